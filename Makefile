@@ -1,0 +1,33 @@
+# Two commands matter: `make run` (a simulated head listens) and `make test`. Both make .venv first if it is missing.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: run test test-all lint bench install clean
+
+run: install
+	$(BIN)/sfms-robot run --duration 20
+
+install: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+test: install
+	$(BIN)/python -m pytest -m "not slow and not hardware and not gpu"
+
+test-all: install
+	$(BIN)/python -m pytest -m "not hardware and not gpu"
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: install
+	$(BIN)/sfms-robot bench
+
+clean:
+	rm -rf $(VENV) build dist

@@ -1,0 +1,3 @@
+"""A robot head that listens: voice in, servo goals out."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,28 @@
+"""Where the files that ship with the package lie. The only module that knows."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+Shipped = Literal["configs", "firmware_maps", "sim"]
+
+
+def data_dir(name: Shipped) -> Path:
+    """Folder of shipped files: inside the installed package, else beside it in a checkout.
+
+    Raises FileNotFoundError when neither exists, which means a broken installation.
+    """
+    installed = Path(str(files("sfms_robot"))) / name
+    if installed.is_dir():
+        return installed
+    checkout = Path(__file__).resolve().parent.parent
+    if (checkout / "pyproject.toml").is_file() and (checkout / name).is_dir():
+        return checkout / name
+    raise FileNotFoundError(f"the package's own folder {name!r} is missing: reinstall sfms-robot")
+
+
+def shipped_names(folder: Path, marker: str) -> list[str]:
+    """Names of the folders in `folder` that hold a file called `marker`, sorted."""
+    return sorted(path.parent.name for path in folder.glob(f"*/{marker}"))

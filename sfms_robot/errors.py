@@ -1,0 +1,76 @@
+"""Everything that can go wrong, as one tree.
+
+RobotError                      base; `exit_code` is what the command line returns
++-- ConfigError          (2)    a file, a flag or a value in it is wrong; names file, key, value, choices
+|   +-- MissingExtra     (2)    a feature needs a package that is not installed; names the pip install
++-- PortError            (3)    a port cannot be opened, or is held by somebody else
++-- BusError             (4)    no servo of a bus answers; the bus cannot go on
+|   +-- ServoError       (4)    a servo is not what the configuration says, or refuses a command
+|   +-- PacketError      (4)    bytes that are no packet (codecs raise it, buses count it)
++-- ModelError           (5)    weights or model files are missing, corrupt or of another shape
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class RobotError(Exception):
+    """Base of every error this package raises on purpose. The text is one line for a person."""
+
+    exit_code = 1
+
+
+class ConfigError(RobotError):
+    """A configuration file, a data file or a flag holds something that cannot be used."""
+
+    exit_code = 2
+
+    @classmethod
+    def at(
+        cls,
+        file: Path | str,
+        key: str,
+        value: object,
+        problem: str,
+        choices: Iterable[object] = (),
+    ) -> ConfigError:
+        """`file: key = value problem (valid choices)`, the form every configuration error takes."""
+        listed = ", ".join(str(choice) for choice in choices)
+        place = f"{file}: {key} = {value!r}" if key else f"{file}:"
+        return cls(f"{place} {problem}" + (f" ({listed})" if listed else ""))
+
+
+class MissingExtra(ConfigError):
+    """A feature needs an optional dependency: says which `pip install` brings it."""
+
+    @classmethod
+    def of(cls, feature: str, extra: str) -> MissingExtra:
+        return cls(f"{feature} needs an optional part: pip install 'sfms-robot[{extra}]'")
+
+
+class PortError(RobotError):
+    """A serial port cannot be opened. Example: no such device, no permission, held by another program."""
+
+    exit_code = 3
+
+
+class BusError(RobotError):
+    """A bus failed as a whole. One silent servo is never a BusError."""
+
+    exit_code = 4
+
+
+class ServoError(BusError):
+    """One servo is not what the head configuration says, or refused a command at start-up."""
+
+
+class PacketError(BusError):
+    """Bytes that are not a packet: bad header, length or checksum."""
+
+
+class ModelError(RobotError):
+    """Weights or a model's files are missing, corrupt, or belong to another configuration."""
+
+    exit_code = 5

@@ -1,0 +1,180 @@
+"""The values that travel through the program, and the one table of channel names.
+
+Axes are ROS REP-103: x forward, y left, z up. Roll + = right ear down, pitch + = nose down, yaw + = turn to
+the head's own left; R = Rz(yaw) Ry(pitch) Rx(roll). Left and right are the head's own, as in ARKit.
+Radians, metres and seconds throughout. A *motion* array is (..., 58): pose 6, then blendshapes 52.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+
+FRAME_HZ: Final = 25
+FRAME_S: Final = 1.0 / FRAME_HZ
+AUDIO_HZ: Final = 16_000
+FRAME_SAMPLES: Final = AUDIO_HZ // FRAME_HZ  # 640
+
+POSE_CHANNELS: Final = ("roll", "pitch", "yaw", "x", "y", "z")
+
+# ARKit names, alphabetical with tongueOut last: also FaceVerse's working order (identity permutation).
+BLENDSHAPES: Final = (
+    "browDownLeft", "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight",
+    "cheekPuff", "cheekSquintLeft", "cheekSquintRight",
+    "eyeBlinkLeft", "eyeBlinkRight", "eyeLookDownLeft", "eyeLookDownRight", "eyeLookInLeft", "eyeLookInRight",
+    "eyeLookOutLeft", "eyeLookOutRight", "eyeLookUpLeft", "eyeLookUpRight", "eyeSquintLeft", "eyeSquintRight",
+    "eyeWideLeft", "eyeWideRight",
+    "jawForward", "jawLeft", "jawOpen", "jawRight",
+    "mouthClose", "mouthDimpleLeft", "mouthDimpleRight", "mouthFrownLeft", "mouthFrownRight", "mouthFunnel",
+    "mouthLeft", "mouthLowerDownLeft", "mouthLowerDownRight", "mouthPressLeft", "mouthPressRight", "mouthPucker",
+    "mouthRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper",
+    "mouthSmileLeft", "mouthSmileRight", "mouthStretchLeft", "mouthStretchRight",
+    "mouthUpperUpLeft", "mouthUpperUpRight", "noseSneerLeft", "noseSneerRight",
+    "tongueOut",
+)  # fmt: skip
+CHANNELS: Final = POSE_CHANNELS + BLENDSHAPES
+CHANNEL_INDEX: Final[Mapping[str, int]] = {name: index for index, name in enumerate(CHANNELS)}
+POSE: Final = slice(0, 6)
+SHAPES: Final = slice(6, 58)
+MOTION_DIM: Final = len(CHANNELS)  # 58
+
+# The order of Apple's ARKit header (eyes, jaw, mouth, brows, cheeks, nose, tongue).
+_APPLE: Final = (
+    "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft",
+    "eyeWideLeft",
+    "eyeBlinkRight", "eyeLookDownRight", "eyeLookInRight", "eyeLookOutRight", "eyeLookUpRight", "eyeSquintRight",
+    "eyeWideRight",
+    "jawForward", "jawLeft", "jawRight", "jawOpen",
+    "mouthClose", "mouthFunnel", "mouthPucker", "mouthLeft", "mouthRight", "mouthSmileLeft", "mouthSmileRight",
+    "mouthFrownLeft", "mouthFrownRight", "mouthDimpleLeft", "mouthDimpleRight", "mouthStretchLeft",
+    "mouthStretchRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper", "mouthPressLeft",
+    "mouthPressRight", "mouthLowerDownLeft", "mouthLowerDownRight", "mouthUpperUpLeft", "mouthUpperUpRight",
+    "browDownLeft", "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight",
+    "cheekPuff", "cheekSquintLeft", "cheekSquintRight", "noseSneerLeft", "noseSneerRight", "tongueOut",
+)  # fmt: skip
+
+
+def _swapped(order: Sequence[str], *pairs: tuple[str, str]) -> tuple[str, ...]:
+    other = {a: b for a, b in pairs} | {b: a for a, b in pairs}
+    return tuple(other.get(name, name) for name in order)
+
+
+# Name order of each outside format. MediaPipe puts `_neutral` first and has no tongueOut. The Live Link app's CSV
+# swaps jaw and mouth left/right against Apple's header; its UDP packet does not.
+ORDERS: Final[Mapping[str, tuple[str, ...]]] = {
+    "alphabetical": BLENDSHAPES,
+    "faceverse": BLENDSHAPES,
+    "apple": _APPLE,
+    "live_link_udp": _APPLE,
+    "live_link_csv": _swapped(_APPLE, ("jawLeft", "jawRight"), ("mouthLeft", "mouthRight")),
+    "mediapipe": ("_neutral", *BLENDSHAPES[:-1]),
+}
+
+
+def reorder(values: NDArray[np.floating], order: str) -> Floats:
+    """Blendshapes (..., n) in the named outside order -> (..., 52) alphabetical; missing ones are 0.
+
+    Raises KeyError for an unknown order and ValueError for a wrong last dimension.
+    """
+    names = ORDERS[order]
+    if values.shape[-1] != len(names):
+        raise ValueError(f"order {order!r} has {len(names)} channels, got {values.shape[-1]}")
+    out = np.zeros((*values.shape[:-1], len(BLENDSHAPES)), dtype=np.float32)
+    for column, name in enumerate(names):
+        if name != "_neutral":
+            out[..., BLENDSHAPES.index(name)] = values[..., column]
+    return out
+
+
+@dataclass(frozen=True)
+class FaceFrame:
+    """One face at one instant.
+
+    Attributes:
+        time_s: when.
+        pose: (6,) roll, pitch, yaw [rad], x, y, z [m].
+        blendshapes: (52,) 0..1, order `BLENDSHAPES`.
+        jaw_rad: (3,) axis-angle or None; when present it replaces jawOpen.
+    """
+
+    time_s: float
+    pose: Floats
+    blendshapes: Floats
+    jaw_rad: Floats | None = None
+
+    @classmethod
+    def of(cls, time_s: float, motion: NDArray[np.floating]) -> FaceFrame:
+        """From one motion row (58,)."""
+        row = np.asarray(motion, dtype=np.float32)
+        return cls(time_s, row[POSE], row[SHAPES])
+
+    @property
+    def motion(self) -> Floats:
+        """(58,) pose then blendshapes."""
+        return np.concatenate([self.pose, self.blendshapes]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SpeakerFrame:
+    """What the person did in the last 40 ms.
+
+    Attributes:
+        time_s: the END of the frame: its samples cover (time_s - 0.04, time_s].
+        audio: (n,) mono 16 kHz, -1..1; empty when there is no microphone.
+        face: the person's face, or None: a missing modality is normal.
+        agent_audio: (n,) what the robot itself says, or None.
+    """
+
+    time_s: float
+    audio: Floats
+    face: FaceFrame | None = None
+    agent_audio: Floats | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What our face does next. A newer plan replaces an older one from its first time on.
+
+    Attributes:
+        made_at_s: time of the last speaker frame used.
+        times_s: (H,) times_s[0] = made_at_s + one frame.
+        frames: (H, 58) motion.
+        jaw_rad: (H, 3) or None.
+    """
+
+    made_at_s: float
+    times_s: Doubles
+    frames: Floats
+    jaw_rad: Floats | None = None
+
+
+@dataclass(frozen=True)
+class JointCommand:
+    """Joint angles [rad] (J,) float64 in the joint order of the head."""
+
+    time_s: float
+    angles_rad: Doubles
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a bus knows of one joint.
+
+    Attributes:
+        position_rad: None until the servo has answered once, or for good where the family cannot tell.
+        age_s: age of the position; inf when there is none.
+        fault: named fault or None.
+        extra: what else the family tells, unit in the key (`current_mA`, `velocity_rad_s`, `voltage_V`).
+    """
+
+    position_rad: float | None
+    age_s: float
+    fault: str | None = None
+    extra: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,172 @@
+"""The seams: what the loop needs from each part, and nothing more.
+
+Concrete parts are put together in `app`; everything that runs in time takes `now_s` as an argument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.frames import Doubles, Floats, Plan, Reading, SpeakerFrame
+
+StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
+
+
+class Source(Protocol):
+    """Where the person's voice and face come from."""
+
+    @property
+    def duration_s(self) -> float | None:
+        """Length of a recording; None for something live."""
+
+    def read(self, now_s: float) -> Sequence[SpeakerFrame]:
+        """Frames complete at or before `now_s` and not given yet, oldest first; now_s = 0 is the start."""
+
+    def close(self) -> None: ...
+
+
+class Listener(Protocol):
+    """A predictor, streaming. Holds weights only: what a stream remembers is the `memory` it is handed."""
+
+    @property
+    def hop(self) -> int:
+        """A new plan is made every `hop` frames."""
+
+    @property
+    def horizon(self) -> int:
+        """Frames in a plan."""
+
+    def start(self, seed: int) -> Any:
+        """Memory of a stream that has heard nothing."""
+
+    def step(self, speaker: SpeakerFrame, memory: Any) -> tuple[Plan | None, Any]:
+        """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
+
+
+class PlanFeed(Protocol):
+    """A listener seen from the loop: frames go in, plans come out when they are ready."""
+
+    def push(self, frame: SpeakerFrame, now_s: float) -> None: ...
+
+    def poll(self, now_s: float) -> Sequence[Plan]:
+        """Plans that became visible by `now_s`, oldest first. Never blocks."""
+
+    def step_times_ms(self) -> Sequence[float]:
+        """Duration of every listener step so far; empty in virtual time."""
+
+    def close(self) -> None: ...
+
+
+class TickConversion(Protocol):
+    """Joint angles of one bus <-> servo ticks: zero, sign, ratio (`motion.calibration`)."""
+
+    def to_ticks(self, angles_rad: Doubles) -> NDArray[np.int64]:
+        """Nearest ticks (J,) that lie inside the position limits, whatever the rounding."""
+
+    def to_rad(self, ticks: NDArray[np.int64]) -> Doubles:
+        """Angles (J,) of servo positions; a position outside the limits is told as it is."""
+
+
+class Bus(Protocol):
+    """Servos of one or several named buses, addressed by joint. Never raises for one servo."""
+
+    @property
+    def joints(self) -> Sequence[str]:
+        """Joint names, in the order of `goals_rad`."""
+
+    @property
+    def capabilities(self) -> Mapping[str, frozenset[str]]:
+        """Per joint, what its family tells or does: position, velocity, current, voltage, temperature, torque."""
+
+    def connect(self) -> None:
+        """Open, identify every servo, check it against the head. Raises PortError, BusError or ServoError."""
+
+    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+        """Torque on without a jump: goal := present, verified, then enable. Returns the angles held, rad (J,)."""
+
+    def write(self, goals_rad: Doubles, now_s: float) -> None:
+        """One goal per joint, rad (J,). Refuses (raises ValueError) what is not finite or not in range."""
+
+    def poll(self, now_s: float) -> Mapping[str, Reading]:
+        """Freshest reading of every joint; blocks at most the configured read deadline."""
+
+    def stop(self, policy: StopPolicy) -> None:
+        """Torque off, or hold, for every servo that can be reached. Completes whatever is dead; idempotent."""
+
+    def close(self) -> None:
+        """Give the ports back. Idempotent."""
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Counters for the report: writes, reads, errors, retries, reconnects, silent ids, faults."""
+
+
+class Observer(Protocol):
+    """Sees every tick, may drop, never blocks."""
+
+    def tick(self, seen: Tick) -> None: ...
+
+    def heard(self, frame: SpeakerFrame) -> None: ...
+
+    def planned(self, plan: Plan) -> None: ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One turn of the loop, as observers see it.
+
+    Attributes:
+        time_s: nominal time of the tick.
+        motion: (58,) the face asked for at this instant, without lead.
+        goals_rad: (J,) what was written.
+        readings: freshest reading per joint.
+    """
+
+    time_s: float
+    motion: Floats
+    goals_rad: Doubles
+    readings: Mapping[str, Reading]
+
+
+class Clock(Protocol):
+    """Loop time from 0. Real clocks sleep; a virtual one jumps."""
+
+    def now_s(self) -> float: ...
+
+    def wait_until(self, time_s: float) -> None: ...
+
+
+class Timeline(Protocol):
+    """Joins plans and plays them at any instant. State is a value."""
+
+    def start(self) -> Any: ...
+
+    def accept(self, plan: Plan, state: Any) -> Any: ...
+
+    def sample(self, times_s: Doubles, now_s: float, state: Any) -> tuple[Floats, Any]:
+        """Motion (N, 58) at each of (N,) instants, and the state with what was counted."""
+
+
+class Retargeter(Protocol):
+    """Motion -> joint angles of this head."""
+
+    @property
+    def joints(self) -> Sequence[str]: ...
+
+    def angles(self, motion: Floats) -> Doubles:
+        """(J, 58) one motion row per joint (each joint has its own lead), or (58,) for all -> rad (J,)."""
+
+
+class Limiter(Protocol):
+    """Position, speed, acceleration and jerk of every joint. State is a value."""
+
+    def start(self, angles_rad: Doubles) -> Any: ...
+
+    def step(self, reference_rad: Doubles, state: Any) -> tuple[Doubles, Any]:
+        """Reference (3, J): angle, speed, acceleration one tick ahead -> angles (J,) that may be sent."""
