@@ -28,6 +28,14 @@ class Model(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, value: Any) -> Any:
+        for key in value if isinstance(value, dict) else ():
+            if key not in cls.model_fields:
+                raise ValueError(f"{key!r} is not a known key ({', '.join(cls.model_fields)})")
+        return value
+
 
 # --- a head -----------------------------------------------------------------------------------------------------
 
@@ -74,6 +82,9 @@ class Expression(Model):
             raise ValueError(f"needs exactly one of channel, sum, max, mean; has {', '.join(kinds) or 'none'}")
         if self.channel is not None and self.channel not in CHANNEL_INDEX:
             raise ValueError(f"{self.channel!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
+        for kind in ("sum", "max", "mean"):
+            if getattr(self, kind) == ():
+                raise ValueError(f"{kind} is empty")
         if self.clamp is not None and self.clamp[0] >= self.clamp[1]:
             raise ValueError(f"clamp {list(self.clamp)} is reversed or empty")
         return self
@@ -188,7 +199,8 @@ class FirmwareMap(Model):
     ticks_per_revolution: Positive
     center_ticks: int
     no_load_speed_deg_s: Positive
-    baud_codes: dict[int, int]
+    baud_codes: dict[int, int]  # code in register baud_rate -> bits per second
+    faults: dict[int, str] = Field(default_factory=dict)  # bit of hardware_error_status -> what it means
     registers: Annotated[dict[Name, Register], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -199,6 +211,122 @@ class FirmwareMap(Model):
                 raise ValueError(f"registers.{name}.address = {register.address} overlaps {last} (ends at {end})")
             end, last = register.address + register.size, name
         return self
+
+
+# --- a listener and its training --------------------------------------------------------------------------------
+
+
+Count = Annotated[int, Field(ge=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class ChannelGroup(Model):
+    """Channels that share one keyframe track: at most one code per frame, from `levels[0] * levels[1] * ...`."""
+
+    channels: Annotated[tuple[str, ...], Field(min_length=1)]
+    levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
+    keyframes: Count
+    transition_bias: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _known(self) -> ChannelGroup:
+        for name in self.channels:
+            if name not in CHANNEL_INDEX:
+                raise ValueError(f"channels: {name!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
+        return self
+
+    @property
+    def codes(self) -> int:
+        return math.prod(self.levels)
+
+
+class Sampling(Model):
+    """How tokens are drawn. `frames_per_pass`: future frames decided by one pass of the decoder."""
+
+    temperature: Positive = 1.0
+    nucleus: Annotated[float, Field(gt=0, le=1)] = 1.0
+    frames_per_pass: Count = 1
+    seam_frames: Count = 4
+
+
+class Listener(Model):
+    """A listener: `configs/listeners/NAME/config.yaml`."""
+
+    kind: Literal["sfms"]
+    description: str = ""
+    motion_space: Literal["arkit58"] = "arkit58"
+    past_frames: Count = 40
+    future_frames: Count = 8
+    hop: Count = 4
+    placement: Literal["exact", "static", "static_paper", "learned"] = "exact"
+    max_gap_frames: Count = 24
+    groups: Annotated[dict[Name, ChannelGroup], Field(min_length=1)]
+    tokenizer_width: Count = 96
+    predictor_width: Count = 96
+    predictor_layers: Count = 2
+    heads: Count = 4
+    sampling: Sampling = Sampling()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Listener:
+        owner: dict[str, str] = {}
+        for name, group in self.groups.items():
+            for channel in group.channels:
+                if owner.setdefault(channel, name) != name:
+                    raise ValueError(f"groups.{name}.channels: {channel!r} is already in group {owner[channel]}")
+        missing = [channel for channel in CHANNEL_INDEX if channel not in owner]
+        if missing:
+            raise ValueError(f"groups: no group holds {', '.join(missing)}")
+        if len({len(group.levels) for group in self.groups.values()}) != 1:
+            raise ValueError("groups: every group needs the same number of levels")
+        if self.hop > self.future_frames:
+            raise ValueError(f"hop {self.hop} is above future_frames {self.future_frames}")
+        for key, width in (("tokenizer_width", self.tokenizer_width), ("predictor_width", self.predictor_width)):
+            if width % (2 * self.heads):
+                raise ValueError(f"{key} {width} is not a multiple of twice heads ({self.heads})")
+        return self
+
+    @property
+    def window_frames(self) -> int:
+        return self.past_frames + self.future_frames
+
+
+class TokenizerTraining(Model):
+    """Phase 1: scores, quantizer, inpainter."""
+
+    steps: Count
+    batch: Count
+    learning_rate: Positive
+    score_learning_rate: Positive = 1e-3
+    weight_decay: NonNegative = 0.01
+    clip_norm: Positive = 1.0
+    mask_loss: NonNegative = 0.1
+    temperature: tuple[Positive, Positive] = (2.0, 0.1)
+
+
+class PredictorTraining(Model):
+    """Phase 2: the next-token predictor."""
+
+    steps: Count
+    batch: Count
+    learning_rate: Positive
+    weight_decay: NonNegative = 0.01
+    clip_norm: Positive = 1.0
+    transition_weight: Positive = 0.5
+    neutral_prefix: Share = 0.1
+    drop_audio: Share = 0.1
+    drop_face: Share = 0.3
+    history_noise: Share = 0.05
+    gain_db: NonNegative = 6.0
+
+
+class Training(Model):
+    """How a listener is trained: `configs/training/NAME.yaml`."""
+
+    seed: int = 1
+    listener: Listener
+    tokenizer: TokenizerTraining
+    predictor: PredictorTraining
 
 
 # --- loading ----------------------------------------------------------------------------------------------------

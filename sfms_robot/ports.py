@@ -170,3 +170,12 @@ class Limiter(Protocol):
 
     def step(self, reference_rad: Doubles, state: Any) -> tuple[Doubles, Any]:
         """Reference (3, J): angle, speed, acceleration one tick ahead -> angles (J,) that may be sent."""
+
+
+class Audit(Protocol):
+    """Judges the command stream from outside the limiter. State is a value with `violations` and `clamped`."""
+
+    def start(self, angles_rad: Doubles) -> Any: ...
+
+    def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: Any) -> Any:
+        """One command (J,), and what was wanted of the limiter."""

@@ -1,0 +1,46 @@
+"""`sfms-robot run`: drive a head."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+from pathlib import Path
+
+import typer
+
+INTERRUPTED = 130
+
+
+def run(
+    head: str = typer.Option("face28", help="Shipped head, or a folder with a head.yaml."),
+    port: str = typer.Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
+    listener: str = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights."),
+    audio: str = typer.Option(
+        "default",
+        help="FILE.wav (any rate, mono or stereo), a shipped speaker, 'none', or 'default': a shipped speaker.",
+    ),
+    face: str = typer.Option(
+        "auto", help="The speaker's face: FILE.csv[.gz], 'none', or 'auto': the shipped speaker's own, else none."
+    ),
+    duration: float | None = typer.Option(None, min=0.04, help="Seconds; default: as long as the recording."),
+    fast: bool = typer.Option(False, help="Virtual time: as fast as it goes, bit-identical for one --seed."),
+    seed: int = typer.Option(0, min=0, help="Two seeds listen differently, one seed repeats (with --fast)."),
+    record: Path | None = typer.Option(None, help="Folder to write the run to, for `sfms-robot replay`."),
+    dry_run: bool = typer.Option(False, "--dry-run", help="Open and read the servos, never switch torque on."),
+    json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
+) -> None:
+    """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
+    from sfms_robot.app.progress import RunProgress
+    from sfms_robot.app.run import RunOptions, run_head
+    from sfms_robot.cli.tables import print_dry_run, print_run
+
+    options = RunOptions(head, port, listener, audio, face, duration, fast, seed, record, dry_run)
+    report = run_head(options, RunProgress)
+    if json:
+        print(json_module.dumps(report))
+    elif dry_run:
+        print_dry_run(report)
+    else:
+        print_run(report, record)
+    if report["exit"] == "interrupted":
+        sys.exit(INTERRUPTED)

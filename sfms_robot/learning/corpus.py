@@ -1,0 +1,120 @@
+"""Dyads as a few long tensors, from which windows are cut without crossing from one dyad into the next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_SAMPLES, MOTION_DIM
+from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
+from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.signals import mel
+
+STRETCH_WINDOWS = 5  # exact placement shares its keyframes among this many windows
+
+
+@dataclass(frozen=True)
+class Corpus:
+    """N frames of all dyads, one after another.
+
+    Attributes:
+        motion: (N, 58) listener, raw units.
+        face: (N, 58) speaker, raw units, 0 where unknown; face_known: (N,) bool.
+        mel: (N, 4, 128) half precision, natural log.
+        heard: (N,) bool.
+        lengths: frames of each dyad.
+    """
+
+    motion: Tensor
+    face: Tensor
+    face_known: Tensor
+    mel: Tensor
+    heard: Tensor
+    lengths: tuple[int, ...]
+
+    def starts(self, window: int) -> Tensor:
+        """First frames of every window that lies in one dyad."""
+        firsts, at = [], 0
+        for length in self.lengths:
+            firsts.append(torch.arange(at, at + length - window + 1))
+            at += length
+        return torch.cat(firsts)
+
+
+def gather(dyads: Sequence[Dyad], window: int) -> Corpus:
+    """Stack dyads; those shorter than a window are left out. Raises ConfigError when none is left."""
+    kept = [dyad for dyad in dyads if len(dyad.listener) >= window]
+    if not kept:
+        raise ConfigError(f"none of {len(dyads)} dyads is as long as a window of {window} frames")
+    face = torch.cat([torch.from_numpy(dyad.speaker) for dyad in kept])
+    known = face.isfinite().all(-1)
+    rows = [torch.from_numpy(mel.log_mel(dyad.audio, mel.start())[0]).half() for dyad in kept]
+    return Corpus(
+        motion=torch.cat([torch.from_numpy(dyad.listener) for dyad in kept]),
+        face=torch.where(known[:, None], face, 0.0),
+        face_known=known,
+        mel=torch.cat(rows).view(-1, mel.ROWS_PER_FRAME, mel.MEL_BINS),
+        heard=torch.cat([_heard(dyad) for dyad in kept]),
+        lengths=tuple(len(dyad.listener) for dyad in kept),
+    )
+
+
+def _heard(dyad: Dyad) -> Tensor:
+    """A dyad without any sound has no voice, rather than a silent one."""
+    frames = len(dyad.audio) // FRAME_SAMPLES
+    return torch.full((frames,), bool(dyad.audio.any()))
+
+
+def fit_scales(model: SfmsModel, corpus: Corpus) -> None:
+    """Set the model's means and deviations. Deviations have floors, so that a still channel's noise is not blown up."""
+    floor = torch.full((MOTION_DIM,), 0.03)
+    floor[:3], floor[3:6] = 0.01, 0.003  # [rad], [m]
+    model.motion_mean.copy_(corpus.motion.mean(0))
+    model.motion_std.copy_(torch.maximum(corpus.motion.std(0), floor))
+    rows = corpus.mel[:: max(1, len(corpus.mel) // 20_000)].float().flatten(0, 1)
+    model.mel_mean.copy_(rows.mean(0))
+    model.mel_std.copy_(rows.std(0).clamp(min=0.5))
+
+
+@torch.no_grad()
+def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
+    """Keyframe masks (N, G) of all dyads, placed stretch by stretch so that busy seconds may borrow from quiet ones."""
+    size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
+    masks = []
+    for dyad in motion.split(list(lengths)):
+        for stretch in dyad.split(_stretches(len(dyad), size, tokenizer.window)):
+            masks.append(tokenizer.place(stretch[None])[0])
+    return torch.cat(masks)
+
+
+def _stretches(frames: int, size: int, least: int) -> list[int]:
+    """Lengths that add up to `frames`, none under `least` unless there is only one."""
+    whole, rest = divmod(frames, size)
+    sizes = [size] * whole
+    if rest and (rest >= least or not sizes):
+        sizes.append(rest)
+    elif rest:
+        sizes[-1] += rest
+    return sizes
+
+
+def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
+    """(N, ...) cut at (B,) starts -> (B, length, ...)."""
+    return values[starts[:, None] + torch.arange(length)]
+
+
+def context(model: SfmsModel, corpus: Corpus, tokens: Tensor, starts: Tensor, past: int) -> Context:
+    """What the predictor sees before the future of each window; `tokens` (N, G)."""
+    sound = windows(corpus.mel, starts, past).float().flatten(1, 2)
+    return Context(
+        face=model.standardise(windows(corpus.face, starts, past)),
+        face_known=windows(corpus.face_known, starts, past),
+        mel=model.standardise_mel(sound),
+        heard=windows(corpus.heard, starts, past),
+        tokens=windows(tokens, starts, past),
+    )

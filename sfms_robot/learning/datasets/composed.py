@@ -1,0 +1,247 @@
+"""Composed dyads: real timing, real movement, put together here.
+
+Real are: when somebody nods, looks away, laughs or says "mm-hm" while others talk, and when they talk and pause (AMI
+meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`); how speech sounds (`voices`). That they
+belong together is ours: the voice says other words than the meeting did, only its phrases begin and end when they did.
+Whoever holds the floor sits straight ahead. Stretches
+with nods, above all those at the end of a phrase, are drawn more often than they are in the meetings. Meetings, people, takes and voices kept for validation are whole ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, Doubles, Floats
+from sfms_robot.learning.datasets.acting import Score, listener_motion, speaker_motion
+from sfms_robot.learning.datasets.ami import Person, read_people, split_series
+from sfms_robot.learning.datasets.clips import Dyad, save
+from sfms_robot.learning.datasets.motions import SPLITS, Motions
+from sfms_robot.learning.datasets.motions import load as load_motions
+from sfms_robot.learning.datasets.voices import Voice, find_voices, lay, room, split_voices
+from sfms_robot.metrics.timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
+
+LENGTH_S: Final = (30.0, 60.0)
+VALIDATION_SHARE: Final = 1 / 6  # of the training minutes
+_FILMED: Final = 0.65  # share of dyads with a voice whose mouth was recorded
+_FACELESS: Final = 0.3  # share of those in which the speaker is heard only
+_LOOKS: Final = 0.6  # share of the looks away that is kept: across a table with papers people look away a lot
+_LONGEST_LOOK_S: Final = (1.5, 4.0)  # a look away ends after this: in meetings people watch slides for minutes
+_WEIGHTS: Final = (4.0, 3.0, 2.0, 3)  # of a stretch: base + nods a minute, up to + a nod after a phrase, up to
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A piece of a meeting in which a person mostly listens.
+
+    Attributes:
+        nods_per_minute: of listening time.
+        answers: nods that begin 0 to 0.8 s after the end of a phrase.
+    """
+
+    person: Person
+    start_s: float
+    end_s: float
+    nods_per_minute: float = 0.0
+    answers: int = 0
+
+    @property
+    def weight(self) -> float:
+        """How often it is drawn: those who nod, and nod when a phrase ends, more often than they are in the meetings."""
+        base, most, answer, answers = _WEIGHTS
+        return base + min(self.nods_per_minute, most) + answer * min(self.answers, answers)
+
+    @property
+    def frames(self) -> int:
+        return int(round((self.end_s - self.start_s) * FRAME_HZ))
+
+    @property
+    def name(self) -> str:
+        return f"{self.person.meeting}_{self.person.agent}_{int(self.start_s):04d}"
+
+
+def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> dict[str, list[Dyad]]:
+    """`minutes` of "train" dyads and a sixth of it of "validation" dyads; the same for the same seed.
+
+    `ami` holds the AMI tables, `voices` are folders of WAV files, `motions` is a file of motion primitives. Raises
+    ConfigError.
+    """
+    made: dict[str, list[Dyad]] = {split: [] for split in SPLITS}
+    for split, dyad in dyads(ami, voices, motions, seed, minutes):
+        made[split].append(dyad)
+    return made
+
+
+def compose_folder(data: Path, out: Path, seed: int, minutes: float, voices: Sequence[Path] = ()) -> dict[str, float]:
+    """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train and out/validation.
+
+    Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, the AMI clips) and
+    those of further folders. Returns the minutes written per split. Raises ConfigError.
+    """
+    ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
+    brought = [folder for folder in (data / "facegood_audio_mouth", data / "speech_audio", ami) if folder.is_dir()]
+    bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
+    motions = data_dir("sim") / "listeners" / "motions.npz"
+    written = dict.fromkeys(SPLITS, 0.0)
+    for split in SPLITS:
+        for stale in (out / split).glob("*.npz"):
+            stale.unlink()
+    for split, dyad in dyads(ami, [*bundled, *brought, *voices], motions, seed, minutes):
+        save(out / split, [dyad])
+        written[split] += len(dyad.listener) * FRAME_S / 60
+    return written
+
+
+def dyads(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> Iterator[tuple[str, Dyad]]:
+    """The same one by one, as (split, dyad): for sets that need not lie in memory."""
+    if not minutes > 0:
+        raise ConfigError(f"--minutes {minutes:g}: must be above 0")
+    people = split_series(read_people(ami))
+    spoken = split_voices(find_voices(voices))
+    moves = load_motions(motions)
+    for number, split in enumerate(SPLITS):
+        rng = np.random.default_rng([seed, number])
+        wanted = minutes * (1 if split == "train" else VALIDATION_SHARE)
+        annotated = [person for person in people[split] if person.gaze is not None]
+        for stretch in choose(stretches(people[split], rng), wanted, rng):
+            lender = annotated[int(rng.integers(len(annotated)))] if annotated else None
+            yield split, compose_one(stretch, lender, _cast(spoken[split], rng), moves[split], rng)
+
+
+def _cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
+    filmed = rng.random() < _FILMED
+    fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
+    return fitting[int(rng.integers(len(fitting)))]
+
+
+# --- which stretches --------------------------------------------------------------------------------------------
+
+
+def stretches(people: Sequence[Person], rng: np.random.Generator) -> list[Stretch]:
+    """Cut everybody's time into pieces of 30 to 60 s; keep those he was seen in and mostly listened in."""
+    found = []
+    for person in people:
+        at = float(rng.uniform(0, LENGTH_S[0]))
+        while at + LENGTH_S[1] < person.until_s:
+            length = FRAME_S * round(float(rng.uniform(*LENGTH_S)) * FRAME_HZ)
+            piece = Stretch(person, at, at + length)
+            at += length
+            own, others = (_active(spans, piece) for spans in (person.talk, person.others))
+            listening = listening_mask(others, FRAME_HZ, own)
+            if own.mean() > 0.2 or listening.mean() < 0.6 or _active(person.unseen, piece).any():
+                continue
+            onsets = _within(person.nods, piece)[:, 0]
+            rate = nods_per_minute(onsets, listening, FRAME_HZ)
+            answers = phrase_end_counts(onsets, phrase_ends(others, FRAME_HZ), listening, FRAME_HZ)[0]
+            found.append(replace(piece, nods_per_minute=rate, answers=answers))
+    return found
+
+
+def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -> list[Stretch]:
+    """Draw about `minutes` of stretches without repetition, by weight.
+
+    Systematic draw along the nod rate: even a small set has the rates of the large one.
+    """
+    if not found:
+        return []
+    ranked = sorted(found, key=lambda stretch: stretch.nods_per_minute)
+    weights = np.array([stretch.weight for stretch in ranked])
+    mean_s = float(np.average([stretch.frames * FRAME_S for stretch in ranked], weights=weights))
+    count = max(1, round(60 * minutes / mean_s))
+    spots = (rng.random() + np.arange(count)) / count
+    drawn = np.unique(np.searchsorted(np.cumsum(weights) / weights.sum(), spots).clip(max=len(ranked) - 1))
+    return [ranked[int(index)] for index in rng.permutation(drawn)]
+
+
+# --- one dyad ---------------------------------------------------------------------------------------------------
+
+
+def compose_one(
+    stretch: Stretch, lender: Person | None, voice: Voice, motions: Motions, rng: np.random.Generator
+) -> Dyad:
+    """One stretch, acted and voiced. `lender` gives his looks where those of this meeting were not annotated."""
+    person, frames = stretch.person, stretch.frames
+    others, own = _active(person.others, stretch), _active(person.talk, stretch)
+    score = Score(
+        frames,
+        nods=_within(person.nods, stretch),
+        shakes=_within(person.shakes, stretch),
+        tilts=_within(person.tilts, stretch),
+        laughs=_within(person.laughs, stretch),
+        talk=_within(person.talk, stretch),
+        backchannels=_within(person.backchannels, stretch),
+        gaze=_looks(stretch, lender, rng),
+        shared_laughs=_within(person.others_laughs, stretch),
+        asked=person.asked[(person.asked > stretch.start_s) & (person.asked < stretch.end_s)] - stretch.start_s,
+        ends=phrase_ends(others, FRAME_HZ),
+    )
+    said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
+    speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
+    faceless = mouth is None or rng.random() < _FACELESS
+    return Dyad(
+        stretch.name,
+        _recorded(speech, voice, rng),
+        np.full((frames, MOTION_DIM), np.nan, np.float32)
+        if faceless or mouth is None
+        else speaker_motion(mouth, motions, rng),
+        listener_motion(score, motions, rng),
+        listening_mask(others, FRAME_HZ, own),
+    )
+
+
+def _recorded(speech: Floats, voice: Voice, rng: np.random.Generator) -> Floats:
+    """Speech as some microphone in some room would take it: tilt, gain, noise floor."""
+    tilt = np.float32(rng.uniform(-0.3, 0.3))
+    heard = speech - tilt * np.concatenate([[0], speech[:-1]]).astype(np.float32)
+    gain = np.float32(10 ** (rng.uniform(-10, 6) / 20))
+    return np.asarray(np.clip(gain * heard + room(len(speech), voice, rng), -1, 1), np.float32)
+
+
+def _looks(stretch: Stretch, lender: Person | None, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
+    """Looks away from whoever has the floor, in seconds of the stretch, none longer than a few seconds."""
+    person = stretch.person
+    if person.gaze is None:
+        if lender is None:
+            return ()
+        length = stretch.end_s - stretch.start_s
+        begin = float(rng.uniform(0, max(0.0, lender.until_s - length)))
+        stretch, person = Stretch(lender, begin, begin + length), lender
+    looks = []
+    for start, end, target in person.gaze or ():
+        if end < stretch.start_s or start > stretch.end_s:
+            continue
+        where = _where(person, start, end, target)
+        if where is not None and rng.random() < _LOOKS:
+            end = min(end, start + float(rng.uniform(*_LONGEST_LOOK_S)))
+            looks.append((start - stretch.start_s, end - stretch.start_s, where))
+    return tuple(looks)
+
+
+def _where(person: Person, start: float, end: float, target: str) -> str | None:
+    """A gaze target as a direction; None for somebody who speaks during the look, or is about to or just has."""
+    if len(target) != 1:
+        return {"table": "down", "slide-screen": "screen", "whiteboard": "screen"}.get(target, "away")
+    heard = any(agent == target and a < end + 1 and b > start - 1 for a, b, agent in person.floor)
+    return None if heard else f"side {target}"
+
+
+def _active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
+    """(N,) frames whose middle lies in a span."""
+    out = np.zeros(stretch.frames, bool)
+    for start, end in spans[(spans[:, 1] > stretch.start_s) & (spans[:, 0] < stretch.end_s)]:
+        first, last = (int(np.ceil((t - stretch.start_s) * FRAME_HZ - 0.5)) for t in (start, end))
+        out[max(0, first) : max(0, last)] = True
+    return out
+
+
+def _within(spans: Doubles, stretch: Stretch) -> Doubles:
+    """Spans that begin inside, in seconds of the stretch, with room to be seen before its end."""
+    inside = (spans[:, 0] >= stretch.start_s) & (spans[:, 0] < stretch.end_s - 0.5)
+    return spans[inside] - stretch.start_s

@@ -1,0 +1,122 @@
+"""A listener left to itself: stream held-out speakers through it and compare what it does with what people did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, SpeakerFrame
+from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.metrics import timing
+from sfms_robot.ports import Listener
+
+ROTATIONS = slice(0, 3)
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """How a set of faces behaves. Rates are per minute, nods over listening time.
+
+    Attributes:
+        phrase_end_ratio: nod onsets just after phrase ends over those later on (`metrics.timing`).
+        nod_deg: median peak to peak of a nod.
+        still_share: share of seconds in which the head turns less than 0.1 degree.
+        speed_deg_s: 99.9th percentile of head speed; acceleration_deg_s2, jerk_deg_s3: its differences, likewise.
+    """
+
+    nods: float
+    nod_deg: float
+    phrase_end_ratio: float
+    blinks: float
+    smiles: float
+    still_share: float
+    speed_deg_s: float
+    acceleration_deg_s2: float
+    jerk_deg_s3: float
+
+    def __str__(self) -> str:
+        return "  ".join(f"{field.name} {getattr(self, field.name):.2f}" for field in fields(self))
+
+
+def speaker_frames(dyad: Dyad) -> list[SpeakerFrame]:
+    """The speaker of a dyad as a source would give it; a face of NaN is None, no sound at all is no microphone."""
+    silent = not dyad.audio.any()
+    frames = []
+    for index, row in enumerate(dyad.speaker):
+        time_s = (index + 1) * FRAME_S
+        sound = dyad.audio[index * FRAME_SAMPLES : (index + 1) * FRAME_SAMPLES]
+        face = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
+        frames.append(SpeakerFrame(time_s, sound[:0] if silent else sound, face))
+    return frames
+
+
+def roll_out(listener: Listener, speaker: Sequence[SpeakerFrame], seed: int) -> Floats:
+    """(N, 58) what the listener's face did while `speaker` (N frames) was heard: each plan until the next one."""
+    memory = listener.start(seed)
+    motion = np.zeros((len(speaker) + listener.horizon, 58), dtype=np.float32)
+    for index, frame in enumerate(speaker):
+        plan, memory = listener.step(frame, memory)
+        if plan is not None:
+            motion[index + 1 : index + 1 + listener.horizon] = plan.frames
+    return motion[: len(speaker)]
+
+
+def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> Behaviour:
+    """Figures of listeners (N, 58), each beside the dyad it belongs to."""
+    onsets, minutes, sizes = 0.0, 0.0, []
+    counts = np.zeros(4)
+    blinks = smiles = total = 0.0
+    for motion, dyad in zip(motions, dyads, strict=True):
+        nods = timing.find_nods(motion[:, CHANNEL_INDEX["pitch"]], FRAME_HZ)
+        starts = [start for start, _, _ in nods]
+        listened = float(dyad.listening.sum()) / FRAME_HZ / 60
+        onsets += sum(bool(dyad.listening[int(start * FRAME_HZ)]) for start in starts)
+        minutes += listened
+        sizes += [size for _, _, size in nods]
+        ends = timing.phrase_ends(timing.voice_activity(dyad.audio), FRAME_HZ)
+        counts += timing.phrase_end_counts(starts, ends, dyad.listening, FRAME_HZ)
+        blinks += len(timing.find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ))
+        smiles += len(timing.find_smiles(motion[:, CHANNEL_INDEX["mouthSmileLeft"]], FRAME_HZ))
+        total += len(motion) / FRAME_HZ / 60
+    return Behaviour(
+        nods=onsets / minutes if minutes else float("nan"),
+        nod_deg=float(np.degrees(np.median(sizes))) if sizes else float("nan"),
+        phrase_end_ratio=timing.ratio_of([float(count) for count in counts]),
+        blinks=blinks / total,
+        smiles=smiles / total,
+        still_share=float(np.mean([_still(motion) for motion in motions])),
+        speed_deg_s=_differences(motions, 1),
+        acceleration_deg_s2=_differences(motions, 2),
+        jerk_deg_s3=_differences(motions, 3),
+    )
+
+
+def _still(motion: Floats) -> float:
+    seconds = len(motion) // FRAME_HZ
+    turns = np.degrees(motion[: seconds * FRAME_HZ, ROTATIONS]).reshape(seconds, FRAME_HZ, 3)
+    return float((np.ptp(turns, axis=1).max(axis=1) < 0.1).mean())
+
+
+def _differences(motions: Sequence[Floats], order: int) -> float:
+    values = [np.linalg.norm(np.diff(motion[:, ROTATIONS].astype(float), order, axis=0), axis=1) for motion in motions]
+    return float(np.degrees(np.percentile(np.concatenate(values), 99.9)) * FRAME_HZ**order)
+
+
+def evaluate_rollout(
+    listener: Listener,
+    dyads: Sequence[Dyad],
+    seed: int = 1,
+    each: Callable[[int, int], None] | None = None,
+) -> tuple[Behaviour, Behaviour, list[Floats]]:
+    """What the listener does, what the dyads' own listeners did, and the listener's motions.
+
+    `each(done, of)` is called after every dyad.
+    """
+    motions = []
+    for index, dyad in enumerate(dyads):
+        motions.append(roll_out(listener, speaker_frames(dyad), seed + index))
+        if each is not None:
+            each(index + 1, len(dyads))
+    return behaviour(motions, dyads), behaviour([dyad.listener for dyad in dyads], dyads), motions

@@ -1,0 +1,77 @@
+"""Transformer parts shared by the listeners: pre-norm blocks, written out so that a step is the same everywhere.
+
+Shapes: B batch, T frames of the query, S frames of the memory, D width.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def sinusoidal(length: int, width: int) -> Tensor:
+    """Sinusoidal positions (length, width) of Vaswani et al. 2017; `width` is even."""
+    position = torch.arange(length, dtype=torch.float32)[:, None]
+    rate = torch.exp(torch.arange(0, width, 2, dtype=torch.float32) * (-math.log(10_000.0) / width))
+    return torch.cat([torch.sin(position * rate), torch.cos(position * rate)], dim=-1)
+
+
+class Attention(nn.Module):
+    """Multi-head attention of `x` (B, T, D) over `memory` (B, S, D)."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, memory: Tensor, seen: Tensor | None = None) -> Tensor:
+        """`seen` (B, S): True where the memory may be looked at; at least one per row."""
+        b, t, d = x.shape
+        q = self.query(x).view(b, t, self.heads, -1).transpose(1, 2)  # (B, h, T, D/h)
+        k, v = self.key_value(memory).view(b, memory.shape[1], 2, self.heads, -1).permute(2, 0, 3, 1, 4)
+        mask = None if seen is None else seen[:, None, None, :]
+        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        out: Tensor = self.out(y.transpose(1, 2).reshape(b, t, d))
+        return out
+
+
+class FeedForward(nn.Module):
+    """Norm, widen twofold, narrow: the residual branch of a block."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.up = nn.Linear(width, 2 * width)
+        self.down = nn.Linear(2 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.down(F.gelu(self.up(self.norm(x))))
+        return y
+
+
+class Block(nn.Module):
+    """Self-attention, attention over a memory when `cross`, feed-forward; pre-norm, residual."""
+
+    def __init__(self, width: int, heads: int, cross: bool = False) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.attention = Attention(width, heads)
+        self.cross_norm = nn.LayerNorm(width) if cross else None
+        self.cross = Attention(width, heads) if cross else None
+        self.forward_part = FeedForward(width)
+
+    def forward(
+        self, x: Tensor, memory: Tensor | None = None, seen: Tensor | None = None, memory_seen: Tensor | None = None
+    ) -> Tensor:
+        """x (B, T, D) -> (B, T, D); `seen` masks x (B, T), `memory_seen` the memory (B, S)."""
+        y = self.norm(x)
+        x = x + self.attention(y, y, seen)
+        if self.cross is not None and self.cross_norm is not None and memory is not None:
+            x = x + self.cross(self.cross_norm(x), memory, memory_seen)
+        out: Tensor = x + self.forward_part(x)
+        return out

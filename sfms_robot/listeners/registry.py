@@ -1,0 +1,25 @@
+"""Which predictor a folder holds. Families are strings, imported only when chosen."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Final, cast
+
+from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.ports import Listener
+
+LOADERS: Final = {"sfms": "sfms_robot.listeners.sfms"}  # kind -> module with load(folder) -> Listener
+
+
+def load_listener(folder: Path) -> Listener:
+    """The listener of a folder with config.yaml and weights. Raises ConfigError or ModelError."""
+    module = import_module(LOADERS[load_config(folder).kind])
+    return cast(Listener, module.load(folder))
+
+
+def one_thread() -> None:
+    """Make torch repeat itself exactly: one thread, so that sums are added in one order."""
+    import torch
+
+    torch.set_num_threads(1)

@@ -1,0 +1,192 @@
+"""When a listener nods, blinks and smiles, and how that sits on the other person's speech.
+
+Pure functions on arrays sampled at `rate_hz` (25 in this project). An event is (start_s, end_s, size). The phrase-end
+ratio compares two windows after the same phrase ends, so a listener who nods at random gets 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, signal
+
+Event = tuple[float, float, float]
+Bools = NDArray[np.bool_]
+
+AFTER_S: Final = (0.0, 0.8)  # right after a phrase end
+LATER_S: Final = (1.5, 3.0)  # what it is compared with
+QUIET_DB: Final = -66.0  # of full scale: nothing below is speech
+LISTENING_S: Final = 2.0  # somebody else spoke this recently
+
+
+def find_nods(pitch_rad: ArrayLike, rate_hz: float, least_rad: float = np.deg2rad(1.6)) -> list[Event]:
+    """Nods in a head pitch (N,): swings down and back (or back and down) of `least_rad` peak to peak or more.
+
+    Returns (start_s, end_s, peak-to-peak rad) in order. Only what swings faster than about 0.8 Hz counts, and only
+    swings that come back: a gaze shift goes one way, a drift is slow. Swings less than 0.3 s apart are one nod.
+    """
+    pitch = np.asarray(pitch_rad, np.float64)
+    if len(pitch) < int(rate_hz):
+        return []
+    sos = signal.butter(2, (0.8, min(6.0, 0.45 * rate_hz)), "bandpass", fs=rate_hz, output="sos")
+    swing = signal.sosfiltfilt(sos, pitch)
+    turns = _turns(swing, 0.35 * least_rad)
+    found: list[Event] = []
+    for a, b, c in zip(turns[:-2], turns[1:-1], turns[2:], strict=True):
+        down, up = abs(swing[b] - swing[a]), abs(swing[c] - swing[b])
+        spread = np.ptp(pitch[a : c + 1])
+        returned = abs(pitch[c] - pitch[a]) < 0.4 * spread
+        if min(down, up) < 0.5 * least_rad or spread < least_rad or not returned:
+            continue
+        if not 0.15 <= (c - a) / rate_hz <= 1.4:
+            continue
+        if found and a / rate_hz - found[-1][1] < 0.3:
+            start, _, size = found.pop()
+            found.append((start, c / rate_hz, max(size, float(spread))))
+        else:
+            found.append((a / rate_hz, c / rate_hz, float(spread)))
+    return [event for event in found if event[1] - event[0] <= 6]
+
+
+def _turns(values: NDArray[np.float64], least: float) -> list[int]:
+    """Alternating highs and lows that stand out by `least`, with both ends."""
+    highs, _ = signal.find_peaks(values, prominence=least)
+    lows, _ = signal.find_peaks(-values, prominence=least)
+    return sorted({0, len(values) - 1, *highs.tolist(), *lows.tolist()})
+
+
+def find_blinks(blink: ArrayLike, rate_hz: float, least: float = 0.35) -> list[Event]:
+    """Blinks in a lid closure (N,) 0..1: rises by `least` that are over within 0.6 s. One frame is enough.
+
+    Returns (start_s, end_s, height), counted against the closure around it, so lids that rest half closed are fine.
+    """
+    closed = np.asarray(blink, np.float64)
+    peaks, found = signal.find_peaks(np.r_[0.0, closed, 0.0], prominence=least, distance=max(1, int(0.12 * rate_hz)))
+    if not len(peaks):
+        return []
+    widths, _, left, right = signal.peak_widths(np.r_[0.0, closed, 0.0], peaks, rel_height=0.5)
+    rows = zip(left, right, found["prominences"], widths / rate_hz, strict=True)
+    return [((a - 1) / rate_hz, (b - 1) / rate_hz, float(height)) for a, b, height, wide in rows if wide <= 0.6]
+
+
+def find_smiles(smile: ArrayLike, rate_hz: float, least: float = 0.2) -> list[Event]:
+    """Smiles in a mouthSmile (N,): above `least` for 0.4 s or more; ends where it falls below half of that.
+
+    Returns (start_s, end_s, peak).
+    """
+    level = np.asarray(smile, np.float64)
+    found: list[Event] = []
+    for start, end in runs(level > 0.5 * least):
+        peak = float(level[start:end].max())
+        if peak > least and np.count_nonzero(level[start:end] > least) >= 0.4 * rate_hz:
+            found.append((start / rate_hz, end / rate_hz, peak))
+    return found
+
+
+def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.04) -> Bools:
+    """Speech per frame of `audio` (n,) by energy over an adaptive floor; last part frame left out.
+
+    The floor is the quietest twentieth of the 8 s around; the threshold lies 8 dB above it, but always 16 to 34 dB
+    below the loud parts, so that neither hum, nor gain, nor talk without a pause confuses it. Offline: it looks ahead.
+    """
+    samples = np.asarray(audio, np.float64)
+    size = int(round(rate_hz * frame_s))
+    frames = len(samples) // size
+    if not frames:
+        return np.zeros(0, bool)
+    power = (samples[: frames * size].reshape(frames, size) ** 2).mean(axis=1)
+    level_db = 10 * np.log10(power + 1e-10)
+    loud_db = np.percentile(level_db, 97)
+    floor_db = ndimage.percentile_filter(level_db, 5, size=max(3, int(8 / frame_s)), mode="nearest")
+    threshold_db = np.clip(floor_db + 8, loud_db - 34, loud_db - 16)
+    active = (level_db > threshold_db) & (level_db > QUIET_DB)
+    return _without_short(active, True, 2)
+
+
+def _without_short(active: Bools, value: bool, frames: int) -> Bools:
+    out = active.copy()
+    for start, end in runs(active == value):
+        if end - start < frames:
+            out[start:end] = not value
+    return out
+
+
+def runs(mask: ArrayLike) -> list[tuple[int, int]]:
+    """Half-open [start, end) of every run of True in (N,)."""
+    bounds = np.flatnonzero(np.diff(np.r_[0, np.asarray(mask, np.int8), 0]))
+    return list(zip(bounds[::2].tolist(), bounds[1::2].tolist(), strict=True))
+
+
+def phrase_ends(voice_active: ArrayLike, rate_hz: float, silence_s: float = 0.2) -> NDArray[np.float64]:
+    """Seconds at which speech ends and at least `silence_s` of silence follows."""
+    active = np.asarray(voice_active, bool)
+    need = int(np.ceil(silence_s * rate_hz - 1e-9))
+    silences = runs(~active)
+    return np.array([start / rate_hz for start, end in silences if start > 0 and end - start >= need])
+
+
+def listening_mask(voice_active: ArrayLike, rate_hz: float, own_voice: ArrayLike | None = None) -> Bools:
+    """True where the other spoke in the last 2 s (this instant included) and the listener is silent."""
+    active = np.asarray(voice_active, bool)
+    last = np.maximum.accumulate(np.where(active, np.arange(len(active)), -(10**9)))
+    recent = np.arange(len(active)) - last <= LISTENING_S * rate_hz
+    return recent if own_voice is None else recent & ~np.asarray(own_voice, bool)
+
+
+def nods_per_minute(onsets_s: Sequence[float] | NDArray[np.float64], listening: ArrayLike, rate_hz: float) -> float:
+    """Onsets inside listening time per minute of it; NaN when there is none."""
+    inside, minutes = _inside(onsets_s, np.asarray(listening, bool), rate_hz)
+    return inside / minutes if minutes else float("nan")
+
+
+def _inside(onsets_s: Sequence[float] | NDArray[np.float64], mask: Bools, rate_hz: float) -> tuple[int, float]:
+    index = np.round(np.asarray(onsets_s, np.float64) * rate_hz).astype(int)
+    index = index[(index >= 0) & (index < len(mask))]
+    return int(mask[index].sum()), float(mask.sum()) / rate_hz / 60
+
+
+def phrase_end_counts(
+    onsets_s: Sequence[float] | NDArray[np.float64],
+    ends_s: Sequence[float] | NDArray[np.float64],
+    listening: ArrayLike,
+    rate_hz: float,
+) -> tuple[int, float, int, float]:
+    """Onsets and minutes in the two windows after phrase ends, both within listening time.
+
+    Returns (onsets after, minutes after, onsets later, minutes later): add them up over people, then divide.
+    An instant that lies in both (of two phrase ends) counts in both; within one window it counts once.
+    """
+    listened = np.asarray(listening, bool)
+    after = _window(ends_s, AFTER_S, len(listened), rate_hz) & listened
+    later = _window(ends_s, LATER_S, len(listened), rate_hz) & listened
+    return (*_inside(onsets_s, after, rate_hz), *_inside(onsets_s, later, rate_hz))
+
+
+def _window(
+    ends_s: Sequence[float] | NDArray[np.float64], span_s: tuple[float, float], size: int, rate: float
+) -> Bools:
+    mask = np.zeros(size, bool)
+    for end in ends_s:
+        mask[max(0, int(round((end + span_s[0]) * rate))) : max(0, int(round((end + span_s[1]) * rate)))] = True
+    return mask
+
+
+def phrase_end_ratio(
+    onsets_s: Sequence[float] | NDArray[np.float64],
+    ends_s: Sequence[float] | NDArray[np.float64],
+    listening: ArrayLike,
+    rate_hz: float,
+) -> float:
+    """Nod onsets per minute 0 to 0.8 s after a phrase end over those 1.5 to 3 s after it; NaN if undefined."""
+    return ratio_of(phrase_end_counts(onsets_s, ends_s, listening, rate_hz))
+
+
+def ratio_of(counts: Sequence[float]) -> float:
+    """(onsets after, minutes after, onsets later, minutes later), summed over people, as a ratio of rates."""
+    after, after_min, later, later_min = counts
+    if not later or not after_min or not later_min:
+        return float("nan")
+    return (after / after_min) / (later / later_min)

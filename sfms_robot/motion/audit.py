@@ -1,0 +1,67 @@
+"""Counts what a command stream did, from the outside: it shares no arithmetic with the limiter.
+
+Angles are judged as float64, by finite differences at nominal dt; ticks as they went over the wire, where rounding
+allows one tick more per period.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.frames import Doubles
+from sfms_robot.motion.calibration import Calibration
+from sfms_robot.motion.limits import JointLimits
+
+_TOLERANCE = 1e-6
+_CHANGED_RAD = 1e-6
+
+
+@dataclass(frozen=True)
+class AuditState:
+    """The last three angles (3, J), oldest first, the last ticks (J,), and the counts so far (ticks x joints)."""
+
+    recent_rad: Doubles
+    ticks: NDArray[np.int64]
+    violations: int = 0
+    clamped: int = 0
+
+
+class Audit:
+    """Holds the limits of the joints of one bus; `calibration` has the same joints in the same order."""
+
+    def __init__(self, limits: JointLimits, calibration: Calibration, dt_s: float) -> None:
+        self._limits, self._calibration, self._dt_s = limits, calibration, dt_s
+        self._bounds = np.stack([limits.speed, limits.acceleration, limits.jerk]) * (1 + _TOLERANCE)
+        self._stride_ticks = limits.speed * dt_s * np.abs(calibration.ticks_per_rad) * (1 + _TOLERANCE) + 1
+
+    def start(self, angles_rad: Doubles) -> AuditState:
+        """Standing still at `angles_rad` (J,), where the limiter started."""
+        return AuditState(np.tile(angles_rad, (3, 1)), self._calibration.to_ticks(angles_rad))
+
+    def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: AuditState) -> AuditState:
+        """Count one command (J,) against the limits, and against `wanted_rad` (J,), what the limiter was asked for.
+
+        A joint that breaks several limits in one tick counts once. An angle that is not finite is a violation, and
+        is not carried on.
+        """
+        finite = np.isfinite(angles_rad)
+        angles = np.where(finite, angles_rad, state.recent_rad[-1])
+        stream = np.concatenate([state.recent_rad, angles[None]])
+        rates = [np.diff(stream, order, axis=0)[-1] / self._dt_s**order for order in (1, 2, 3)]
+        bad = ~finite | (angles < self._limits.low) | (angles > self._limits.high)
+        bad |= (np.abs(rates) > self._bounds).any(axis=0)
+
+        ticks = self._calibration.to_ticks(angles)
+        bad |= (ticks < self._calibration.low_ticks) | (ticks > self._calibration.high_ticks)
+        bad |= np.abs(ticks - state.ticks) > self._stride_ticks
+        with np.errstate(invalid="ignore"):
+            clamped = ~(np.abs(angles_rad - wanted_rad) <= _CHANGED_RAD)
+        return AuditState(
+            stream[1:],
+            ticks,
+            state.violations + int(np.count_nonzero(bad)),
+            state.clamped + int(np.count_nonzero(clamped)),
+        )

@@ -1,0 +1,247 @@
+"""Position, speed, acceleration and jerk of every joint, never exceeded.
+
+The law: after every tick the state (position, speed, acceleration) of a joint can be brought to a stop inside its
+range, its speed and acceleration being within their limits all the way. A tick keeps it like this:
+
+1. If one tick of bounded jerk leads exactly to the reference sample, and the law holds there, the sample passes
+   unchanged: no lag, no chatter. Three equal pieces of constant jerk meet any position, speed and acceleration
+   exactly, so the test is a 3x3 product for all joints at once.
+2. Otherwise ruckig plans the fastest way to the reference and its first tick is the candidate, if the law holds.
+3. Otherwise the joint brakes for one tick. The braking curve of a lawful state stays lawful, so by induction there
+   is always a way out.
+
+Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, hence within
+the same limits. A reference that is not finite is refused: the joint brakes, and the tick is counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import ruckig
+from numpy.typing import NDArray
+
+from sfms_robot.config import Head
+from sfms_robot.frames import Doubles
+
+Bools = NDArray[np.bool_]
+
+# Rounding eats into a limit at about 1e-9 of it; the law is tested at 1e-6.
+_HEADROOM = 1 - 2e-7
+_SLACK = 1e-9
+_POSITION_SLACK_RAD = 1e-10
+
+# Three pieces of a third each, jerks (1, 0, 0), (0, 1, 0), (0, 0, 1): what they add to acceleration, speed, position
+# at the end of a tick of length 1. The inverse turns what is missing into jerks.
+_JERKS_FOR = np.linalg.inv(np.array([[1 / 3, 1 / 3, 1 / 3], [5 / 18, 3 / 18, 1 / 18], [19 / 162, 7 / 162, 1 / 162]]))
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """All (J,): range [rad], speed [rad/s], acceleration [rad/s^2], jerk [rad/s^3]."""
+
+    low: Doubles
+    high: Doubles
+    speed: Doubles
+    acceleration: Doubles
+    jerk: Doubles
+
+    @classmethod
+    def of(cls, head: Head, joints: Sequence[str] | None = None) -> JointLimits:
+        """Of a head's joints, all of them or those of one bus."""
+        names = tuple(head.joints) if joints is None else joints
+        classes = [head.limit(name) for name in names]
+        return cls(
+            np.array([head.joints[name].min_rad for name in names]),
+            np.array([head.joints[name].max_rad for name in names]),
+            np.radians([limit.speed_deg_s for limit in classes]),
+            np.radians([limit.acceleration_deg_s2 for limit in classes]),
+            np.radians([limit.jerk_deg_s3 for limit in classes]),
+        )
+
+
+@dataclass(frozen=True)
+class LimiterState:
+    """Position, speed, acceleration (3, J) after the last tick, and what was counted.
+
+    Attributes:
+        chased: ticks x joints where the reference was out of reach.
+        refused: ticks x joints where the reference was not finite.
+    """
+
+    motion: Doubles
+    chased: int = 0
+    refused: int = 0
+
+
+def reference(samples_rad: Doubles, step_s: float) -> Doubles:
+    """Angles (3, J) at t - step, t, t + step -> angle, speed, acceleration (3, J) at t, by central differences."""
+    before, here, after = samples_rad
+    return np.stack([here, (after - before) / (2 * step_s), (after - 2 * here + before) / step_s**2])
+
+
+class JerkLimiter:
+    """Implements `ports.Limiter` for joints that share one tick of `dt_s`."""
+
+    def __init__(self, limits: JointLimits, dt_s: float) -> None:
+        self._low, self._high = limits.low, limits.high
+        self._speed = limits.speed * _HEADROOM
+        self._acceleration = limits.acceleration * _HEADROOM
+        self._jerk = limits.jerk * _HEADROOM
+        self._dt_s = dt_s
+        self._planner = ruckig.Ruckig(1)
+        self._path = ruckig.Trajectory(1)
+        bounds = zip(self._speed.tolist(), self._acceleration.tolist(), self._jerk.tolist(), strict=True)
+        self._inputs = [_input(*bound, dt_s) for bound in bounds]
+
+    def start(self, angles_rad: Doubles) -> LimiterState:
+        """At rest at `angles_rad` (J,), moved to the edge of the range where it lies outside.
+
+        Raises ValueError when an angle is not finite.
+        """
+        if not np.isfinite(angles_rad).all():
+            raise ValueError(f"joint {int(np.argmin(np.isfinite(angles_rad)))} starts at an angle that is not finite")
+        still = np.zeros_like(self._low)
+        return LimiterState(np.stack([np.clip(angles_rad, self._low, self._high), still, still]))
+
+    def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
+        """Reference (3, J) one tick ahead -> angles (J,) that may be sent, and the state after the tick."""
+        finite: Bools = np.logical_and.reduce(np.isfinite(reference_rad), axis=0)
+        wanted = self._near(np.where(finite, reference_rad, state.motion))
+        after = wanted.copy()
+        passes = finite & self._in_one_tick(state.motion, wanted) & self._lawful(wanted)
+        hard = np.flatnonzero(~passes)
+        if len(hard):
+            targets = self._targets(wanted)
+            for j in hard.tolist():
+                after[:, j] = self._chased(j, state.motion[:, j], targets[:, j]) if finite[j] else np.nan
+            brakes = ~(passes | self._lawful(after))
+            if brakes.any():
+                stop = Stop.of(state.motion, self._acceleration, self._jerk).after(self._dt_s)
+                stop[0] += state.motion[0]
+                after = np.where(brakes, stop, after)
+        after[0] = np.minimum(np.maximum(after[0], self._low), self._high)
+        refused = int(len(finite) - np.count_nonzero(finite))
+        counted = LimiterState(after, state.chased + len(hard) - refused, state.refused + refused)
+        return after[0].copy(), counted
+
+    def _near(self, wanted: Doubles) -> Doubles:
+        """`wanted` (3, J) with what is absurdly far out of its limits brought just out of them: 1e300 overflows."""
+        bound = np.stack([1 + self._high, 2 * self._speed, 2 * self._acceleration])
+        floor = np.stack([self._low - 1, -bound[1], -bound[2]])
+        near: Doubles = np.minimum(np.maximum(wanted, floor), bound)
+        return near
+
+    def _in_one_tick(self, motion: Doubles, wanted: Doubles) -> Bools:
+        """Whether three pieces of bounded jerk lead from `motion` to `wanted` (3, J) in one tick."""
+        dt = self._dt_s
+        p, v, a = motion
+        missing = np.stack(
+            [
+                (wanted[2] - a) / dt,
+                (wanted[1] - v - a * dt) / dt**2,
+                (wanted[0] - p - v * dt - a * (dt**2 / 2)) / dt**3,
+            ]
+        )
+        jerks = _JERKS_FOR @ missing
+        inner = np.abs(np.stack([a + jerks[0] * (dt / 3), wanted[2] - jerks[2] * (dt / 3)]))
+        ok: Bools = (np.abs(jerks).max(axis=0) <= self._jerk) & (inner.max(axis=0) <= self._acceleration)
+        ok &= np.abs(wanted[0] - p) <= self._speed * dt
+        return ok
+
+    def _lawful(self, motion: Doubles) -> Bools:
+        """Whether states (3, J) can stop inside the range, speed and acceleration within limits all the way.
+
+        Nothing that is not finite is lawful.
+        """
+        p, v, a = motion
+        peak = v + a * np.abs(a) / (2 * self._jerk)  # speed by the time the acceleration is gone
+        # Stopping takes no more way than: acceleration to 0 first, then a whole stop from the highest speed.
+        top = np.abs(v) + a**2 / (2 * self._jerk)
+        last = top * ((np.abs(a) + self._acceleration) / self._jerk + top / (2 * self._acceleration))
+        first = -last
+        if not ((p + first >= self._low) & (p + last <= self._high)).all():
+            first, last = Stop.of(motion, self._acceleration, self._jerk).extent()
+        loose = 1 + _SLACK
+        ok: Bools = (np.abs(v) <= self._speed * loose) & (np.abs(peak) <= self._speed * loose)
+        ok &= np.abs(a) <= self._acceleration * loose
+        ok &= (p + first >= self._low - _POSITION_SLACK_RAD) & (p + last <= self._high + _POSITION_SLACK_RAD)
+        ok &= (p >= self._low - _POSITION_SLACK_RAD) & (p <= self._high + _POSITION_SLACK_RAD)
+        return ok
+
+    def _targets(self, wanted: Doubles) -> Doubles:
+        """`wanted` (3, J) made something ruckig may aim at: inside the range, lawful, or else standing still."""
+        p = np.minimum(np.maximum(wanted[0], self._low), self._high)
+        v = np.minimum(np.maximum(wanted[1], -self._speed), self._speed)
+        a = np.minimum(np.maximum(wanted[2], -self._acceleration), self._acceleration)
+        outside = p != wanted[0]
+        target = np.stack([p, np.where(outside, 0.0, v), np.where(outside, 0.0, a)])
+        target[2] *= self._lawful(target)
+        target[1:] *= self._lawful(target)
+        return target
+
+    def _chased(self, j: int, motion: Doubles, target: Doubles) -> Doubles:
+        """State (3,) of joint j after the first tick of the fastest way to `target`; NaN where ruckig finds none."""
+        given = self._inputs[j]
+        given.current_position, given.current_velocity, given.current_acceleration = ([x] for x in motion.tolist())
+        given.target_position, given.target_velocity, given.target_acceleration = ([x] for x in target.tolist())
+        try:
+            self._planner.calculate(given, self._path)
+        except ruckig.RuckigError:
+            return np.full(3, np.nan)
+        return np.array(self._path.at_time(self._dt_s))[:, 0]
+
+
+def _input(speed: float, acceleration: float, jerk: float, dt_s: float) -> ruckig.InputParameter:
+    given = ruckig.InputParameter(1)
+    given.max_velocity, given.max_acceleration, given.max_jerk = [speed], [acceleration], [jerk]
+    given.minimum_duration = dt_s
+    return given
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The fastest stop from states (3, J), everything along s, the sign of the speed once the acceleration is gone.
+
+    Jerk -J until the acceleration is -peak, which is held where it is the limit, then +J; all (J,).
+    """
+
+    s: Doubles
+    speed: Doubles
+    acceleration: Doubles
+    jerk: Doubles
+    times_s: tuple[Doubles, Doubles, Doubles]
+
+    @classmethod
+    def of(cls, motion: Doubles, acceleration: Doubles, jerk: Doubles) -> Stop:
+        v, a = motion[1], motion[2]
+        s = np.where(v + a * np.abs(a) / (2 * jerk) >= 0, 1.0, -1.0)
+        v, a = s * v, s * a
+        peak = np.minimum(np.sqrt(np.maximum(jerk * v + a**2 / 2, 0.0)), acceleration)
+        t1 = np.maximum((a + peak) / jerk, 0.0)
+        t2 = np.maximum(v + a * t1 - jerk * t1**2 / 2 - peak**2 / (2 * jerk), 0.0) / acceleration
+        return cls(s, v, a, jerk, (t1, t2, peak / jerk))
+
+    def after(self, time_s: float) -> Doubles:
+        """Way, speed and acceleration (3, J), with their signs, `time_s` into the stop; inf for its end."""
+        p, v, a = np.zeros_like(self.speed), self.speed, self.acceleration
+        left = np.full_like(v, time_s)
+        for jerk, lasts in zip((-self.jerk, 0.0, self.jerk), self.times_s, strict=True):
+            t = np.minimum(lasts, left)
+            left = left - t
+            p, v, a = p + v * t + a * t**2 / 2 + jerk * t**3 / 6, v + a * t + jerk * t**2 / 2, a + jerk * t
+        over = left > 0  # what rounding leaves of speed and acceleration at the end is none
+        return np.stack([self.s * p, np.where(over, 0.0, self.s * v), np.where(over, 0.0, self.s * a)])
+
+    def extent(self) -> tuple[Doubles, Doubles]:
+        """How far it goes below and above the position it starts from [rad].
+
+        Where the joint moves against s at first, it turns round on the way, while the acceleration still falls.
+        """
+        end = self.after(np.inf)[0]
+        back = np.minimum(self.speed, 0.0)
+        t = (self.acceleration - np.sqrt(np.maximum(self.acceleration**2 + 2 * self.jerk * back, 0.0))) / self.jerk
+        turn = np.where(back < 0, self.s * (back * t + self.acceleration * t**2 / 2 - self.jerk * t**3 / 6), 0.0)
+        return np.minimum(np.minimum(end, turn), 0.0), np.maximum(np.maximum(end, turn), 0.0)

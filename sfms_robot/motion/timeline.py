@@ -1,0 +1,315 @@
+"""Joins plans and plays them at any instant, with continuous speed and acceleration.
+
+A plan gives a face every 40 ms; servos want one every tick, at tick time plus their own lead. Between two frames
+every channel follows a quintic that matches value, slope and curvature at both ends, so that a jerk limiter behind
+it has nothing to repair. Two rules for slope and curvature at a frame:
+
+- pose: central differences of fourth order (second order where frames are unevenly spaced or too few). The head
+  may swing a little past a frame, as a head does.
+- blendshapes: the harmonic-mean slopes of Fritsch and Carlson (1980), no curvature beside a flat stretch, and the
+  curve kept between the two frames' values: it never overshoots, so 0 stays 0 and a closed lid stays closed.
+
+A blink is two frames long, and a peak that falls between two ticks would be shaved off. The blink channels are
+therefore widened by half a tick on either side: the tick nearest to the peak sees the peak.
+
+A newer plan replaces the older from its first time on. Where both have a frame they are blended over two frames,
+blinks by maximum. What was played already (leads included), and the piece of curve that is in play, stay as they
+were: a late plan bends the future, it never makes the present jump. Past the last frame the curve goes on for
+one frame at most, then holds. A plan that comes too late for all its frames is still where the face goes next.
+When no plan came for half a second the face eases to neutral.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats, Plan
+
+BLEND_FRAMES = 2
+STALL_S = 0.5  # without a plan for this long, ease to neutral
+EASE_S = 1.0
+HISTORY = 8  # frames kept before the one in play
+JAW_FULL_OPEN_RAD = math.radians(25.0)  # jaw pitch that stands for jawOpen = 1
+_EVEN = 1e-3  # frames count as evenly spaced within this share of a frame
+_BLINKS = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
+_JAW_OPEN = CHANNEL_INDEX["jawOpen"]
+
+
+@dataclass(frozen=True)
+class _Knots:
+    """Frames with slope and curvature: times (K,), the others (K, 58), per second."""
+
+    times_s: Doubles
+    values: Doubles
+    slopes: Doubles
+    bends: Doubles
+
+    def fields(self) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+        return self.times_s, self.values, self.slopes, self.bends
+
+    def part(self, first: int, stop: int) -> _Knots:
+        cut = slice(first, stop)
+        return _Knots(self.times_s[cut], self.values[cut], self.slopes[cut], self.bends[cut])
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A piecewise quintic. The last knot is made up: one frame of extrapolation, then rest.
+
+    Attributes:
+        knots: K frames; everything is known up to `end_s`, the last but one.
+        coefficients: (K-1, 6, 58) of the powers 0..5 of the position in the piece, 0..1.
+        low, high: (K-1, 58) bounds of each piece.
+        made_at_s: of the newest plan.
+        delay_s: one frame for plans of a single frame, which could not be interpolated otherwise.
+    """
+
+    knots: _Knots
+    coefficients: Doubles
+    low: Doubles
+    high: Doubles
+    made_at_s: float
+    delay_s: float
+
+    @property
+    def end_s(self) -> float:
+        return float(self.knots.times_s[-2])
+
+
+@dataclass(frozen=True)
+class TimelineState:
+    """What the timeline remembers; bounded, whatever the length of the run.
+
+    Attributes:
+        curve: None before the first plan.
+        played_s: latest instant of the curve that was asked for.
+        held: samples that ran past the horizon and one frame more.
+        eased: samples on the way to neutral, or there, because no plan came.
+        late: plans whose frames were all in the past.
+        refused: plans thrown away: not finite, or older than the one before.
+    """
+
+    curve: Curve | None = None
+    played_s: float = -math.inf
+    held: int = 0
+    eased: int = 0
+    late: int = 0
+    refused: int = 0
+
+
+def horizon_left_s(horizon: int, hop: int, latency_s: float) -> float:
+    """Longest lead [s] that never runs past the plan: plans of `horizon` frames every `hop`, visible after `latency_s`.
+
+    Negative when plans come too late even without a lead.
+    """
+    delay = 1 if horizon == 1 else 0
+    return (horizon - hop + delay) * FRAME_S - latency_s
+
+
+class PlanTimeline:
+    """Implements `ports.Timeline`.
+
+    Args:
+        tick_s: period of the ticks it will be sampled at; only the widening of blinks depends on it.
+    """
+
+    def __init__(self, tick_s: float) -> None:
+        self._half_tick_s = tick_s / 2
+
+    def start(self) -> TimelineState:
+        return TimelineState()
+
+    def accept(self, plan: Plan, state: TimelineState) -> TimelineState:
+        """The state with `plan` joined on; a plan that cannot be used is counted in `refused`, never raised."""
+        old = state.curve
+        if not _usable(plan) or (old is not None and plan.made_at_s < old.made_at_s):
+            return replace(state, refused=state.refused + 1)
+        times_s = np.asarray(plan.times_s, dtype=np.float64)
+        frames = _frames(plan)
+        step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else FRAME_S
+
+        delay_s = FRAME_S if len(times_s) == 1 else 0.0
+        played_s = state.played_s if old is not None else state.played_s - delay_s
+
+        past, broken = _past(old, played_s, float(times_s[0]), step_s)
+        new = times_s > past.times_s[-1] + step_s / 4
+        late = not new.any()
+        if late:
+            times_s, frames = past.times_s[-1:] + step_s, frames[-1:]
+        else:
+            times_s, frames = times_s[new], frames[new]
+        for i in range(min(BLEND_FRAMES, len(times_s))):
+            if broken or (old is not None and times_s[i] <= old.end_s + step_s / 4):
+                frames[i] = _blend(_motion(old, times_s[i : i + 1])[0], frames[i], (i + 1) / (BLEND_FRAMES + 1))
+        knots = _joined(past, times_s, frames, step_s, played_s)
+        curve = _curve(knots, plan.made_at_s, delay_s)
+        return replace(state, curve=curve, played_s=played_s, late=state.late + late)
+
+    def sample(self, times_s: Doubles, now_s: float, state: TimelineState) -> tuple[Floats, TimelineState]:
+        """Motion (N, 58) at (N,) instants, in any order; neutral before the first plan.
+
+        `now_s` is the time of the tick; instants after it are leads.
+        """
+        curve = state.curve
+        played_s = max(state.played_s, float(np.max(times_s)) - (curve.delay_s if curve else 0.0))
+        if curve is None:
+            return np.zeros((len(times_s), MOTION_DIM), np.float32), replace(state, played_s=played_s)
+        asked_s = times_s - curve.delay_s
+        motion = _motion(curve, asked_s)
+        around_s = np.concatenate([asked_s - self._half_tick_s, asked_s + self._half_tick_s])
+        widened = _motion(curve, around_s, _BLINKS).reshape(2, len(asked_s), -1).max(axis=0)
+        motion[:, _BLINKS] = np.maximum(motion[:, _BLINKS], widened)
+        motion[:, _BLINKS] = np.maximum(motion[:, _BLINKS], self._near(curve, asked_s))
+        held = bool(played_s > curve.knots.times_s[-1])
+        eased = now_s - curve.delay_s - curve.made_at_s > STALL_S
+        return motion.astype(np.float32), replace(
+            state, played_s=played_s, held=state.held + held, eased=state.eased + eased
+        )
+
+    def _near(self, curve: Curve, asked_s: Doubles) -> Doubles:
+        """Blink (N, 2) of a frame less than half a tick away, 0 where there is none."""
+        times_s = curve.knots.times_s
+        nearest = np.searchsorted(times_s, asked_s + self._half_tick_s, side="right") - 1
+        near = np.abs(times_s[np.maximum(nearest, 0)] - asked_s) <= self._half_tick_s
+        blinks: Doubles = curve.knots.values[np.maximum(nearest, 0), _BLINKS]
+        return blinks * (near & (nearest >= 0) & (asked_s - curve.made_at_s < STALL_S))[:, None]
+
+
+def _blend(before: Doubles, after: Doubles, share: float) -> Doubles:
+    """Between two motions (58,), `share` of the later one; blinks by maximum."""
+    blend = (1 - share) * before + share * after
+    blend[_BLINKS] = np.maximum(before[_BLINKS], after[_BLINKS])
+    return blend
+
+
+def _usable(plan: Plan) -> bool:
+    """Finite, in time order, 58 wide."""
+    frames, times_s = np.asarray(plan.frames), np.asarray(plan.times_s)
+    shaped = times_s.ndim == 1 and len(times_s) > 0 and frames.shape == (len(times_s), MOTION_DIM)
+    jaw_ok = plan.jaw_rad is None or bool(np.isfinite(plan.jaw_rad).all())
+    return (
+        shaped
+        and bool(np.isfinite(frames).all() and np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
+        and jaw_ok
+        and math.isfinite(plan.made_at_s)
+    )
+
+
+def _frames(plan: Plan) -> Doubles:
+    """Frames (H, 58) with blendshapes in 0..1, and the jaw pose, when there is one, in the place of jawOpen."""
+    frames = np.array(plan.frames, dtype=np.float64)
+    if plan.jaw_rad is not None:  # axis-angle; y points left, so + about y lowers the chin
+        frames[:, _JAW_OPEN] = plan.jaw_rad[:, 1] / JAW_FULL_OPEN_RAD
+    frames[:, SHAPES] = np.clip(frames[:, SHAPES], 0.0, 1.0)
+    return frames
+
+
+def _past(old: Curve | None, played_s: float, first_s: float, step_s: float) -> tuple[_Knots, bool]:
+    """Knots that a plan starting at `first_s` joins on to, and whether the old curve had run out before it."""
+    if old is not None and played_s <= old.knots.times_s[-1] and first_s <= old.end_s + 1.5 * step_s:
+        times_s = old.knots.times_s
+        in_play = int(np.searchsorted(times_s, played_s, side="left"))  # the knot that ends the piece in play
+        if in_play == len(times_s) - 1:  # that knot is made up: leave the piece where it is now
+            known, here = old.knots.part(max(0, in_play - HISTORY), in_play), _here(old, played_s)
+            return _Knots(*(np.concatenate(pair) for pair in zip(known.fields(), here.fields(), strict=True))), False
+        before = int(np.searchsorted(times_s[:-1], first_s - step_s / 4, side="left"))
+        return old.knots.part(max(0, min(in_play, before) - HISTORY), max(in_play + 1, before)), False
+    at_s = np.array([played_s if math.isfinite(played_s) else first_s - step_s])
+    still = np.zeros((1, MOTION_DIM))
+    return _Knots(at_s, _motion(old, at_s), still, still), True
+
+
+def _here(curve: Curve, at_s: float) -> _Knots:
+    """The curve at one instant of its last piece, as a knot."""
+    start_s, end_s = curve.knots.times_s[-2:]
+    width, c = end_s - start_s, curve.coefficients[-1]
+    u = (at_s - start_s) / width
+    slope = sum(k * c[k] * u ** (k - 1) for k in range(1, 6)) / width
+    bend = sum(k * (k - 1) * c[k] * u ** (k - 2) for k in range(2, 6)) / width**2
+    value = _motion(curve, np.array([at_s]))
+    return _Knots(np.array([at_s]), value, np.reshape(slope, (1, -1)), np.reshape(bend, (1, -1)))
+
+
+def _joined(past: _Knots, times_s: Doubles, frames: Doubles, step_s: float, played_s: float) -> _Knots:
+    """All knots, the made-up last one included; slopes are kept where they were played, made anew after."""
+    overrun = frames[-1] + (frames[-1] - (frames[-2] if len(frames) > 1 else past.values[-1]))
+    overrun[SHAPES] = np.clip(overrun[SHAPES], 0.0, 1.0)
+    all_times = np.concatenate([past.times_s, times_s, times_s[-1:] + step_s])
+    values = np.concatenate([past.values, frames, overrun[None]])
+    slopes, bends = _derivatives(all_times, values)
+    kept = min(len(past.times_s), int(np.searchsorted(past.times_s, played_s, side="left")) + 1)
+    slopes[:kept], bends[:kept] = past.slopes[:kept], past.bends[:kept]
+    return _Knots(all_times, values, slopes, bends)
+
+
+def _derivatives(times_s: Doubles, values: Doubles) -> tuple[Doubles, Doubles]:
+    """Slopes and curvatures (K, 58) at the knots; both 0 at the two ends."""
+    width = np.diff(times_s)[:, None]
+    chord = np.diff(values, axis=0) / width
+    left, right, wl, wr = chord[:-1], chord[1:], width[:-1], width[1:]
+    slopes, bends = np.zeros_like(values), np.zeros_like(values)
+    slopes[1:-1] = (wr * left + wl * right) / (wl + wr)
+    bends[1:-1] = 2 * (right - left) / (wl + wr)
+    for i in range(2, len(times_s) - 2):
+        if np.ptp(width[i - 2 : i + 2]) < _EVEN * width[i]:
+            a, b, c, d, e = values[i - 2 : i + 3]
+            slopes[i] = (a - 8 * b + 8 * d - e) / (12 * width[i])
+            bends[i] = (-a + 16 * b - 30 * c + 16 * d - e) / (12 * width[i] ** 2)
+    if len(times_s) > 3 and np.ptp(width[-3:-1]) < _EVEN * width[-2]:  # nothing is known past the last frame
+        a, b, c = values[-4:-1]
+        slopes[-2], bends[-2] = (a - 4 * b + 3 * c) / (2 * width[-2]), (a - 2 * b + c) / width[-2] ** 2
+
+    bends[1:-1, SHAPES] = 2 * (right - left)[:, SHAPES] / (wl + wr)
+    left, right = left[:, SHAPES], right[:, SHAPES]
+    turns = left * right <= 0
+    safe_left, safe_right = np.where(turns, 1.0, left), np.where(turns, 1.0, right)
+    a, b = 2 * wr + wl, wr + 2 * wl
+    slopes[1:-1, SHAPES] = np.where(turns, 0.0, (a + b) / (a / safe_left + b / safe_right))
+    bends[1:-1, SHAPES] *= (left != 0) & (right != 0)
+    return slopes, bends
+
+
+def _curve(knots: _Knots, made_at_s: float, delay_s: float) -> Curve:
+    width = np.diff(knots.times_s)[:, None]
+    start, end = knots.values[:-1], knots.values[1:]
+    rise = end - start
+    m0, m1 = knots.slopes[:-1] * width, knots.slopes[1:] * width
+    b0, b1 = knots.bends[:-1] * width**2, knots.bends[1:] * width**2
+    coefficients = np.stack(
+        [
+            start,
+            m0,
+            b0 / 2,
+            10 * rise - 6 * m0 - 4 * m1 - 1.5 * b0 + 0.5 * b1,
+            -15 * rise + 8 * m0 + 7 * m1 + 1.5 * b0 - b1,
+            6 * rise - 3 * m0 - 3 * m1 - 0.5 * b0 + 0.5 * b1,
+        ],
+        axis=1,
+    )
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    low[:, POSE], high[:, POSE] = -np.inf, np.inf
+    return Curve(knots, coefficients, low, high, made_at_s, delay_s)
+
+
+def _motion(curve: Curve | None, asked_s: Doubles, columns: slice = slice(None)) -> Doubles:
+    """Motion (N, columns) on the curve's own time; held outside it, faded to neutral once plans stopped coming."""
+    if curve is None:
+        return np.zeros((len(asked_s), MOTION_DIM))[:, columns]
+    times_s = curve.knots.times_s
+    piece = np.clip(np.searchsorted(times_s, asked_s, side="right") - 1, 0, len(times_s) - 2)
+    along = np.clip((asked_s - times_s[piece]) / (times_s[piece + 1] - times_s[piece]), 0.0, 1.0)
+    powers = np.ones((len(asked_s), 6))
+    np.multiply.accumulate(np.broadcast_to(along[:, None], (len(along), 5)), axis=1, out=powers[:, 1:])
+    out = np.empty((len(asked_s), len(range(MOTION_DIM)[columns])))
+    for i in set(piece.tolist()):  # leads differ by less than a frame: one piece or two
+        rows = piece == i
+        values = powers[rows] @ curve.coefficients[i, :, columns]
+        out[rows] = np.minimum(np.maximum(values, curve.low[i, columns]), curve.high[i, columns])
+    gone = (asked_s - curve.made_at_s - STALL_S) / EASE_S
+    if np.max(gone) > 0:
+        u = np.clip(gone, 0.0, 1.0)
+        out *= (1 - u**3 * (10 - 15 * u + 6 * u**2))[:, None]
+    return out

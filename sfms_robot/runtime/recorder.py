@@ -1,0 +1,237 @@
+"""The run as a file: an observer that writes DIR/run.mcap, which `replay` and Foxglove open.
+
+The loop only drops a value into a bounded queue; a thread of its own encodes and writes. When the queue is full a
+value is dropped and counted, never waited for - except in virtual time, where waiting costs nothing and the file must
+be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second.
+
+Topics: /speaker (25 Hz: sound, level, face), /plan (per plan), /face (per tick: the 58 channels asked for),
+/joints (per tick and joint: goal, present, age, fault).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import logging
+import math
+import queue
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO, Final, Literal
+
+import numpy as np
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.signals.audio import energy_db
+
+RUN_FILE: Final = "run.mcap"
+REPORT_FILE: Final = "report.json"
+FullPolicy = Literal["drop", "wait"]
+
+_QUEUE_LENGTH: Final = 2000  # ten seconds of a 100 Hz loop
+_CHUNK_BYTES: Final = 64 * 1024  # short stalls, and little is lost when a run is killed
+_DIGITS: Final = 5
+_log = logging.getLogger(__name__)
+
+_NUMBER: Final = {"type": "number"}
+_NUMBER_OR_NULL: Final = {"type": ["number", "null"]}
+_CHANNELS: Final[Mapping[str, Any]] = dict.fromkeys(CHANNELS, _NUMBER_OR_NULL)
+_JOINT: Final = {
+    "type": "object",
+    "properties": {
+        "goal_rad": _NUMBER,
+        "present_rad": _NUMBER_OR_NULL,
+        "age_s": _NUMBER_OR_NULL,
+        "fault": {"type": ["string", "null"]},
+    },
+}
+_SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "/speaker": {
+        "time_s": _NUMBER,
+        "audio_pcm16": {"type": "string", "contentEncoding": "base64"},
+        "audio_hz": _NUMBER,
+        "energy_db": _NUMBER,
+        "face": {"type": ["object", "null"], "properties": _CHANNELS},
+    },
+    "/plan": {
+        "made_at_s": _NUMBER,
+        "times_s": {"type": "array", "items": _NUMBER},
+        "frames": {"type": "array", "items": {"type": "array", "items": _NUMBER}},
+    },
+    "/face": {"time_s": _NUMBER, **_CHANNELS},
+    "/joints": {"time_s": _NUMBER, "joints": {"type": "object", "additionalProperties": _JOINT}},
+}
+
+
+class Recorder:
+    """`ports.Observer` that writes a run to a folder.
+
+    joints: names, in the order of `Tick.goals_rad`. when_full: "drop" beside a real clock, "wait" in virtual time.
+    about: what else to keep in the file, text by text. Raises ConfigError when the folder cannot be written to.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        joints: Sequence[str],
+        when_full: FullPolicy = "drop",
+        about: Mapping[str, str] | None = None,
+        queue_length: int = _QUEUE_LENGTH,
+    ) -> None:
+        self._joints = tuple(joints)
+        self._wait = when_full == "wait"
+        self._queue: queue.Queue[Tick | SpeakerFrame | Plan | None] = queue.Queue(queue_length)
+        self._dropped = 0
+        self._written = 0
+        self._trouble: str | None = None
+        self._closed = False
+        self._file = _open(folder)
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
+        self._channels = self._begin(about or {})
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    def tick(self, seen: Tick) -> None:
+        """One turn of the loop. The readings are copied: the bus may go on changing its own."""
+        self._put(replace(seen, readings=dict(seen.readings)))
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        """What the person did."""
+        self._put(frame)
+
+    def planned(self, plan: Plan) -> None:
+        """What the listener answered."""
+        self._put(plan)
+
+    def close(self) -> None:
+        """Write what is queued and finish the file. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.put(None)
+        self._thread.join()
+        self._attempt(self._writer.finish)
+        self._attempt(self._file.close)
+        if self._trouble:
+            _log.warning("the recording is not whole: %s", self._trouble)
+        if self._dropped:
+            _log.warning("the recording lacks %d values: the disk was too slow", self._dropped)
+
+    def statistics(self) -> dict[str, Any]:
+        """Messages written, values dropped, and what went wrong with the file, for the report."""
+        return {"messages": self._written, "dropped": self._dropped, "trouble": self._trouble}
+
+    def _put(self, value: Tick | SpeakerFrame | Plan) -> None:
+        if self._closed:
+            return
+        try:
+            self._queue.put(value, block=self._wait)
+        except queue.Full:
+            self._dropped += 1
+
+    def _begin(self, about: Mapping[str, str]) -> dict[str, int]:
+        self._writer.start(profile="", library="sfms-robot")
+        self._writer.add_metadata("run", {**about, "joints": json.dumps(self._joints)})
+        channels = {}
+        for topic, properties in _SCHEMAS.items():
+            schema = json.dumps({"type": "object", "properties": properties}).encode()
+            number = self._writer.register_schema(f"sfms_robot{topic.replace('/', '.')}", "jsonschema", schema)
+            channels[topic] = self._writer.register_channel(topic, "json", number)
+        return channels
+
+    def _work(self) -> None:
+        """The thread: runs till close. After trouble with the file it goes on emptying the queue."""
+        while (value := self._queue.get()) is not None:
+            if self._trouble is None:
+                self._attempt(partial(self._write, value))
+
+    def _attempt(self, action: Callable[[], Any]) -> None:
+        try:
+            action()
+        except (OSError, ValueError) as error:
+            self._trouble = self._trouble or str(error)
+
+    def _write(self, value: Tick | SpeakerFrame | Plan) -> None:
+        for topic, time_s, body in _messages(value, self._joints):
+            time_ns = max(0, round(time_s * 1e9))
+            data = json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
+            self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
+            self._written += 1
+
+
+def write_report(folder: Path, report: Mapping[str, Any]) -> None:
+    """DIR/report.json, whole or not at all. Raises ConfigError when the folder cannot be written to."""
+    part = folder / (REPORT_FILE + ".part")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        part.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        part.replace(folder / REPORT_FILE)
+    except OSError as error:
+        raise ConfigError(f"--record {folder}: cannot be written to: {error.strerror or error}") from error
+
+
+def _open(folder: Path) -> BinaryIO:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return (folder / RUN_FILE).open("wb")
+    except OSError as error:
+        raise ConfigError(f"--record {folder}: cannot be written to: {error.strerror or error}") from error
+
+
+def _messages(value: Tick | SpeakerFrame | Plan, joints: Sequence[str]) -> list[tuple[str, float, dict[str, Any]]]:
+    """What one value becomes in the file: topic, time, body."""
+    if isinstance(value, Plan):
+        body = {
+            "made_at_s": value.made_at_s,
+            "times_s": _numbers(value.times_s),
+            "frames": [_numbers(frame) for frame in value.frames],
+        }
+        return [("/plan", value.made_at_s, body)]
+    if isinstance(value, SpeakerFrame):
+        return [("/speaker", value.time_s, _speaker_body(value))]
+    face = {"time_s": value.time_s, **_by_channel(value.motion)}
+    return [("/face", value.time_s, face), ("/joints", value.time_s, _joints_body(value, joints))]
+
+
+def _speaker_body(frame: SpeakerFrame) -> dict[str, Any]:
+    pcm = np.round(np.clip(frame.audio, -1.0, 1.0) * 32767).astype("<i2")
+    return {
+        "time_s": frame.time_s,
+        "audio_pcm16": base64.b64encode(pcm.tobytes()).decode(),
+        "audio_hz": AUDIO_HZ,
+        "energy_db": round(energy_db(frame.audio), 2),
+        "face": None if frame.face is None else _by_channel(frame.face.motion),
+    }
+
+
+def _joints_body(seen: Tick, joints: Sequence[str]) -> dict[str, Any]:
+    body = {}
+    for name, goal_rad in zip(joints, _numbers(seen.goals_rad), strict=True):
+        reading = seen.readings.get(name)
+        body[name] = {
+            "goal_rad": goal_rad,
+            "present_rad": None if reading is None or reading.position_rad is None else _number(reading.position_rad),
+            "age_s": None if reading is None else _number(reading.age_s),
+            "fault": None if reading is None else reading.fault,
+        }
+    return {"time_s": seen.time_s, "joints": body}
+
+
+def _by_channel(motion: Floats) -> dict[str, float | None]:
+    return dict(zip(CHANNELS, _numbers(motion), strict=True))
+
+
+def _number(value: float) -> float | None:
+    """JSON has no inf and no NaN: null."""
+    return round(float(value), _DIGITS) if math.isfinite(value) else None
+
+
+def _numbers(values: NDArray[np.floating]) -> list[float | None]:
+    return [_number(value) for value in values.tolist()]

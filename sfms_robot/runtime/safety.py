@@ -1,0 +1,102 @@
+"""What keeps a run safe from the outside: the way to rest, signals turned into a flag, real-time priority."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from sfms_robot.errors import RobotError
+from sfms_robot.frames import Doubles
+from sfms_robot.ports import Bus, Clock, Limiter
+from sfms_robot.runtime.clock import beats
+from sfms_robot.runtime.log import RunLog
+
+EASE_S = 1.0  # torque-on pose -> live face, and live face -> rest
+SETTLE_S = 2.0  # a slow joint may need longer than EASE_S; after this the torque goes off all the same
+ARRIVED_RAD = 1e-4
+
+logger = logging.getLogger(__name__)
+
+
+def smooth(u: float) -> float:
+    """0 -> 0, 1 -> 1 with speed and acceleration zero at both ends (quintic)."""
+    u = min(1.0, max(0.0, u))
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def come_to_rest(
+    bus: Bus,
+    limiter: Limiter,
+    state: Any,
+    from_rad: Doubles,
+    rest_rad: Doubles,
+    clock: Clock,
+    log: RunLog,
+    rate_hz: float,
+) -> None:
+    """Ease every joint to its rest angle under the limits. A bus that fails on the way ends it early, with a line."""
+    period_s = 1.0 / rate_hz
+    span = rest_rad - from_rad
+    start_s = clock.now_s()
+    try:
+        for beat in beats(clock, rate_hz):
+            now_s = beat.time_s - start_s
+            weights = [smooth((now_s + k * period_s) / EASE_S) for k in (-1, 0, 1)]
+            angle, before, ahead = weights[1], weights[0], weights[2]
+            reference = np.stack(
+                [
+                    from_rad + angle * span,
+                    (ahead - before) / (2 * period_s) * span,
+                    (ahead - 2 * angle + before) / period_s**2 * span,
+                ]
+            )
+            goals_rad, state = limiter.step(reference, state)
+            bus.write(goals_rad, beat.time_s)
+            log.ease(beat, goals_rad, reference[0])
+            bus.poll(beat.time_s)
+            arrived = bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD))
+            if now_s >= EASE_S + SETTLE_S or (arrived and now_s >= EASE_S):
+                return
+    except RobotError as error:
+        logger.error("could not ease to rest: %s", error)
+
+
+@contextmanager
+def interrupt_flag() -> Iterator[Callable[[], bool]]:
+    """SIGINT and SIGTERM set a flag instead of raising, so that no write is cut in half. Restored on exit."""
+    caught: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        caught.append(number)
+
+    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(caught)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def realtime_priority(wanted: bool = True) -> Iterator[str]:
+    """SCHED_FIFO while inside, where the system grants it. Yields "fifo", "not asked for", or why it was refused."""
+    if not wanted:
+        yield "not asked for"
+        return
+    try:
+        before = (os.sched_getscheduler(0), os.sched_getparam(0))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
+    except (AttributeError, OSError) as error:
+        yield f"refused: {error}"
+        return
+    try:
+        yield "fifo"
+    finally:
+        os.sched_setscheduler(0, *before)

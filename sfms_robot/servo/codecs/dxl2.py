@@ -1,0 +1,176 @@
+"""Dynamixel Protocol 2.0 packets: values in, bytes out, and back. Opens no port.
+
+    FF FF FD 00 | id | length (2) | instruction | parameters ... | crc (2)
+
+1. `length` counts instruction, parameters and crc, after stuffing. Words travel low byte first.
+2. A status packet is instruction 0x55 whose first parameter is the error byte; bit 7 of it is the alert.
+3. Stuffing: between instruction and crc, every FF FF FD is followed by one more FD, so the header FF FF FD 00
+   never appears inside a packet. The crc is over the stuffed bytes.
+4. A reader that lost its place looks for the next header; a header inside an unfinished packet means that the
+   packet was cut off, and reading goes on at that header.
+
+Source: ROBOTIS e-manual, docs/en/dxl/protocol2.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+from sfms_robot.errors import PacketError
+
+PING: Final = 0x01
+READ: Final = 0x02
+WRITE: Final = 0x03
+REG_WRITE: Final = 0x04
+ACTION: Final = 0x05
+FACTORY_RESET: Final = 0x06
+REBOOT: Final = 0x08
+CLEAR: Final = 0x10
+STATUS: Final = 0x55
+SYNC_READ: Final = 0x82
+SYNC_WRITE: Final = 0x83
+FAST_SYNC_READ: Final = 0x8A
+BULK_READ: Final = 0x92
+BULK_WRITE: Final = 0x93
+
+# Error byte of a status packet.
+ALERT: Final = 0x80
+ERRORS: Final = {
+    1: "result fail",
+    2: "instruction error",
+    3: "crc error",
+    4: "data range error",
+    5: "data length error",
+    6: "data limit error",
+    7: "access error",
+}
+INSTRUCTION_ERROR: Final = 2
+DATA_RANGE_ERROR: Final = 4
+DATA_LENGTH_ERROR: Final = 5
+DATA_LIMIT_ERROR: Final = 6
+ACCESS_ERROR: Final = 7
+
+BROADCAST: Final = 0xFE
+MAX_ID: Final = 252
+MAX_PACKET: Final = 1024  # bytes; longer claims are rubbish, and bound what a reader holds
+STATUS_OVERHEAD: Final = 11  # bytes of a status packet beside its data
+
+_HEADER: Final = b"\xff\xff\xfd\x00"
+_LOOKALIKE: Final = b"\xff\xff\xfd"
+_STUFFED: Final = b"\xff\xff\xfd\xfd"
+
+
+class Packet(NamedTuple):
+    """One packet. Of a status, `params` is the data behind the error byte; of an instruction, `error` is 0."""
+
+    servo: int
+    instruction: int
+    params: bytes
+    error: int = 0
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
+        table.append(crc & 0xFFFF)
+    return tuple(table)
+
+
+_CRC: Final = _crc_table()
+
+
+def crc16(data: bytes | bytearray, crc: int = 0) -> int:
+    """CRC-16/BUYPASS: polynomial 0x8005, start 0, not reflected. `crc` continues an earlier call."""
+    table = _CRC
+    for byte in data:
+        crc = ((crc & 0xFF) << 8) ^ table[(crc >> 8) ^ byte]
+    return crc
+
+
+def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> bytes:
+    """An instruction packet. Raises PacketError when it would be longer than `MAX_PACKET`."""
+    return _encode(servo, (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED))
+
+
+def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:
+    """A status packet, as a servo sends it."""
+    return _encode(servo, (bytes([STATUS, error]) + data).replace(_LOOKALIKE, _STUFFED))
+
+
+def encode_fast_status(replies: Iterable[tuple[int, int, bytes]]) -> bytes:
+    """The one status packet that answers a fast sync read; `replies` are (id, error, data) in list order.
+
+    Each device appends error, id, data and the crc of everything so far; the last crc closes the packet. Nothing is
+    stuffed: a device cannot know what the ones before it sent.
+    """
+    parts = [bytes([error, servo]) + data for servo, error, data in replies]
+    out = _HEADER + bytes([BROADCAST]) + (1 + sum(len(part) + 2 for part in parts)).to_bytes(2, "little")
+    out += bytes([STATUS])
+    for part in parts:
+        out += part
+        out += crc16(out).to_bytes(2, "little")
+    return out
+
+
+def _encode(servo: int, body: bytes) -> bytes:
+    if len(body) + 9 > MAX_PACKET:
+        raise PacketError(f"a packet of {len(body) + 9} bytes is longer than {MAX_PACKET}")
+    packet = _HEADER + bytes([servo]) + (len(body) + 2).to_bytes(2, "little") + body
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+def maybe_packet(buffer: bytearray) -> Packet | None:
+    """Take the first whole packet off the front of `buffer`, or None: more bytes are needed.
+
+    Rubbish in front of it is dropped, as is a packet whose crc is wrong. What stays in the buffer after None is at
+    most one unfinished packet, so a caller that empties it after each read holds a bounded number of bytes.
+    """
+    while True:
+        start = buffer.find(_HEADER)
+        if start < 0:
+            del buffer[: len(buffer) - _header_begun(buffer)]
+            return None
+        del buffer[:start]
+        if len(buffer) < 7:
+            return None
+        servo, length = buffer[4], buffer[5] | buffer[6] << 8
+        total = length + 7
+        if length < 3 or total > MAX_PACKET or servo in (0xFD, 0xFF):
+            del buffer[0]
+            continue
+        if len(buffer) < total:
+            again = buffer.find(_HEADER, 7)
+            if 7 <= again <= total - 6:  # a header wholly in front of the crc: this packet was cut off
+                del buffer[:again]
+                continue
+            return None
+        if crc16(buffer[: total - 2]) != buffer[total - 2] | buffer[total - 1] << 8:
+            del buffer[0]
+            continue
+        body = bytes(buffer[7 : total - 2])
+        if body[0] == STATUS and len(body) < 2:
+            del buffer[0]
+            continue
+        del buffer[:total]
+        if _STUFFED in body:
+            body = body.replace(_STUFFED, _LOOKALIKE)
+        if body[0] == STATUS:
+            return Packet(servo, STATUS, body[2:], body[1])
+        return Packet(servo, body[0], body[1:])
+
+
+def _header_begun(buffer: bytearray) -> int:
+    """Bytes at the end of `buffer` that may be the beginning of a header."""
+    for size in (3, 2, 1):
+        if buffer.endswith(_HEADER[:size]):
+            return size
+    return 0
+
+
+def error_text(error: int) -> str:
+    """What the low bits of an error byte say."""
+    return ERRORS.get(error & ~ALERT, f"error {error & ~ALERT}")

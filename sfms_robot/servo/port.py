@@ -1,0 +1,212 @@
+"""Serial ports: the only file that touches one.
+
+`SerialPort` is a real port: reads block until bytes come or a deadline passes, and never spin.
+
+`VirtualTimePort` is the same port when the servos are emulated and time is virtual. Bytes go over the same pseudo
+terminal, but before a read the port tells the emulator, on a control socket, how many bytes it has written so far
+and what time it is. The emulator takes exactly those bytes, moves its servos on to that time, says how long its
+reply is and writes it. So nothing depends on scheduling, and a silence costs no time at all.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import socket
+import termios
+from typing import Protocol
+
+import serial
+
+from sfms_robot.errors import BusError, PortError
+
+_REPLY_TIMEOUT_S = 5.0  # real seconds; only a stopped emulator takes so long
+_WRITE_TIMEOUT_S = 0.5  # a device that takes nothing for so long is as good as gone; stopping must not wait for it
+
+
+class Now(Protocol):
+    """The part of a clock that a port needs."""
+
+    def now_s(self) -> float: ...
+
+
+class Port(Protocol):
+    """What a bus needs of a port."""
+
+    @property
+    def name(self) -> str: ...
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`. Raises BusError when the device is gone; reading does too."""
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        """1 to `n` bytes as soon as there are any; empty when none came by `deadline_s` of `now_s`."""
+
+    def discard_input(self) -> None:
+        """Forget what came and was not read."""
+
+    def now_s(self) -> float: ...
+
+    def set_baud(self, baud: int) -> None: ...
+
+    def close(self) -> None:
+        """Idempotent."""
+
+
+class SerialPort:
+    """A serial device, or a pyserial URL that has a file descriptor such as socket://host:port."""
+
+    def __init__(self, device: str, baud: int, clock: Now) -> None:
+        self.name = device
+        self._clock = clock
+        self._serial = _open(device, baud)
+        self._fd = self._serial.fileno()
+        self.discard_input()
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._serial.write(data)
+        except OSError as error:
+            raise BusError(f"{self.name}: cannot be written any more: {error}") from error
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        try:
+            ready, _, _ = select.select([self._fd], [], [], max(0.0, deadline_s - self._clock.now_s()))
+            data = os.read(self._fd, n) if ready else b""
+        except OSError as error:
+            raise BusError(f"{self.name}: cannot be read any more: {error}") from error
+        if ready and not data:
+            raise BusError(f"{self.name}: the device is gone")
+        return data
+
+    def discard_input(self) -> None:
+        try:
+            self._serial.reset_input_buffer()
+        except (OSError, termios.error) as error:
+            raise BusError(f"{self.name}: cannot be read any more: {error}") from error
+
+    def now_s(self) -> float:
+        return self._clock.now_s()
+
+    def set_baud(self, baud: int) -> None:
+        try:
+            self._serial.baudrate = baud
+        except (OSError, ValueError) as error:
+            raise PortError(f"{self.name}: does not take {baud} baud: {error}") from error
+
+    def close(self) -> None:
+        self._serial.close()
+
+
+class VirtualTimePort:
+    """The pseudo terminal of an emulated chain, in virtual time."""
+
+    _WINDOW = 2048  # bytes on their way at most: more than the terminal holds would block for good
+
+    def __init__(self, device: str, control_path: str, baud: int, clock: Now) -> None:
+        self.name = device
+        self._clock = clock
+        self._written = 0
+        self._told = 0
+        self._wanted_from = 0
+        self._written_at_s = 0.0
+        self._inbox = bytearray()
+        self._control = socket.socket(socket.AF_UNIX)
+        self._control.settimeout(_REPLY_TIMEOUT_S)
+        try:
+            self._control.connect(control_path)
+        except OSError as error:
+            self._control.close()
+            raise PortError(f"{control_path}: no emulator answers there: {error}") from error
+        try:
+            self._serial = _open(device, baud)
+        except PortError:
+            self._control.close()
+            raise
+
+    def write(self, data: bytes) -> None:
+        now_s = self._clock.now_s()
+        if self._told < self._written and self._written_at_s < now_s:
+            self._exchange(self._written_at_s)
+        for start in range(0, len(data), self._WINDOW):
+            chunk = data[start : start + self._WINDOW]
+            if self._written + len(chunk) - self._told > self._WINDOW:
+                self._exchange(now_s)
+            self._serial.write(chunk)
+            self._written += len(chunk)
+        self._written_at_s = now_s
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        if not self._inbox:
+            self._exchange(self._clock.now_s())
+        data = bytes(self._inbox[:n])
+        del self._inbox[:n]
+        return data
+
+    def discard_input(self) -> None:
+        self._inbox.clear()
+        self._wanted_from = self._written  # answers to what was written before need not even be sent
+
+    def now_s(self) -> float:
+        return self._clock.now_s()
+
+    def set_baud(self, baud: int) -> None:
+        if self._told < self._written:
+            self._exchange(self._written_at_s)
+        self._serial.baudrate = baud
+
+    def close(self) -> None:
+        if self._serial.is_open and self._told < self._written:
+            try:
+                self._exchange(self._written_at_s)
+            except BusError:
+                self._inbox.clear()  # the emulator is gone: nobody is left to tell
+        self._serial.close()
+        self._control.close()
+
+    def _exchange(self, now_s: float) -> None:
+        """Let the emulator take what was written, at `now_s`, and fetch its whole reply."""
+        try:
+            self._control.sendall(b"sync %d %d %r\n" % (self._written, self._wanted_from, now_s))
+            answer = self._line()
+            missing = int(answer.removeprefix(b"ack "))
+            fd = self._serial.fileno()
+            while missing > 0:
+                if not select.select([fd], [], [], _REPLY_TIMEOUT_S)[0]:
+                    raise OSError("the reply it announced does not come")
+                data = os.read(fd, missing)
+                if not data:
+                    raise OSError("end of file")
+                self._inbox += data
+                missing -= len(data)
+        except (OSError, ValueError) as error:
+            raise BusError(f"{self.name}: the emulator is gone: {error}") from error
+        self._told = self._written
+
+    def _line(self) -> bytes:
+        line = b""
+        while not line.endswith(b"\n"):
+            part = self._control.recv(64)
+            if not part:
+                raise OSError("it closed its control socket")
+            line += part
+        return line
+
+
+def _open(device: str, baud: int) -> serial.Serial:
+    """Raises PortError of one line: missing, not permitted, held by somebody else, not a serial device."""
+    try:
+        return serial.serial_for_url(device, baudrate=baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise PortError(f"{device}: {_reason(device, error)}") from error
+
+
+def _reason(device: str, error: Exception) -> str:
+    if getattr(error, "errno", None) in (errno.EAGAIN, errno.EBUSY):
+        return "is held by another program"
+    if device.startswith("/") and not os.path.exists(device):
+        return "no such device"
+    if device.startswith("/") and not os.access(device, os.R_OK | os.W_OK):
+        return "no permission to open it (on Debian and Ubuntu: sudo usermod -aG dialout $USER, then log in again)"
+    return f"cannot be opened as a serial port: {error}"

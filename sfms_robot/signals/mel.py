@@ -1,0 +1,70 @@
+"""Log-mel spectrogram, causal: four rows of 128 bins for every 40 ms frame, one code path offline and streaming.
+
+Each row looks back over 25 ms and a new one is due every 10 ms. What a stream has to remember is the samples no
+finished row can do without: 240 of them after whole frames. The recording starts in silence.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
+
+MEL_BINS: Final = 128
+HOP: Final = 160
+WINDOW: Final = 400
+FFT: Final = 512
+ROWS_PER_FRAME: Final = FRAME_SAMPLES // HOP  # 4
+FLOOR: Final = 1e-6  # added to the power: about -80 dB below full scale
+
+
+def start() -> Floats:
+    """Past of a stream that has heard nothing: (240,) zeros."""
+    return np.zeros(WINDOW - HOP, dtype=np.float32)
+
+
+def log_mel(samples: Floats, past: Floats) -> tuple[Floats, Floats]:
+    """Rows that `samples` complete, and the past of the next call.
+
+    Args:
+        samples: (n,) mono 16 kHz, -1..1; any n.
+        past: what the last call returned, or `start()`; not changed.
+
+    Returns:
+        (rows, 128) natural log of mel power, and the samples to hand in next time (240 to 399 of them).
+    """
+    seen = np.concatenate([past, samples]).astype(np.float32)
+    rows = max(0, (len(seen) - WINDOW) // HOP + 1)
+    if rows == 0:
+        return np.zeros((0, MEL_BINS), dtype=np.float32), seen
+    windows = np.lib.stride_tricks.sliding_window_view(seen, WINDOW)[: rows * HOP : HOP]
+    return _rows(windows), seen[rows * HOP :].copy()
+
+
+def _rows(windows: NDArray[np.float32]) -> Floats:
+    """(rows, 400) -> (rows, 128). Row by row, so that the result never depends on how many come at once."""
+    power = np.abs(np.fft.rfft(windows * _HANN, FFT)) ** 2
+    mel = np.stack([_FILTERS @ row for row in power])
+    return np.asarray(np.log(mel + FLOOR), dtype=np.float32)
+
+
+def _mel(hz: Doubles | float) -> Doubles:
+    return np.asarray(2595.0 * np.log10(1.0 + np.asarray(hz, dtype=np.float64) / 700.0))
+
+
+def _filters() -> Doubles:
+    """(128, 257) triangles equally spaced in mel, each at least one FFT bin wide so that none is empty."""
+    edges_hz = 700.0 * (10 ** (np.linspace(_mel(20.0), _mel(AUDIO_HZ / 2), MEL_BINS + 2) / 2595.0) - 1.0)
+    bins_hz = np.linspace(0, AUDIO_HZ / 2, FFT // 2 + 1)
+    step = bins_hz[1]
+    low, centre, high = edges_hz[:-2, None], edges_hz[1:-1, None], edges_hz[2:, None]
+    rise = (bins_hz - centre) / np.maximum(centre - low, step) + 1.0
+    fall = (centre - bins_hz) / np.maximum(high - centre, step) + 1.0
+    return np.asarray(np.clip(np.minimum(rise, fall), 0.0, None))
+
+
+_HANN: Final = np.hanning(WINDOW + 1)[:-1]
+_FILTERS: Final = _filters()

@@ -1,0 +1,322 @@
+"""Face-track files: CSV (also gzipped) in, motion in our units and axes out.
+
+Columns go by name, in any case, so the column order of the Live Link app, of its UDP packet, of Apple's header and of
+MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...); without one
+they are radians and metres. What a source's axes and signs mean is one row of `SOURCES`; a sign that nothing at hand
+proves stays marked there, and can be flipped by the reader.
+
+A row of NaN means: no face was seen.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, FRAME_HZ, MOTION_DIM, POSE_CHANNELS, Doubles, Floats
+
+Signs = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class SourceAxes:
+    """How one source's head pose becomes ours: roll + right ear down, pitch + nose down, yaw + own left.
+
+    Attributes:
+        angles: sign of its roll, pitch, yaw.
+        position: its axis for our x (forward), y (left), z (up).
+        position_sign: sign of each of these.
+        from_camera: position is measured from a camera, so its median over the file is taken off.
+        verified: how the signs are known, or None: nobody has proved them; flip what turns out wrong.
+    """
+
+    angles: Signs
+    position: tuple[str, str, str]
+    position_sign: Signs
+    from_camera: bool
+    verified: str | None
+
+
+# All three turn yaw first, then pitch, then roll, about up, left and forward: R = Rz(yaw) Ry(pitch) Rx(roll).
+SOURCES: Final[Mapping[str, SourceAxes]] = {
+    "robot": SourceAxes((1, 1, 1), ("x", "y", "z"), (1, 1, 1), False, "our own axes, written by write_track"),
+    "mediapipe": SourceAxes(
+        (1, 1, 1),
+        ("z", "x", "y"),
+        (1, 1, 1),
+        True,
+        "camera frame x viewer's right, y up, z to the viewer; R = Ry(yaw) Rx(pitch) Rz(roll) of the face transform",
+    ),
+    # In think-biq/LLV @ 07ec14c examples/dao.gesichter the eyes turn against HeadYaw (r = -0.95 with the look-left
+    # channels), as they do when a face keeps looking at its phone: a hint that + is own left, no proof.
+    "live_link": SourceAxes((1, 1, 1), ("z", "x", "y"), (1, 1, 1), True, None),
+}
+
+_UNITS: Final = {"deg": math.pi / 180, "rad": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
+_POSE_COLUMN: Final = re.compile(r"(head)?_?(yaw|pitch|roll|x|y|z)(?:_(deg|rad|m|cm|mm))?")
+_TIME_COLUMNS: Final = {
+    "timecode": 0.0,
+    "t_s": 1.0,
+    "time_s": 1.0,
+    "time": 1.0,
+    "t": 1.0,
+    "t_ms": 1e-3,
+    "time_ms": 1e-3,
+}
+_SHAPE_BY_KEY: Final = {name.lower(): name for name in BLENDSHAPES}
+_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
+_LONGEST_GAP_S: Final = 0.25  # rows further apart than this have a lost face between them
+_TIME_EPS_S: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Track:
+    """A face over time.
+
+    Attributes:
+        times_s: (N,) increasing.
+        motion: (N, 58) radians, metres, 0..1; a row of NaN where no face was seen.
+        known: names of the channels the file had; the others are 0.
+    """
+
+    times_s: Doubles
+    motion: Floats
+    known: frozenset[str]
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the last row."""
+        return float(self.times_s[-1]) if len(self.times_s) else 0.0
+
+
+@dataclass(frozen=True)
+class _Column:
+    """Where one of our channels stands in the file, and its factor to our unit."""
+
+    index: int
+    channel: str
+    factor: float
+
+
+def read_track(path: Path | str, source: str | None = None, flip: Iterable[str] = ()) -> Track:
+    """Read a face track.
+
+    `source` is a key of `SOURCES`, or None: told from the header. `flip` names pose channels whose sign is turned.
+    Raises ConfigError, in one line with file, row and column, for what cannot be used.
+    """
+    file = Path(path)
+    header, rows = _cells(file)
+    axes = _axes(file, source, header)
+    columns = _columns(file, header, axes)
+    time_column = _time_column(file, header)
+    flipped = _flips(file, flip)
+
+    motion = np.zeros((len(rows), MOTION_DIM), dtype=np.float64)
+    for number, row in enumerate(rows):
+        motion[number] = _motion_row(file, number + 2, row, header, columns)
+    times_s = _times(file, header[time_column], [row[time_column] if row else "" for row in rows])
+    if axes.from_camera:
+        moved = slice(CHANNEL_INDEX["x"], CHANNEL_INDEX["z"] + 1)
+        seen = np.isfinite(motion[:, 0])
+        if seen.any():
+            motion[:, moved] -= np.median(motion[seen, moved], axis=0)
+    motion[:, flipped] *= -1
+    motion[:, len(POSE_CHANNELS) :] = np.clip(motion[:, len(POSE_CHANNELS) :], 0.0, 1.0)
+    return Track(times_s, motion.astype(np.float32), frozenset(column.channel for column in columns))
+
+
+def write_track(path: Path | str, track: Track) -> None:
+    """Write a track in our own axes; gzipped when the name ends in `.gz`. An unseen face becomes empty cells."""
+    units = dict.fromkeys(("roll", "pitch", "yaw"), "_rad") | dict.fromkeys(("x", "y", "z"), "_m")
+    names = [name for name in CHANNELS if name in track.known]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["time_s", *(name + units.get(name, "") for name in names)])
+    picked = track.motion[:, [CHANNEL_INDEX[name] for name in names]]
+    for time_s, row in zip(track.times_s, picked, strict=True):
+        writer.writerow([f"{time_s:.4f}", *("" if math.isnan(v) else f"{v:.4f}".rstrip("0").rstrip(".") for v in row)])
+    data = text.getvalue().encode()
+    # No time stamp in the gzip header: the same track gives the same bytes.
+    Path(path).write_bytes(gzip.compress(data, mtime=0) if str(path).endswith(".gz") else data)
+
+
+def resample(track: Track, rate_hz: float = FRAME_HZ, start_s: float = 0.0) -> Track:
+    """The track at start_s, start_s + 1/rate_hz, ... up to its last row.
+
+    Linear in time; a blink takes its maximum over the interval that ends at the instant, so that none falls between
+    frames. NaN before the first row and wherever a neighbour is NaN or more than 0.25 s away.
+    """
+    count = max(0, math.floor((track.duration_s - start_s) * rate_hz + _TIME_EPS_S * rate_hz) + 1)
+    grid_s = start_s + np.arange(count) / rate_hz
+    if not len(track.times_s) or not count:
+        return Track(grid_s, np.full((count, MOTION_DIM), np.nan, dtype=np.float32), track.known)
+    return Track(grid_s, _interpolated(track, grid_s, 1.0 / rate_hz), track.known)
+
+
+def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
+    times_s, last = track.times_s, len(track.times_s) - 1
+    after = np.clip(np.searchsorted(times_s, grid_s - _TIME_EPS_S), 0, last)
+    before = np.where(times_s[after] <= grid_s + _TIME_EPS_S, after, np.maximum(after - 1, 0))
+    gap_s = times_s[after] - times_s[before]
+    weight = np.where(gap_s > 0, (grid_s - times_s[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0)[:, None]
+    low, high = track.motion[before], track.motion[after]
+    out = np.where(weight <= 0, low, low + weight * (high - low))
+    outside = (grid_s < times_s[0] - _TIME_EPS_S) | (grid_s > times_s[-1] + _TIME_EPS_S)
+    out[outside | (gap_s > _LONGEST_GAP_S)] = np.nan
+    first = np.searchsorted(times_s, grid_s - interval_s + _TIME_EPS_S)
+    end = np.searchsorted(times_s, grid_s + _TIME_EPS_S)
+    for row in np.flatnonzero((end > first) & np.isfinite(out[:, 0])):
+        window = track.motion[first[row] : end[row], _BLINKS]
+        out[row, _BLINKS] = np.fmax(out[row, _BLINKS], np.fmax.reduce(window, axis=0))
+    return out.astype(np.float32)
+
+
+# --- the parts of reading ---------------------------------------------------------------------------------------
+
+
+def _cells(file: Path) -> tuple[list[str], list[list[str]]]:
+    try:
+        data = file.read_bytes()
+        if data[:2] == b"\x1f\x8b":
+            data = gzip.decompress(data)
+        text = data.decode("utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: no such file") from None
+    except (OSError, EOFError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
+    try:
+        rows = [row for row in csv.reader(io.StringIO(text)) if row]
+    except csv.Error as error:
+        raise ConfigError(f"{file}: not a CSV file: {error}") from error
+    if len(rows) < 2:
+        raise ConfigError(f"{file}: holds no face: " + ("a header and no rows" if rows else "the file is empty"))
+    return [cell.strip() for cell in rows[0]], rows[1:]
+
+
+def _axes(file: Path, source: str | None, header: Sequence[str]) -> SourceAxes:
+    if source is not None:
+        if source not in SOURCES:
+            raise ConfigError.at(file, "source", source, "is not a known source", SOURCES)
+        return SOURCES[source]
+    posed = [match for match in map(_POSE_COLUMN.fullmatch, map(str.lower, header)) if match]
+    if not any(match[1] for match in posed):
+        return SOURCES["robot"]
+    return SOURCES["mediapipe" if any(match[3] for match in posed if match[1]) else "live_link"]
+
+
+def _columns(file: Path, header: Sequence[str], axes: SourceAxes) -> list[_Column]:
+    turned = dict(zip(("roll", "pitch", "yaw"), axes.angles, strict=True))
+    moved = {
+        theirs: (ours, sign)
+        for ours, theirs, sign in zip(("x", "y", "z"), axes.position, axes.position_sign, strict=True)
+    }
+    columns: dict[str, _Column] = {}
+    for index, name in enumerate(header):
+        key = name.lower()
+        if key in _SHAPE_BY_KEY:
+            column = _Column(index, _SHAPE_BY_KEY[key], 1.0)
+        elif match := _POSE_COLUMN.fullmatch(key):
+            axis, unit = match[2], match[3]
+            is_angle = axis in turned
+            if unit is not None and is_angle != (unit in ("deg", "rad")):
+                raise ConfigError.at(
+                    file,
+                    "column",
+                    name,
+                    "has a unit that does not fit",
+                    ("_deg, _rad for angles, _m, _cm, _mm for positions",),
+                )
+            channel, sign = (axis, turned[axis]) if is_angle else moved[axis]
+            column = _Column(index, channel, sign * _UNITS[unit or "rad"])
+        else:
+            continue
+        if column.channel in columns:
+            raise ConfigError.at(file, "column", name, f"gives {column.channel} a second time")
+        columns[column.channel] = column
+    if not columns:
+        choices = "ARKit names such as eyeBlinkLeft, jawOpen; head pose such as headYaw_deg, pitch_rad, x_m"
+        raise ConfigError(f"{file}: no column is a face channel ({choices})")
+    return list(columns.values())
+
+
+def _time_column(file: Path, header: Sequence[str]) -> int:
+    for index, name in enumerate(header):
+        if name.lower() in _TIME_COLUMNS:
+            return index
+    raise ConfigError(f"{file}: no column tells the time (Timecode, t_s, time_s, t_ms, time_ms)")
+
+
+def _flips(file: Path, flip: Iterable[str]) -> list[int]:
+    for name in flip:
+        if name not in POSE_CHANNELS:
+            raise ConfigError.at(file, "flip", name, "is not a pose channel", POSE_CHANNELS)
+    return [CHANNEL_INDEX[name] for name in flip]
+
+
+def _motion_row(
+    file: Path, number: int, row: Sequence[str], header: Sequence[str], columns: Sequence[_Column]
+) -> Doubles:
+    """One row as motion (58,), all NaN when a cell is empty: the face was lost."""
+    out = np.zeros(MOTION_DIM)
+    for column in columns:
+        cell = row[column.index].strip() if column.index < len(row) else ""
+        if cell == "" or cell.lower() == "nan":
+            return np.full(MOTION_DIM, np.nan)
+        out[CHANNEL_INDEX[column.channel]] = _number(file, number, header[column.index], cell) * column.factor
+    return out
+
+
+def _number(file: Path, row: int, column: str, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ConfigError(f"{file}: row {row}, column {column} = {cell!r} is not a number")
+    return value
+
+
+def _times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
+    """Seconds (N,): as written, or from the first row for a time of day and for a clock that counts from long ago."""
+    factor = _TIME_COLUMNS[name.lower()]
+    if name.lower() == "timecode":
+        times_s = _timecodes(file, name, cells)
+    else:
+        times_s = np.array([_number(file, n + 2, name, cell.strip()) * factor for n, cell in enumerate(cells)])
+    backwards = np.flatnonzero(np.diff(times_s) <= 0)
+    if len(backwards):
+        row = int(backwards[0]) + 1
+        problem = f"is not later than the row before ({cells[row - 1]!r})"
+        raise ConfigError(f"{file}: row {row + 2}, column {name} = {cells[row]!r} {problem}")
+    return times_s - times_s[0] if name.lower() == "timecode" or times_s[0] > 1e6 else times_s
+
+
+def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
+    """HH:MM:SS:FF.fff -> seconds (N,). FF counts 60 a second in the Live Link app whatever the rate of the rows.
+
+    Other writers count 24, 25 or 30. The file tells: a take that holds one whole second shows nearly the whole count.
+    """
+    parts = np.empty((len(cells), 4))
+    for number, cell in enumerate(cells):
+        fields = cell.strip().split(":")
+        if len(fields) != 4:
+            raise ConfigError(f"{file}: row {number + 2}, column {name} = {cell!r} is not HH:MM:SS:FF.fff")
+        parts[number] = [_number(file, number + 2, name, field) for field in fields]
+    whole_s = parts[:, :3] @ np.array([3600.0, 60.0, 1.0])
+    whole_s += 86_400.0 * np.cumsum(np.diff(whole_s, prepend=whole_s[0]) < -43_200)  # a take across midnight
+    highest = parts[:, 3].max()
+    counts = 60
+    if whole_s[-1] - whole_s[0] >= 2 and highest < 30:
+        counts = next(base for base in (24, 25, 30) if highest < base)
+    times_s: Doubles = whole_s + parts[:, 3] / counts
+    return times_s

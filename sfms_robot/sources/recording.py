@@ -1,0 +1,157 @@
+"""A recorded person as a source: a sound file, a face track, or one of them, at 25 frames a second.
+
+Frame i covers (i, i + 1) x 40 ms and carries the face at its end. A missing voice is empty audio, a missing face is
+None: both are normal. A voice shorter than the run starts again after one second of silence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, SpeakerFrame
+from sfms_robot.signals.audio import read_audio
+from sfms_robot.signals.tracks import Track, read_track, resample
+
+DEFAULT_SPEAKER = "facegood_1114_3_16"
+_PAUSE_FRAMES = FRAME_HZ  # silence before a recording starts again
+_EPS_FRAMES = 1e-6
+_AUDIO_LATER = ("mic",)
+_FACE_LATER = ("live-link", "vmc", "webcam")
+
+
+class Recording:
+    """`ports.Source` over arrays. Holds no time of its own: `read` is told it.
+
+    audio: (n,) mono 16 kHz, or None. track: the face, or None. duration_s: length of the run; None for the length of
+    what is recorded (and for ever when nothing is). loop: start again when the recording ends before the run does.
+    """
+
+    def __init__(
+        self, audio: Floats | None, track: Track | None, duration_s: float | None = None, loop: bool = True
+    ) -> None:
+        if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
+            raise ConfigError(f"--duration = {duration_s:g}: a run lasts longer than 0 s")
+        self._audio = audio
+        self._faces = None if track is None else resample(track, FRAME_HZ, start_s=FRAME_S).motion
+        self._loop = loop
+        self._given = 0
+        self._recorded = _frames_recorded(audio, self._faces)
+        recorded_s = self._recorded * FRAME_S if self._recorded else None
+        self._duration_s = recorded_s if duration_s is None else duration_s
+
+    @property
+    def duration_s(self) -> float | None:
+        """Length of the run; None for one without end."""
+        return self._duration_s
+
+    def read(self, now_s: float) -> Sequence[SpeakerFrame]:
+        """Frames complete at or before `now_s` and not given yet, oldest first."""
+        complete = math.floor(now_s * FRAME_HZ + _EPS_FRAMES)
+        if self._duration_s is not None:
+            complete = min(complete, math.floor(self._duration_s * FRAME_HZ + _EPS_FRAMES))
+        frames = [self._frame(index) for index in range(self._given, complete)]
+        self._given = max(self._given, complete)
+        return frames
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _frame(self, index: int) -> SpeakerFrame:
+        place = index % (self._recorded + _PAUSE_FRAMES) if self._loop and self._recorded else index
+        time_s = (index + 1) / FRAME_HZ
+        face = None
+        if self._faces is not None and place < len(self._faces) and np.isfinite(self._faces[place]).all():
+            face = FaceFrame.of(time_s, self._faces[place])
+        return SpeakerFrame(time_s, self._samples(place), face)
+
+    def _samples(self, place: int) -> Floats:
+        if self._audio is None:
+            return np.zeros(0, dtype=np.float32)
+        out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+        part = self._audio[place * FRAME_SAMPLES : (place + 1) * FRAME_SAMPLES]
+        out[: len(part)] = part
+        return out
+
+
+def _frames_recorded(audio: Floats | None, faces: Floats | None) -> int:
+    """The voice decides where a recording ends; a face alone does for itself."""
+    if audio is not None:
+        return math.ceil(len(audio) / FRAME_SAMPLES)
+    return 0 if faces is None else len(faces)
+
+
+@dataclass(frozen=True)
+class Speaker:
+    """A recorded person that ships with the package: `sim/speakers/NAME/`."""
+
+    name: str
+    audio: Path
+    face: Path | None
+
+
+def speakers() -> list[str]:
+    """Names of the shipped speakers."""
+    return shipped_names(data_dir("sim") / "speakers", "speech.wav")
+
+
+def shipped_speaker(name: str) -> Speaker:
+    """A shipped speaker by name. Raises ConfigError with the names there are."""
+    if name not in speakers():
+        raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speakers())})")
+    folder = data_dir("sim") / "speakers" / name
+    face = folder / "face.csv.gz"
+    return Speaker(name, folder / "speech.wav", face if face.is_file() else None)
+
+
+def open_source(
+    audio: str = "default", face: str = "auto", duration_s: float | None = None, loop: bool = True
+) -> Recording:
+    """What `--audio FILE|SPEAKER|none|default` and `--face FILE|none|auto` ask for.
+
+    `default` is `DEFAULT_SPEAKER`, or no voice when a face file is given. A face `auto` is the shipped speaker's
+    own, or none beside somebody's sound file. Raises ConfigError for a kind of input that is not there and for files
+    that cannot be used.
+    """
+    if audio == "default":
+        audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
+    voice, own_face = _voice(audio)
+    seen = own_face if face == "auto" else _face(face)
+    return Recording(
+        None if voice is None else read_audio(voice),
+        None if seen is None else read_track(seen),
+        duration_s,
+        loop,
+    )
+
+
+def _voice(name: str) -> tuple[Path | None, Path | None]:
+    """Sound file, and the face that belongs to it."""
+    choices = f"FILE.wav, none, default, {', '.join(speakers())}"
+    if name.partition(":")[0] in _AUDIO_LATER:
+        raise ConfigError(f"--audio {name}: not available yet ({choices})")
+    if name == "none":
+        return None, None
+    if name in speakers() and not Path(name).is_file():
+        speaker = shipped_speaker(name)
+        return speaker.audio, speaker.face
+    if not Path(name).exists():
+        raise ConfigError(f"--audio {name}: no such file ({choices})")
+    return Path(name), None
+
+
+def _face(name: str) -> Path | None:
+    choices = "FILE.csv, FILE.csv.gz, none, auto"
+    if name.partition(":")[0] in _FACE_LATER:
+        raise ConfigError(f"--face {name}: not available yet ({choices})")
+    if name == "none":
+        return None
+    if not Path(name).exists():
+        raise ConfigError(f"--face {name}: no such file ({choices})")
+    return Path(name)

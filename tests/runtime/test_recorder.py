@@ -1,0 +1,130 @@
+import base64
+import json
+import threading
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder, write_report
+
+JOINTS = ("neck_yaw", "jaw")
+
+
+def tick(time_s, readings=None):
+    return Tick(time_s, np.linspace(0, 1, 58, dtype=np.float32), np.array([0.25, -0.5]), readings or {})
+
+
+def messages(folder):
+    with (folder / RUN_FILE).open("rb") as file:
+        return [
+            (channel.topic, message.log_time, json.loads(message.data), schema)
+            for schema, channel, message in make_reader(file).iter_messages()
+        ]
+
+
+def test_a_tick_becomes_a_face_and_joints_with_nulls_for_what_is_not_known(tmp_path):
+    recorder = Recorder(tmp_path, JOINTS)
+    recorder.tick(tick(1.5, {"neck_yaw": Reading(0.125, 0.01), "jaw": Reading(None, float("inf"), "silent")}))
+    recorder.close()
+    (face_topic, face_ns, face, _), (topic, _, body, schema) = messages(tmp_path)
+    assert (face_topic, topic, face_ns) == ("/face", "/joints", 1_500_000_000)
+    assert list(face) == ["time_s", *CHANNELS] and face["tongueOut"] == 1.0
+    assert body["joints"] == {
+        "neck_yaw": {"goal_rad": 0.25, "present_rad": 0.125, "age_s": 0.01, "fault": None},
+        "jaw": {"goal_rad": -0.5, "present_rad": None, "age_s": None, "fault": "silent"},
+    }
+    assert schema.encoding == "jsonschema" and set(json.loads(schema.data)["properties"]) == set(body)
+
+
+def test_sound_and_plans_are_kept(tmp_path):
+    audio = np.linspace(-1, 1, 640, dtype=np.float32)
+    face = FaceFrame.of(0.04, np.full(58, 0.5))
+    recorder = Recorder(tmp_path, JOINTS)
+    recorder.heard(SpeakerFrame(0.04, audio, face))
+    recorder.heard(SpeakerFrame(0.08, np.zeros(0, dtype=np.float32)))
+    recorder.planned(Plan(0.08, np.array([0.12, 0.16]), np.ones((2, 58), dtype=np.float32)))
+    recorder.close()
+    (_, _, first, _), (_, _, second, _), (topic, _, plan, _) = messages(tmp_path)
+    pcm = np.frombuffer(base64.b64decode(first["audio_pcm16"]), dtype="<i2") / 32767
+    np.testing.assert_allclose(pcm, audio, atol=2e-5)
+    assert first["face"]["jawOpen"] == 0.5 and second["face"] is None and second["energy_db"] == -100
+    assert topic == "/plan" and np.shape(plan["frames"]) == (2, 58) and plan["times_s"] == [0.12, 0.16]
+
+
+class Gate:
+    """A plan's frames that cannot be encoded before the gate opens: the writer is busy for as long as a test needs."""
+
+    def __init__(self):
+        self.reached, self.opened = threading.Event(), threading.Event()
+
+    def __iter__(self):
+        self.reached.set()
+        self.opened.wait(10)
+        return iter(())
+
+
+def stuck(recorder):
+    gate = Gate()
+    recorder.planned(Plan(0.0, np.array([]), gate))
+    assert gate.reached.wait(10)
+    return gate
+
+
+def test_a_full_queue_drops_and_counts_and_does_not_block(tmp_path):
+    recorder = Recorder(tmp_path, JOINTS, queue_length=5)
+    gate = stuck(recorder)
+    for n in range(8):
+        recorder.tick(tick(n / 100))
+    gate.opened.set()
+    recorder.close()
+    assert recorder.statistics() == {"messages": 11, "dropped": 3, "trouble": None}
+
+
+def test_in_virtual_time_nothing_is_dropped(tmp_path):
+    recorder = Recorder(tmp_path, JOINTS, when_full="wait", queue_length=1)
+    for n in range(200):
+        recorder.tick(tick(n / 100))
+    recorder.close()
+    assert recorder.statistics()["dropped"] == 0
+    assert [ns for topic, ns, _, _ in messages(tmp_path) if topic == "/face"] == [n * 10_000_000 for n in range(200)]
+
+
+def test_close_is_idempotent_and_later_values_are_ignored(tmp_path):
+    recorder = Recorder(tmp_path, JOINTS)
+    recorder.close()
+    recorder.tick(tick(0.0))
+    recorder.close()
+    assert messages(tmp_path) == []
+
+
+def test_the_file_says_what_it_is_about(tmp_path):
+    Recorder(tmp_path, JOINTS, about={"head": "face28", "seed": "3"}).close()
+    with (tmp_path / RUN_FILE).open("rb") as file:
+        (record,) = make_reader(file).iter_metadata()
+    assert record.metadata == {"head": "face28", "seed": "3", "joints": '["neck_yaw", "jaw"]'}
+
+
+def test_a_value_that_cannot_be_written_is_trouble_told_once_and_not_a_crash(tmp_path, caplog):
+    recorder = Recorder(tmp_path, ("only_one",))
+    recorder.tick(tick(0.0))
+    recorder.tick(tick(0.1))
+    recorder.close()
+    assert "zip()" in recorder.statistics()["trouble"] and "the recording is not whole" in caplog.text
+
+
+def test_a_folder_that_cannot_be_made_is_a_configuration_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="--record .*file/run: cannot be written to"):
+        Recorder(tmp_path / "file" / "run", JOINTS)
+    with pytest.raises(ConfigError, match="--record .*cannot be written to"):
+        write_report(tmp_path / "file", {})
+
+
+def test_the_report_is_json(tmp_path):
+    write_report(tmp_path / "new", {"version": 1})
+    assert json.loads((tmp_path / "new" / "report.json").read_text()) == {"version": 1}
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["report.json"]

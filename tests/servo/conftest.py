@@ -1,0 +1,114 @@
+"""A bus of real code on emulated servos in another process, in virtual time."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from sfms_robot.config import load_firmware_map
+from sfms_robot.servo.dxl2_link import Dxl2Link
+from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
+from sfms_robot.servo.port import VirtualTimePort
+from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
+
+settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure
+settings.load_profile("no_stopwatch")
+
+RAD_PER_TICK = 2 * np.pi / 4096
+
+
+class Linear:
+    """Middle of the servo is 0 rad; angles outside +-limit give the ticks of the limit."""
+
+    def __init__(self, limit_rad: float):
+        self.limit_rad = limit_rad
+
+    def to_ticks(self, angles_rad):
+        return np.rint(2048 + np.clip(angles_rad, -self.limit_rad, self.limit_rad) / RAD_PER_TICK).astype(np.int64)
+
+    def to_rad(self, ticks):
+        return (ticks - 2048) * RAD_PER_TICK
+
+
+@dataclass
+class Time:
+    """Virtual time: moves when told."""
+
+    t: float = 0.0
+
+    def now_s(self) -> float:
+        return self.t
+
+
+@dataclass
+class Rig:
+    chain: Chain
+    clock: Time
+    bus: DynamixelBus
+    count: int
+    baud: int
+
+    def port(self) -> VirtualTimePort:
+        return VirtualTimePort(self.chain.device, self.chain.control, self.baud, self.clock)
+
+    @contextmanager
+    def link(self) -> Iterator[Dxl2Link]:
+        """Another host on the same wire; the bus must be closed."""
+        link = Dxl2Link(self.port(), self.baud, 0.003)
+        try:
+            yield link
+        finally:
+            link.port.close()
+
+    def hold(self) -> np.ndarray:
+        self.bus.connect()
+        return self.bus.enable(self.bus.joints)
+
+    def ticks(self, goals_rad, n: int):
+        """`n` ticks of 10 ms: write, then poll; the last readings."""
+        for _ in range(n):
+            self.clock.t += 0.01
+            self.bus.write(np.asarray(goals_rad, dtype=float), self.clock.t)
+            readings = self.bus.poll(self.clock.t)
+        return readings
+
+
+LIMIT_RAD = 1.0
+
+
+@contextmanager
+def rig_of(
+    servos: Sequence[EmulatedServo], expected: Sequence[int] = (), baud: int = 1_000_000, firmware_map=None
+) -> Iterator[Rig]:
+    """`expected`, `firmware_map`: ids and model that the head names; those plugged in unless told otherwise."""
+    table = firmware_map or load_firmware_map("xl330-m288")
+    ids = expected or [servo.id for servo in servos]
+    with launch(servos, virtual=True) as chain:
+        clock = Time()
+        bus = DynamixelBus(
+            "face",
+            [BusServo(f"joint{i}", i, table, -LIMIT_RAD, LIMIT_RAD) for i in ids],
+            Linear(LIMIT_RAD),
+            lambda: VirtualTimePort(chain.device, chain.control, baud, clock),
+            baud,
+        )
+        try:
+            yield Rig(chain, clock, bus, len(ids), baud)
+        finally:
+            bus.close()
+
+
+@pytest.fixture
+def make_rig():
+    return rig_of
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    """Four servos that stand here and there."""
+    starts = [1900, 2048, 2300, 2100]
+    with rig_of([EmulatedServo(i + 1, start_ticks=ticks) for i, ticks in enumerate(starts)]) as rig:
+        yield rig

@@ -1,0 +1,154 @@
+import os
+import tty
+from contextlib import contextmanager
+
+import pytest
+
+from sfms_robot.errors import BusError, PacketError, PortError
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.dxl2_link import Dxl2Link
+from sfms_robot.servo.port import SerialPort, VirtualTimePort
+from sfms_robot.simulator.launch import EmulatedServo
+
+
+class Frozen:
+    """A clock that stands still: a deadline at `now` has passed."""
+
+    def now_s(self) -> float:
+        return 0.0
+
+
+@contextmanager
+def terminal():
+    """Two ends of a pseudo terminal: (file descriptor of the far end, device path of the near one)."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    try:
+        yield master, os.ttyname(slave)
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_bytes_go_out_and_come_in():
+    with terminal() as (far, device):
+        port = SerialPort(device, 1_000_000, Frozen())
+        port.write(b"abc")
+        assert os.read(far, 10) == b"abc"
+        os.write(far, b"defg")
+        assert port.read(3, 60.0) == b"def"
+        assert port.read(3, 60.0) == b"g"
+        assert port.read(3, 0.0) == b""
+        os.write(far, b"late")
+        port.discard_input()
+        assert port.read(9, 0.0) == b""
+        port.close()
+        port.close()
+
+
+def test_port_is_ours_alone():
+    with terminal() as (_, device):
+        port = SerialPort(device, 57600, Frozen())
+        with pytest.raises(PortError, match=f"{device}: is held by another program"):
+            SerialPort(device, 57600, Frozen())
+        port.close()
+        SerialPort(device, 57600, Frozen()).close()
+
+
+def test_missing_device_is_named():
+    with pytest.raises(PortError, match="/dev/no-such-port: no such device"):
+        SerialPort("/dev/no-such-port", 57600, Frozen())
+
+
+def test_folder_is_no_port(tmp_path):
+    with pytest.raises(PortError, match="cannot be opened as a serial port"):
+        SerialPort(str(tmp_path), 57600, Frozen())
+
+
+def test_device_that_goes_away_is_a_failure_of_the_bus():
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    port = SerialPort(os.ttyname(slave), 57600, Frozen())
+    os.close(slave)
+    os.close(master)
+    with pytest.raises(BusError, match="the device is gone|cannot be read any more"):
+        port.read(1, 1.0)
+    port.close()
+
+
+def test_virtual_port_needs_an_emulator(tmp_path):
+    with pytest.raises(PortError, match="no emulator answers there"):
+        VirtualTimePort("/dev/null", str(tmp_path / "control"), 57600, Frozen())
+
+
+def test_rubbish_neither_hangs_nor_confuses(make_rig):
+    noise = bytes((i * i * 31 + i // 7) & 0xFF for i in range(100_000))
+    with make_rig([EmulatedServo(1)]) as rig:
+        port = rig.port()
+        port.write(noise)
+        assert port.read(1 << 16, 0.0) == b""
+        port.close()
+        rig.clock.t = 1.0
+        with rig.link() as link:
+            assert link.ping(1) is not None
+        assert rig.chain.digest()[1] > 100_000
+
+
+def test_second_host_in_virtual_time_starts_from_zero(make_rig):
+    with make_rig([EmulatedServo(1)]) as rig:
+        for _ in range(2):
+            with rig.link() as link:
+                assert link.read(1, 132, 4) is not None
+
+
+class Script:
+    """A port with answers to come, each given whole to one read."""
+
+    name = "script"
+
+    def __init__(self, *chunks: bytes):
+        self.chunks = list(chunks)
+        self.sent: list[bytes] = []
+
+    def write(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        return self.chunks.pop(0) if self.chunks else b""
+
+    def discard_input(self) -> None: ...
+
+    def now_s(self) -> float:
+        return 0.0
+
+    def set_baud(self, baud: int) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_answers_are_taken_by_id_and_length():
+    four, late, foreign = (
+        dxl2.encode_status(1, 0, b"\x01\x02\x03\x04"),
+        dxl2.encode_status(1, 0, b"\x09"),
+        dxl2.encode_status(2, 0, b"\x05\x06\x07\x08"),
+    )
+    link = Dxl2Link(Script(late + foreign[:5], foreign[5:] + b"\xff\xff" + four), 1_000_000, 0.003)
+    assert link.read(1, 132, 4).params == b"\x01\x02\x03\x04"
+
+
+def test_own_echo_is_not_an_answer():
+    echo = dxl2.encode_instruction(1, dxl2.PING)
+    link = Dxl2Link(Script(echo), 1_000_000, 0.003)
+    assert link.ping(1) is None
+
+
+def test_refusal_without_data_is_an_answer():
+    link = Dxl2Link(Script(dxl2.encode_status(1, dxl2.ACCESS_ERROR)), 1_000_000, 0.003)
+    assert link.read(1, 132, 4).error == dxl2.ACCESS_ERROR
+
+
+def test_data_that_the_sdk_cannot_stuff_are_refused():
+    port = Script()
+    with pytest.raises(PacketError, match="look like a header"):
+        Dxl2Link(port, 1_000_000, 0.003).write(1, 116, b"\xff\xff\xfd\x00")
+    assert port.sent == []

@@ -1,0 +1,158 @@
+import gzip
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, ORDERS
+from sfms_robot.signals.tracks import Track, read_track, resample, write_track
+
+JAW, SMILE, BLINK = CHANNEL_INDEX["jawOpen"], CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["eyeBlinkLeft"]
+WEIGHTS = {name: round(0.01 + index / 60, 4) for index, name in enumerate(BLENDSHAPES)}
+
+
+def written(path, header, *rows):
+    path.write_text("\n".join([",".join(header), *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def upper_first(name):
+    return name[0].upper() + name[1:]
+
+
+@pytest.mark.parametrize("case", [str, upper_first, str.lower])
+@pytest.mark.parametrize("order", ORDERS)
+def test_every_column_order_and_case_reads_the_same(tmp_path, order, case):
+    names = ORDERS[order]
+    file = written(tmp_path / "a.csv", ["t_s", *map(case, names)], [0.0, *(WEIGHTS.get(name, 0.9) for name in names)])
+    track = read_track(file)
+    assert track.known == set(names) & set(BLENDSHAPES)
+    expected = [WEIGHTS[name] if name in track.known else 0.0 for name in BLENDSHAPES]
+    np.testing.assert_allclose(track.motion[0, 6:], expected, rtol=1e-6)
+
+
+def test_live_link_timecode_counts_sixty_a_second_and_starts_at_zero(tmp_path):
+    header = ["Timecode", "BlendShapeCount", "JawOpen", "HeadYaw", "HeadPitch", "HeadRoll"]
+    codes = ["12:27:59:56.169", "12:27:59:58.169", "12:28:00:00.168", "12:28:00:02.168"]
+    track = read_track(written(tmp_path / "a.csv", header, *([code, 61, 0.5, 0.3, 0.2, 0.1] for code in codes)))
+    np.testing.assert_allclose(track.times_s, np.arange(4) / 30, atol=1e-4)
+    np.testing.assert_allclose(track.motion[0, :3], [0.1, 0.2, 0.3], rtol=1e-6)  # radians: roll, pitch, yaw
+
+
+@pytest.mark.parametrize("counts", [24, 25, 30, 60])
+def test_timecode_base_is_told_by_the_highest_count(tmp_path, counts):
+    rows = [[f"00:00:{n // counts:02d}:{n % counts:02d}.000", 0.5] for n in range(3 * counts)]
+    track = read_track(written(tmp_path / "a.csv", ["Timecode", "JawOpen"], *rows))
+    np.testing.assert_allclose(track.times_s, np.arange(3 * counts) / counts, atol=1e-9)
+
+
+def test_timecode_runs_on_across_midnight(tmp_path):
+    rows = [["23:59:59:58.0", 0.1], ["00:00:00:00.0", 0.2]]
+    track = read_track(written(tmp_path / "a.csv", ["Timecode", "JawOpen"], *rows))
+    np.testing.assert_allclose(track.times_s, [0, 1 / 30], atol=1e-9)
+
+
+def test_pose_columns_carry_their_unit_in_the_name(tmp_path):
+    degrees = written(tmp_path / "d.csv", ["t_s", "yaw_deg", "pitch_deg", "x_cm"], [0, 90, -45, 3])
+    radians = written(tmp_path / "r.csv", ["t_s", "yaw_rad", "pitch", "x_mm"], [0, math.pi / 2, -math.pi / 4, 30])
+    np.testing.assert_allclose(read_track(degrees).motion, read_track(radians).motion, atol=1e-6)
+    assert read_track(degrees).motion[0, 3] == pytest.approx(0.03)
+
+
+def test_a_camera_sees_our_forward_as_its_z_and_its_distance_is_taken_off(tmp_path):
+    header = ["t_s", "headYaw_deg", "headX_cm", "headY_cm", "headZ_cm"]
+    track = read_track(written(tmp_path / "a.csv", header, *([t, 0, t, 10 * t, -40 + 2 * t] for t in range(3))))
+    np.testing.assert_allclose(track.motion[2, 3:6], [0.02, 0.01, 0.1], atol=1e-6)
+
+
+def test_a_sign_can_be_flipped(tmp_path):
+    file = written(tmp_path / "a.csv", ["t_s", "HeadYaw", "HeadPitch"], [0, 0.3, 0.2])
+    np.testing.assert_allclose(read_track(file, flip=["yaw"]).motion[0, 1:3], [0.2, -0.3], rtol=1e-6)
+
+
+def test_a_row_with_empty_cells_is_a_lost_face(tmp_path):
+    file = written(tmp_path / "a.csv", ["t_s", "jawOpen", "eyeBlinkLeft"], [0, 0.1, 0.2], [0.1], [0.2, "", 0.1])
+    assert np.isnan(read_track(file).motion).all(axis=1).tolist() == [False, True, True]
+
+
+def test_gzip_is_known_by_its_content(tmp_path):
+    file = tmp_path / "track.csv"
+    file.write_bytes(gzip.compress(b"\xef\xbb\xbft_s,jawOpen\n0,0.25\n"))
+    assert read_track(file).motion[0, JAW] == 0.25
+
+
+@pytest.mark.parametrize("name", ["track.csv", "track.csv.gz"])
+def test_write_then_read_gives_the_track_back(tmp_path, name):
+    motion = np.random.default_rng(1).uniform(0, 1, (5, 58)).astype(np.float32)
+    motion[2] = np.nan
+    track = Track(np.arange(5) / 25, motion, frozenset(CHANNELS))
+    write_track(tmp_path / name, track)
+    again = read_track(tmp_path / name)
+    assert again.known == track.known
+    np.testing.assert_allclose(again.motion, motion, atol=6e-5)
+    np.testing.assert_allclose(again.times_s, track.times_s, atol=1e-4)
+
+
+@given(st.floats(10, 120), st.floats(5, 60))
+def test_resampling_a_straight_line_stays_on_it(from_hz, to_hz):
+    times_s = np.arange(30) / from_hz
+    motion = np.zeros((30, 58), dtype=np.float32)
+    motion[:, SMILE] = times_s / 10
+    out = resample(Track(times_s, motion, frozenset(CHANNELS)), to_hz)
+    np.testing.assert_allclose(out.motion[:, SMILE], out.times_s / 10, atol=1e-6)
+    assert out.times_s[-1] <= times_s[-1] + 1e-6 < out.times_s[-1] + 1 / to_hz + 1e-5
+
+
+def test_a_blink_of_one_row_survives_resampling():
+    motion = np.zeros((60, 58), dtype=np.float32)
+    motion[31, [BLINK, JAW]] = 1.0
+    out = resample(Track(np.arange(60) / 60, motion, frozenset(CHANNELS)), 25)
+    assert out.motion[:, BLINK].max() == 1.0
+    assert out.motion[:, JAW].max() < 1.0
+
+
+def test_what_is_not_seen_stays_unknown_after_resampling():
+    motion = np.zeros((6, 58), dtype=np.float32)
+    motion[1] = np.nan
+    track = Track(np.array([0.1, 0.2, 0.3, 0.4, 0.9, 1.0]), motion, frozenset(CHANNELS))
+    known = np.isfinite(resample(track, 10).motion[:, 0])
+    assert known.tolist() == [False, True, False, True, True, False, False, False, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the file is empty"),
+        ("t_s,jawOpen\n", "a header and no rows"),
+        ("t_s,jawOpne\n0,1\n", "no column is a face channel .*jawOpen"),
+        ("jawOpen\n1\n", "no column tells the time .*Timecode"),
+        ("t_s,jawOpen\n0,0.5\n0.1,half\n", "row 3, column jawOpen = 'half' is not a number"),
+        ("t_s,jawOpen\n0,inf\n", "row 2, column jawOpen = 'inf'"),
+        ("t_s,jawOpen\n0.2,0.5\n0.1,0.5\n", "row 3, column t_s = '0.1' is not later"),
+        ("Timecode,jawOpen\n12:00,0.5\n", "'12:00' is not HH:MM:SS:FF.fff"),
+        ("t_s,jawOpen,JawOpen\n0,0.5,0.5\n", "column = 'JawOpen' gives jawOpen a second time"),
+        ("t_s,yaw_cm\n0,0.5\n", "'yaw_cm' has a unit that does not fit"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said_in_one_line(tmp_path, text, message):
+    file = tmp_path / "face.csv"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=message) as error:
+        read_track(file)
+    assert str(error.value).startswith(str(file)) and "\n" not in str(error.value)
+
+
+def test_missing_file_binary_file_and_unknown_names_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        read_track(tmp_path / "none.csv")
+    (tmp_path / "a.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(ConfigError, match="cannot be read as a CSV"):
+        read_track(tmp_path / "a.csv")
+    good = written(tmp_path / "b.csv", ["t_s", "jawOpen"], [0, 1])
+    with pytest.raises(ConfigError, match="'phone' is not a known source .*live_link"):
+        read_track(good, source="phone")
+    with pytest.raises(ConfigError, match="'jaw' is not a pose channel"):
+        read_track(good, flip=["jaw"])

@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+import soundfile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
+from sfms_robot.signals.tracks import Track, write_track
+from sfms_robot.sources.recording import Recording, open_source, shipped_speaker, speakers
+
+
+def voice(frames):
+    return np.repeat(np.arange(1, frames + 1, dtype=np.float32) / 1000, FRAME_SAMPLES)
+
+
+def face(seconds):
+    motion = np.zeros((int(seconds * 50) + 1, 58), dtype=np.float32)
+    motion[:, 0] = np.arange(len(motion)) / 50  # roll tells the time
+    return Track(np.arange(len(motion)) / 50, motion, frozenset(CHANNELS))
+
+
+@given(st.lists(st.floats(0, 0.3), max_size=20))
+def test_frames_do_not_depend_on_when_they_are_asked_for(steps_s):
+    source, now_s, frames = Recording(voice(10), face(0.3)), 0.0, []
+    for step_s in [*steps_s, 1.0]:
+        now_s += step_s
+        frames += source.read(now_s)
+        assert all(frame.time_s <= now_s + 1e-6 for frame in frames)
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(1, 11) / 25)
+    assert [frame.audio[0] for frame in frames] == [np.float32(n / 1000) for n in range(1, 11)]
+
+
+def test_a_face_belongs_to_the_end_of_its_frame_and_ends_with_its_track():
+    frames = Recording(voice(10), face(0.2)).read(1.0)
+    assert [frame.face is not None for frame in frames] == [True] * 5 + [False] * 5
+    for frame in frames[:5]:
+        assert frame.face.time_s == frame.time_s
+        assert frame.face.pose[0] == pytest.approx(frame.time_s, abs=1e-6)
+
+
+def test_a_short_voice_starts_again_after_a_second_of_silence():
+    frames = Recording(voice(10), face(0.4), duration_s=2.0).read(9.0)
+    heard = [float(frame.audio[0]) for frame in frames]
+    assert len(frames) == 50
+    assert heard[10:35] == [0.0] * 25 and heard[35:45] == heard[:10]
+    assert frames[20].face is None and frames[35].face.pose[0] == frames[0].face.pose[0]
+
+
+def test_without_loop_silence_follows():
+    frames = Recording(voice(10), None, duration_s=2.0, loop=False).read(2.0)
+    assert not any(frame.audio.any() for frame in frames[10:])
+
+
+def test_the_last_frame_is_filled_with_silence():
+    (frame,) = Recording(voice(1)[:100], None).read(1.0)
+    assert frame.audio.shape == (FRAME_SAMPLES,) and not frame.audio[100:].any()
+
+
+def test_a_face_alone_and_nothing_at_all_are_normal():
+    only_face = Recording(None, face(1.0))
+    assert only_face.duration_s == 1.0 and len(only_face.read(1.0)[0].audio) == 0
+    nothing = Recording(None, None)
+    assert nothing.duration_s is None
+    assert all(frame.face is None and not len(frame.audio) for frame in nothing.read(3.0))
+    assert len(Recording(None, None, 2.0).read(9.0)) == 50
+
+
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_run_needs_a_length(duration_s):
+    with pytest.raises(ConfigError, match="--duration"):
+        Recording(None, None, duration_s)
+
+
+def test_shipped_speakers_can_be_heard_and_seen():
+    assert {"facegood_1114_3_16", "katie"} <= set(speakers())
+    default = open_source()
+    frames = default.read(10.0)
+    assert default.duration_s == pytest.approx(47.68) and len(frames) == 250
+    jaw = [frame.face.blendshapes[24] for frame in frames if frame.face is not None]
+    level = [float(np.abs(frame.audio).mean()) for frame in frames]
+    assert np.corrcoef(jaw, level)[0, 1] > 0.4
+    assert all(frame.face is None for frame in open_source("katie").read(20.0))
+    assert shipped_speaker("katie").face is None
+
+
+def test_files_are_opened_by_path(tmp_path):
+    soundfile.write(tmp_path / "a.wav", np.full(44100, 0.1), 44100)
+    write_track(tmp_path / "a.csv", face(0.5))
+    frames = open_source(str(tmp_path / "a.wav"), str(tmp_path / "a.csv"), duration_s=1.0).read(1.0)
+    assert len(frames) == 25 and frames[5].audio[0] == pytest.approx(0.1, abs=0.01)
+    assert frames[5].face is not None and frames[-1].face is None
+    assert open_source(str(tmp_path / "a.wav"), "none").read(1.0)[0].face is None
+    assert len(open_source(face=str(tmp_path / "a.csv")).read(1.0)[0].audio) == 0
+
+
+@pytest.mark.parametrize(
+    ("audio", "face", "message"),
+    [
+        ("mic", "auto", "--audio mic: not available yet .*FILE.wav, none, default"),
+        ("none", "live-link:11111", "--face live-link:11111: not available yet .*FILE.csv"),
+        ("nobody.wav", "auto", "--audio nobody.wav: no such file .*facegood_1114_3_16, katie"),
+        ("none", "nobody.csv", "--face nobody.csv: no such file"),
+    ],
+)
+def test_what_cannot_be_opened_is_said_with_the_choices(audio, face, message):
+    with pytest.raises(ConfigError, match=message):
+        open_source(audio, face)

@@ -1,0 +1,79 @@
+"""The dependency rule, read from the imports of every module."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sfms_robot
+
+PACKAGE = Path(sfms_robot.__file__).parent
+BASE = {"errors", "frames", "ports", "signals", "data", "config"}
+PEERS = {"sources", "listeners", "learning", "metrics", "retarget", "motion", "servo", "simulator"}
+ALLOWED = {
+    **{layer: BASE | {layer} for layer in BASE | PEERS},
+    "learning": BASE | {"learning", "listeners", "metrics"},
+    "simulator": BASE | {"simulator", "servo"},
+    "runtime": BASE | {"runtime"},
+    "app": BASE | PEERS | {"runtime", "app"},
+    "cli": {"app", "config", "errors", "data", "cli"},
+}
+SERVO_PARTS_FOR_THE_SIMULATOR = {"codecs", "registers"}
+
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def imports_of(module: Path) -> set[tuple[str, ...]]:
+    """Every `sfms_robot.x.y` that a module imports, as ("x", "y")."""
+    found: set[tuple[str, ...]] = set()
+    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative import"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        found |= {tuple(name.split(".")[1:]) for name in names if name.split(".")[0] == "sfms_robot"}
+    return found
+
+
+def layer_of(module: Path) -> str:
+    return module.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_module_imports_only_what_its_layer_may(module: Path) -> None:
+    layer = layer_of(module)
+    if layer == "__init__":
+        return
+    for target in imports_of(module):
+        if not target or target[0] == "__version__":
+            continue
+        assert target[0] in ALLOWED[layer], f"{layer} may not import {'.'.join(target)}"
+        if layer == "simulator" and target[0] == "servo":
+            assert set(target[1:2]) <= SERVO_PARTS_FOR_THE_SIMULATOR, f"simulator may not import {'.'.join(target)}"
+
+
+def test_every_layer_has_a_rule() -> None:
+    assert {layer_of(module) for module in MODULES} - {"__init__"} <= set(ALLOWED)
+
+
+def test_help_loads_neither_torch_nor_numpy_nor_a_serial_port() -> None:
+    code = (
+        "import sys; from sfms_robot.cli.main import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'numpy', 'scipy', 'serial', 'pydantic', 'vtkmodules'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_python_keeps_out_of_the_data_folders() -> None:
+    root = PACKAGE.parent
+    for folder in ("configs", "firmware_maps", "sim"):
+        assert not list((root / folder).rglob("*.py"))

@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FaceFrame, Plan, Reading, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.replay import plot, read_recording, sheet, summary
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder
+
+JOINTS = ("neck_pitch", "jaw", "brow")
+
+
+def record(folder, seconds=2.0, voice=True):
+    """A run at 100 Hz: the speaker talks in the first half."""
+    recorder = Recorder(folder, JOINTS, when_full="wait", about={"head": "face28", "seed": "3"})
+    rng = np.random.default_rng(0)
+    for n in range(round(seconds * 100)):
+        time_s = n / 100
+        if n % 4 == 0:
+            loud = 0.2 if voice and time_s < seconds / 2 else 0.0
+            audio = (loud * rng.uniform(-1, 1, 640 if voice else 0)).astype(np.float32)
+            face = FaceFrame.of(time_s + 0.04, np.full(58, 0.25)) if n % 8 == 0 else None
+            recorder.heard(SpeakerFrame(time_s + 0.04, audio, face))
+            recorder.planned(Plan(time_s, np.array([time_s + 0.04]), np.zeros((1, 58), dtype=np.float32)))
+        goals = np.array([0.2 * np.sin(time_s), time_s / 10, 0.0])
+        readings = {"neck_pitch": Reading(goals[0], 0.01), "jaw": Reading(None, float("inf"), "silent")}
+        recorder.tick(Tick(time_s, rng.uniform(0, 1, 58).astype(np.float32), goals, readings))
+    recorder.close()
+    return folder
+
+
+def test_what_was_recorded_is_read_back(tmp_path):
+    run = read_recording(record(tmp_path))
+    assert run.joints == JOINTS and run.about["head"] == "face28" and run.whole
+    np.testing.assert_allclose(run.times_s, np.arange(200) / 100, atol=1e-9)
+    np.testing.assert_allclose(run.goals_rad[:, 1], run.times_s / 10, atol=1e-5)
+    np.testing.assert_allclose(run.present_rad[:, 0], run.goals_rad[:, 0], atol=1e-5)
+    assert np.isnan(run.present_rad[:, 1:]).all()
+    assert run.faults.any(axis=0).tolist() == [False, True, False]
+    assert run.motion.shape == (200, 58) and len(run.audio) == 50 * 640
+    assert np.isnan(run.speaker[1::2]).all() and (run.speaker[::2] == 0.25).all()
+
+
+def test_phrases_are_where_the_speaker_talks(tmp_path):
+    run = read_recording(record(tmp_path))
+    assert run.talks_at(np.array([0.02, 0.5, 0.98, 1.06, 1.9])).tolist() == [True, True, True, False, False]
+    silent = read_recording(record(tmp_path / "silent", voice=False))
+    assert not silent.has_voice and not silent.talking.any()
+
+
+def test_a_summary_counts(tmp_path):
+    assert summary(read_recording(record(tmp_path))) == {
+        "head": "face28", "seed": "3", "duration_s": 1.99, "ticks": 200, "speaker_frames": 50, "plans": 50,
+        "joints": 3, "faults": 1, "whole": True,
+    }  # fmt: skip
+
+
+def test_a_file_without_its_end_is_read_up_to_there(tmp_path):
+    file = record(tmp_path, seconds=20.0) / RUN_FILE
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    run = read_recording(tmp_path)
+    assert not run.whole and 3.0 < run.duration_s < 19.0 and "cut off" in run.title
+    assert len(run.motion) == len(run.goals_rad) == len(run.times_s)
+
+
+def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
+    with pytest.raises(ConfigError, match="has no run.mcap"):
+        read_recording(tmp_path)
+    with pytest.raises(ConfigError, match="is no folder"):
+        read_recording(tmp_path / "nothing")
+    file = record(tmp_path / "run") / RUN_FILE
+    data = bytearray(file.read_bytes())
+    for broken, message in (
+        (b"", "cut off"),
+        (bytes(data[:300]), "holds no tick: the file is cut off"),
+        (b"not an mcap file at all", "not a recorded run"),
+        (bytes(data[:4000]) + bytes([data[4000] ^ 0x55]) + bytes(data[4001:]), "damaged"),
+    ):
+        file.write_bytes(broken)
+        with pytest.raises(ConfigError, match=message) as error:
+            read_recording(tmp_path / "run")
+        assert "\n" not in str(error.value)
+    Recorder(tmp_path / "short", JOINTS).close()
+    with pytest.raises(ConfigError, match="the run never began"):
+        read_recording(tmp_path / "short")
+
+
+@pytest.mark.parametrize(("seconds", "voice"), [(2.0, True), (2.0, False), (0.01, True)])
+def test_a_plot_is_1600_by_1200(tmp_path, seconds, voice):
+    pytest.importorskip("matplotlib")
+    plot(read_recording(record(tmp_path, seconds, voice)), tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    assert (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) == (1600, 1200)
+
+
+def test_pictures_need_a_folder_to_go_to(tmp_path):
+    pytest.importorskip("matplotlib")
+    run = read_recording(record(tmp_path, 0.1))
+    with pytest.raises(ConfigError, match="no folder"):
+        plot(run, tmp_path / "none" / "a.png")
+
+
+def test_the_sheet_of_a_run_is_drawn(tmp_path):
+    pytest.importorskip("vtkmodules")
+    run = read_recording(record(tmp_path, 0.3))
+    assert len(sheet(run, tmp_path / "a.png")) == 12
+    assert (tmp_path / "a.png").stat().st_size > 10_000
