@@ -28,7 +28,7 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, write_report
 from sfms_robot.runtime.safety import interrupt_flag, realtime_priority
-from sfms_robot.simulator.launch import launch
+from sfms_robot.simulator.launch import Chain, launch
 from sfms_robot.sources.recording import open_source
 
 FAST_LATENCY_S = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
@@ -63,6 +63,8 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
     motion = build_motion(head, rate_hz)
     weights = find("listeners", options.listener, "config.yaml")
     source = open_source(options.audio, options.face, options.duration_s)
+    if options.fast and source.duration_s is None:
+        raise ConfigError("--fast without a recording never ends: give it a --duration")
     clock = VirtualClock() if options.fast else RealClock()
     with ExitStack() as stack:
         feed = _feed(weights, options)
@@ -82,6 +84,8 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
             motion.leads_s, motion.rest_rad,
         )  # fmt: skip
         report = _drive(options, parts, motion, clock, rate_hz, weights.name, head.name)
+        if options.fast:
+            report["wire"] = {name: _digest(chain) for name, chain in opened.items() if isinstance(chain, Chain)}
     if options.record is not None:
         write_report(options.record, report)
     return report
@@ -111,6 +115,12 @@ def _drive(
     )
 
 
+def _digest(chain: Chain) -> dict[str, Any]:
+    """What went over an emulated wire: two runs that say the same here sent the same bytes."""
+    sha256, count = chain.digest()
+    return {"sha256": sha256, "bytes": count}
+
+
 def _feed(weights: Path, options: RunOptions) -> PlanFeed:
     """Inline in virtual time, so that one seed is one run; else in a process of its own."""
     if options.fast:
@@ -128,7 +138,12 @@ def _observers(
 ) -> list[Observer]:
     observers: list[Observer] = []
     if options.record is not None:
-        about = {"head": head.name, "listener": options.listener, "seed": str(options.seed)}
+        about = {
+            "head": head.name,
+            "listener": options.listener,
+            "seed": str(options.seed),
+            "audio": Path(options.audio).name,
+        }
         when_full: FullPolicy = "wait" if options.fast else "drop"
         observers.append(Recorder(options.record, list(head.joints), when_full=when_full, about=about))
     if progress is not None:

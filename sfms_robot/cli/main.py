@@ -8,7 +8,7 @@ import sys
 import typer
 
 from sfms_robot import __version__
-from sfms_robot.cli import bench, data, head, replay, run, train
+from sfms_robot.cli import bench, data, evaluate, head, replay, run, train
 from sfms_robot.errors import RobotError
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app.command("bench")(bench.bench)
 app.add_typer(head.app, name="head")
 app.add_typer(data.app, name="data")
 app.add_typer(train.app, name="train")
+app.add_typer(evaluate.app, name="evaluate")
 
 
 def _version(wanted: bool) -> None:
@@ -44,10 +45,10 @@ def _common(
     )
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Entry point: a RobotError is one line on stderr and its own exit code."""
     try:
-        app()
+        app(arguments)
     except RobotError as error:
         print(f"sfms-robot: {error}", file=sys.stderr)
         sys.exit(error.exit_code)

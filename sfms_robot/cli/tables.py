@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,14 @@ def print_bench(result: Mapping[str, Mapping[str, Any]]) -> None:
         table.add_row(
             name, f"{row['median']:.4g} {row['unit']}", _or(row.get("p99"), "-"), f"{row['ratio']:.3g}", row["peer"]
         )
+    Console().print(table)
+
+
+def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
+    """A table of rows that share their keys."""
+    table = Table(*rows[0])
+    for row in rows:
+        table.add_row(*(_or(value, "-") for value in row.values()))
     Console().print(table)
 
 

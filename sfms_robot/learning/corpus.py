@@ -72,8 +72,8 @@ def _heard(dyad: Dyad) -> Tensor:
 
 def fit_scales(model: SfmsModel, corpus: Corpus) -> None:
     """Set the model's means and deviations. Deviations have floors, so that a still channel's noise is not blown up."""
-    floor = torch.full((MOTION_DIM,), 0.03)
-    floor[:3], floor[3:6] = 0.01, 0.003  # [rad], [m]
+    floor = torch.full((MOTION_DIM,), 0.04)
+    floor[:3], floor[3:6] = 0.01, 0.01  # [rad], [m]
     model.motion_mean.copy_(corpus.motion.mean(0))
     model.motion_std.copy_(torch.maximum(corpus.motion.std(0), floor))
     rows = corpus.mel[:: max(1, len(corpus.mel) // 20_000)].float().flatten(0, 1)
@@ -86,8 +86,8 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
     """Keyframe masks (N, G) of all dyads, placed stretch by stretch so that busy seconds may borrow from quiet ones."""
     size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
     masks = []
-    for dyad in motion.split(list(lengths)):
-        for stretch in dyad.split(_stretches(len(dyad), size, tokenizer.window)):
+    for dyad in torch.split(motion, list(lengths)):
+        for stretch in torch.split(dyad, _stretches(len(dyad), size, tokenizer.window)):
             masks.append(tokenizer.place(stretch[None])[0])
     return torch.cat(masks)
 

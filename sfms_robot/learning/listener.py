@@ -58,7 +58,7 @@ def tokenise(model: SfmsModel, corpus: Corpus) -> Tensor:
     """Tokens (N, G) of every listener in the corpus."""
     motion = model.standardise(corpus.motion)
     mask = place_all(model.tokenizer, motion, corpus.lengths)
-    parts = zip(motion.split(4096), mask.split(4096), strict=True)
+    parts = zip(torch.split(motion, 4096), torch.split(mask, 4096), strict=True)
     return torch.cat([model.tokenizer.encode(m[None], k[None])[0] for m, k in parts])
 
 

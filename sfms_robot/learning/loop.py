@@ -33,7 +33,7 @@ def fit(
     Raises ModelError as soon as a loss or gradient is not finite. KeyboardInterrupt passes through: the caller saves.
     """
     base = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
-    smooth, speed = math.nan, frames_per_step
+    smooth, speed = math.nan, 0.0
     with _progress() as progress:
         task = progress.add_task(title, total=steps, loss=math.nan, speed=0.0)
         for step in range(steps):

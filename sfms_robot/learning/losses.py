@@ -9,8 +9,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 
-def reconstruction(motion: Tensor, restored: Tensor, at_keyframes: Tensor, mask: Tensor, member: Tensor) -> Tensor:
-    """L2 + L2^Q of equation (13).
+def reconstruction(
+    motion: Tensor, restored: Tensor, at_keyframes: Tensor, mask: Tensor, member: Tensor, velocity: float
+) -> Tensor:
+    """L2 + L2^Q of equation (13), and, beyond the paper, `velocity` times the error from one frame to the next.
+
+    The velocity term keeps movement between coarse codes from having corners.
 
     The quantization term is the error of the codes alone at the keyframes; with a fixed grid (FSQ) the two
     stop-gradient terms of the equation have nothing to move and fall away.
@@ -21,7 +25,8 @@ def reconstruction(motion: Tensor, restored: Tensor, at_keyframes: Tensor, mask:
     """
     weight = mask.detach() @ member  # (B, T, C)
     keyframes = ((motion - at_keyframes) ** 2 * weight).sum() / weight.sum().clamp(min=1.0)
-    return F.mse_loss(restored, motion) + keyframes
+    steps = F.mse_loss(restored.diff(dim=1), motion.diff(dim=1))
+    return F.mse_loss(restored, motion) + keyframes + velocity * steps
 
 
 def masking(relaxed: Tensor, best: Tensor) -> Tensor:

@@ -57,38 +57,39 @@ def _fit(model: SfmsModel, corpus: Corpus, settings: config.TokenizerTraining) -
         if tokenizer.score is not None:
             hot, cold = settings.temperature
             temperature = hot * (cold / hot) ** (step / max(1, settings.steps - 1))
-            return learned_loss(tokenizer, batch, temperature, settings.mask_loss)
-        mask = tokenizer.place(batch)
-        if long_masks is not None:
-            half = settings.batch // 2
-            mask[:half] = windows(long_masks, chosen[:half], tokenizer.window)
-        return _loss(tokenizer, batch, mask)[0]
+            return learned_loss(tokenizer, batch, temperature, settings)
+        if long_masks is None:
+            return _loss(tokenizer, batch, tokenizer.place(batch), settings.velocity_loss)[0]
+        half = settings.batch // 2
+        near = windows(long_masks, chosen[:half], tokenizer.window)
+        mask = torch.cat([near, tokenizer.place(batch[half:])])
+        return _loss(tokenizer, batch, mask, settings.velocity_loss)[0]
 
     frames = settings.batch * tokenizer.window
     return fit("tokenizer", settings.steps, loss_of, optimizers, settings.clip_norm, frames)
 
 
-def _loss(tokenizer: Tokenizer, batch: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+def _loss(tokenizer: Tokenizer, batch: Tensor, mask: Tensor, velocity: float = 0.0) -> tuple[Tensor, Tensor]:
     """Loss (13) without its masking term, and the squared error of each window (B,)."""
     codes = tokenizer.quantizer.encode(batch)
     restored = tokenizer.inpaint(codes, mask)
     at_keyframes = tokenizer.quantizer.decode(codes)
-    loss = reconstruction(batch, restored, at_keyframes, mask, tokenizer.member)
+    loss = reconstruction(batch, restored, at_keyframes, mask, tokenizer.member, velocity)
     return loss, ((restored - batch) ** 2).mean((1, 2)).detach()
 
 
-def learned_loss(tokenizer: Tokenizer, batch: Tensor, temperature: float, mask_loss: float) -> Tensor:
+def learned_loss(tokenizer: Tokenizer, batch: Tensor, temperature: float, settings: config.TokenizerTraining) -> Tensor:
     """Loss (13) with sampled placements; the best of `DRAWS` is I* of equation (7)."""
     if tokenizer.score is None:
         raise ValueError("this tokenizer does not learn its placement")
     scores = tokenizer.score(batch)
     draws = [place_learned(scores, tokenizer.keyframes, temperature) for _ in range(DRAWS)]
-    scored = [_loss(tokenizer, batch, mask) for mask, _ in draws]
+    scored = [_loss(tokenizer, batch, mask, settings.velocity_loss) for mask, _ in draws]
     best = torch.stack([error for _, error in scored]).argmin(0)  # (B,)
     masks = torch.stack([mask for mask, _ in draws])
     target = masks[best, torch.arange(len(batch))]
     motion = torch.stack([loss for loss, _ in scored]).mean()
-    return motion + mask_loss * torch.stack([masking(relaxed, target) for _, relaxed in draws]).mean()
+    return motion + settings.mask_loss * torch.stack([masking(relaxed, target) for _, relaxed in draws]).mean()
 
 
 @torch.no_grad()
@@ -101,7 +102,7 @@ def reconstruction_error(
     chosen = strategy or tokenizer.strategy
     score: Callable[[Tensor], Tensor] | None = tokenizer.score
     errors = []
-    for batch in windows(motion, _consecutive(corpus, tokenizer.window), tokenizer.window).split(64):
+    for batch in torch.split(windows(motion, _consecutive(corpus, tokenizer.window), tokenizer.window), 64):
         mask = place(batch, keyframes or tokenizer.keyframes, chosen, member=tokenizer.member, score=score)
         errors.append(_loss(tokenizer, batch, mask)[1])
     return float(torch.cat(errors).mean())

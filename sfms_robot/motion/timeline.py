@@ -209,7 +209,7 @@ def _frames(plan: Plan) -> Doubles:
 
 def _past(old: Curve | None, played_s: float, first_s: float, step_s: float) -> tuple[_Knots, bool]:
     """Knots that a plan starting at `first_s` joins on to, and whether the old curve had run out before it."""
-    if old is not None and played_s <= old.knots.times_s[-1] and first_s <= old.end_s + 1.5 * step_s:
+    if old is not None and played_s <= old.knots.times_s[-1]:
         times_s = old.knots.times_s
         in_play = int(np.searchsorted(times_s, played_s, side="left"))  # the knot that ends the piece in play
         if in_play == len(times_s) - 1:  # that knot is made up: leave the piece where it is now

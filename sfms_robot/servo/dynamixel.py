@@ -29,6 +29,7 @@ from sfms_robot.servo.dxl2_link import Dxl2Link
 from sfms_robot.servo.handshake import Handshake
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
+from sfms_robot.servo.roster import Roster
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -37,10 +38,6 @@ READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
 _POLLED: Final = ("present_current", "present_velocity", "present_position")
 _CAPABILITIES: Final = frozenset({"position", "velocity", "current", "torque"})
 _REQUESTS: Final = 3  # sync reads in one poll at most
-_QUIET_POLLS: Final = 3  # polls without any answer before servos are blamed rather than the wire
-_MISSES: Final = 2  # single lost answers in a row before a servo counts as silent
-_FIRST_PAUSE_S: Final = 0.05
-_LONGEST_PAUSE_S: Final = 2.0
 _STOP_PATIENCE_S: Final = 0.02
 _TORQUE_LOST: Final = "torque lost"  # it restarted while it was silent
 
@@ -64,10 +61,6 @@ class _Seen:
     current_mA: float = 0.0
     velocity_raw: int = 0
     fault: str | None = None
-    misses: int = 0
-    silent: bool = False
-    pause_s: float = 0.0
-    probe_s: float = 0.0
 
 
 class DynamixelBus:
@@ -111,11 +104,11 @@ class DynamixelBus:
         velocity = self._table["present_velocity"].scale * self._table.ticks_per_revolution / 60.0
         self._rad_s_per_raw = self._rad_per_tick * velocity
         self._index = {servo.id: i for i, servo in enumerate(servos)}
+        self._roster = Roster(list(self._index))
         self._link: Dxl2Link | None = None
         self._enabled: list[int] = []
         self._seen = [_Seen() for _ in servos]
         self._ticks = np.zeros(count, np.int64)
-        self._quiet = 0
         self._counts = {"writes": 0, "reads": 0, "errors": 0, "retries": 0, "reconnects": 0}
         self._faults: dict[str, None] = {}
 
@@ -136,6 +129,7 @@ class DynamixelBus:
         self._link = link
         self._enabled = []
         self._seen = [_Seen() for _ in self._servos]
+        self._roster = Roster(list(self._index))
         for index, fault in enumerate(faults):
             self._note_fault(index, fault)
 
@@ -226,17 +220,16 @@ class DynamixelBus:
     def poll(self, now_s: float) -> Mapping[str, Reading]:
         """Read position, velocity and current of all servos that are not silent, and one that is."""
         link = self._connected()
-        listed = [servo.id for i, servo in enumerate(self._servos) if not self._seen[i].silent]
-        answers, gaps, misses = self._sweep(link, listed)
+        answers, gaps, missed = self._sweep(link, self._roster.listed)
         for servo, packet in answers.items():
             self._take(link, self._index[servo], packet, now_s)
-        self._blame(bool(answers), gaps, misses, now_s)
+        for servo in self._roster.blame(bool(answers), gaps, missed, now_s):
+            log.warning("%s (id %d) is silent", self.joints[self._index[servo]], servo)
         self._probe(link, now_s)
         return self._readings(now_s)
 
     def statistics(self) -> Mapping[str, Any]:
-        silent = [servo.id for i, servo in enumerate(self._servos) if self._seen[i].silent]
-        return {**self._counts, "silent": silent, "faults": list(self._faults)}
+        return {**self._counts, "silent": self._roster.silent, "faults": list(self._faults)}
 
     # --- goals --------------------------------------------------------------------------------------------------
 
@@ -267,65 +260,46 @@ class DynamixelBus:
         """(answers, ids at which the chain broke, ids that were passed over)."""
         answers: dict[int, Packet] = {}
         gaps: list[int] = []
-        misses: list[int] = []
+        missed: list[int] = []
         rest = list(ids)
         for attempt in range(_REQUESTS):
             # When nothing at all came, the wire gets a second chance before its first servo is suspected.
-            if not rest or (not answers and attempt > min(self._quiet, 1)):
+            if not rest or (not answers and attempt > min(self._roster.quiet_polls, 1)):
                 break
             self._counts["reads"] += 1
             self._counts["retries"] += attempt > 0
             got = link.sync_read(*self._block, rest)
             answers |= got
             last = max((i for i, servo in enumerate(rest) if servo in got), default=-1)
-            misses += [servo for servo in rest[: last + 1] if servo not in got]
+            missed += [servo for servo in rest[: last + 1] if servo not in got]
             gaps += rest[last + 1 : last + 2]
             rest = rest[last + 2 :]
-        self._counts["errors"] += len(gaps) + len(misses)
-        return answers, gaps, misses
-
-    def _blame(self, any_answer: bool, gaps: Sequence[int], misses: Sequence[int], now_s: float) -> None:
-        """Take servos off the list: those at which the chain broke at once, the passed over when it happens again."""
-        self._quiet = 0 if any_answer else self._quiet + 1
-        if any_answer or self._quiet >= _QUIET_POLLS:
-            for servo in gaps:
-                self._silence(self._index[servo], now_s)
-        for servo in misses:
-            seen = self._seen[self._index[servo]]
-            seen.misses += 1
-            if seen.misses >= _MISSES:
-                self._silence(self._index[servo], now_s)
-
-    def _silence(self, index: int, now_s: float) -> None:
-        seen = self._seen[index]
-        seen.silent, seen.pause_s, seen.probe_s = True, _FIRST_PAUSE_S, now_s + _FIRST_PAUSE_S
-        log.warning("%s (id %d) is silent", self.joints[index], self._servos[index].id)
+        self._counts["errors"] += len(gaps) + len(missed)
+        return answers, gaps, missed
 
     def _probe(self, link: Dxl2Link, now_s: float) -> None:
         """Ask the silent servo that has waited longest."""
-        due = [i for i, seen in enumerate(self._seen) if seen.silent and seen.probe_s <= now_s]
-        if not due:
+        servo = self._roster.due(now_s)
+        if servo is None:
             return
-        index = min(due, key=lambda i: self._seen[i].probe_s)
-        seen, servo = self._seen[index], self._servos[index]
         self._counts["retries"] += 1
-        answer = link.read(servo.id, *self._block)
+        answer = link.read(servo, *self._block)
         if answer is None:
-            seen.pause_s = min(2.0 * seen.pause_s, _LONGEST_PAUSE_S)
-            seen.probe_s = now_s + seen.pause_s
+            self._roster.probe_failed(servo, now_s)
             return
+        index = self._index[servo]
         self._counts["reconnects"] += 1
-        seen.silent = False
         self._take(link, index, answer, now_s)
-        log.warning("%s (id %d) answers again", self.joints[index], servo.id)
+        log.warning("%s (id %d) answers again", self.joints[index], servo)
         torque = self._table["torque_enable"]
-        state = link.read(servo.id, torque.address, torque.size)
-        if index in self._enabled and state is not None and state.params == torque.to_bytes(0) and seen.fault is None:
+        state = link.read(servo, torque.address, torque.size)
+        lost = state is not None and state.params == torque.to_bytes(0)
+        if lost and index in self._enabled and self._seen[index].fault is None:
             self._note_fault(index, _TORQUE_LOST)
 
     def _take(self, link: Dxl2Link, index: int, packet: Packet, now_s: float) -> None:
         seen = self._seen[index]
-        seen.misses = 0
+        self._roster.answered(self._servos[index].id)
         if packet.error & ~ALERT:
             self._counts["errors"] += 1
             return

@@ -103,11 +103,13 @@ def _nod_rows(times_s: Doubles, nod: Floats) -> dict[int, str]:
 
 
 def _peaks(signals: dict[str, Floats]) -> list[int]:
+    """The strongest instant of each kind of event that is there at all; all but the blink with open eyes, to see it."""
     wanted = (("blink", _BLINK), ("smile", _SMILE), ("aside", _ASIDE), ("brows", _BROWS), ("turn", _TURN_RAD))
     rows = []
     for name, least in wanted:
-        strength = np.abs(signals[name]) - (0 if name == "blink" else signals["blink"])  # eyes open, to see it
-        if (row := int(np.argmax(strength))) >= 0 and abs(signals[name][row]) >= least:
+        strength = np.abs(signals[name])
+        row = int(np.argmax(strength if name == "blink" else strength * (signals["blink"] < _BLINK)))
+        if strength[row] >= least:
             rows.append(row)
     return rows
 

@@ -112,3 +112,8 @@ def rig() -> Iterator[Rig]:
     starts = [1900, 2048, 2300, 2100]
     with rig_of([EmulatedServo(i + 1, start_ticks=ticks) for i, ticks in enumerate(starts)]) as rig:
         yield rig
+
+
+@pytest.fixture
+def linear():
+    return Linear

@@ -1,11 +1,14 @@
 import math
+import time
 
 import numpy as np
 import pytest
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.simulator.launch import EmulatedServo
+from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
+from sfms_robot.servo.port import SerialPort
+from sfms_robot.simulator.launch import EmulatedServo, launch
 
 RAD_PER_TICK = 2 * math.pi / 4096
 
@@ -210,3 +213,31 @@ def test_what_goes_over_the_wire_is_the_same_every_time(make_rig):
             return rig.chain.digest()
 
     assert digest() == digest()
+
+
+class Monotonic:
+    def now_s(self) -> float:
+        return time.monotonic()
+
+
+def test_bus_works_in_real_time_on_the_serial_port_alone(linear):
+    firmware_map = load_firmware_map("xl330-m288")
+    with launch([EmulatedServo(i, start_ticks=2000) for i in range(1, 29)]) as chain:
+        bus = DynamixelBus(
+            "face",
+            [BusServo(f"joint{i}", i, firmware_map, -1.0, 1.0) for i in range(1, 29)],
+            linear(1.0),
+            lambda: SerialPort(chain.device, 1_000_000, Monotonic()),
+            1_000_000,
+            read_deadline_s=1.0,
+        )
+        bus.connect()
+        held = bus.enable(bus.joints)
+        for k in range(20):
+            bus.write(held, 0.01 * k)
+            readings = bus.poll(0.01 * k)
+            assert [r.position_rad for r in readings.values()] == pytest.approx(held)
+        bus.stop("release")
+        bus.close()
+        counts = bus.statistics()
+        assert (counts["writes"], counts["reads"], counts["errors"], counts["silent"]) == (20, 20, 0, [])

@@ -3,8 +3,8 @@
 Real are: when somebody nods, looks away, laughs or says "mm-hm" while others talk, and when they talk and pause (AMI
 meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`); how speech sounds (`voices`). That they
 belong together is ours: the voice says other words than the meeting did, only its phrases begin and end when they did.
-Whoever holds the floor sits straight ahead. Stretches
-with nods, above all those at the end of a phrase, are drawn more often than they are in the meetings. Meetings, people, takes and voices kept for validation are whole ones.
+Whoever holds the floor sits straight ahead. Stretches with nods, above all those with nods at the end of a phrase, are
+drawn more often than they are in the meetings. Meetings, people, takes and voices kept for validation are whole ones.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ _LOOKS: Final = 0.6  # share of the looks away that is kept: across a table with
 _LONGEST_LOOK_S: Final = (1.5, 4.0)  # a look away ends after this: in meetings people watch slides for minutes
 _WEIGHTS: Final = (4.0, 3.0, 2.0, 3)  # of a stretch: base + nods a minute, up to + a nod after a phrase, up to
 
+_FILES: Final = "*_[A-Z]_[0-9][0-9][0-9][0-9].npz"  # Stretch.name
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -54,7 +56,7 @@ class Stretch:
 
     @property
     def weight(self) -> float:
-        """How often it is drawn: those who nod, and nod when a phrase ends, more often than they are in the meetings."""
+        """How often it is drawn: more for nods, and more again for nods when a phrase ends."""
         base, most, answer, answers = _WEIGHTS
         return base + min(self.nods_per_minute, most) + answer * min(self.answers, answers)
 
@@ -83,19 +85,22 @@ def compose_folder(data: Path, out: Path, seed: int, minutes: float, voices: Seq
     """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train and out/validation.
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, the AMI clips) and
-    those of further folders. Returns the minutes written per split. Raises ConfigError.
+    those of further folders. Dyads of an earlier run are removed from `out` once the new ones are written, so that two
+    sets never mix. Returns the minutes written per split. Raises ConfigError.
     """
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (data / "facegood_audio_mouth", data / "speech_audio", ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
     motions = data_dir("sim") / "listeners" / "motions.npz"
     written = dict.fromkeys(SPLITS, 0.0)
-    for split in SPLITS:
-        for stale in (out / split).glob("*.npz"):
-            stale.unlink()
+    fresh = set()
     for split, dyad in dyads(ami, [*bundled, *brought, *voices], motions, seed, minutes):
         save(out / split, [dyad])
+        fresh.add(out / split / f"{dyad.name}.npz")
         written[split] += len(dyad.listener) * FRAME_S / 60
+    for split in SPLITS:
+        for stale in set((out / split).glob(_FILES)) - fresh:
+            stale.unlink()
     return written
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import gzip
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final
@@ -119,7 +119,7 @@ def load(file: Path) -> dict[str, Motions]:
     return {split: Motions(**{kind: tuple(found) for kind, found in pieces[split].items()}) for split in SPLITS}
 
 
-def save(file: Path, named: Sequence[tuple[str, str, Floats]]) -> None:
+def save(file: Path, named: Iterable[tuple[str, str, Floats]]) -> None:
     """Write (kind, take, array) triples as `build` yields them, in steps of 0.001."""
     count: dict[str, int] = {}
     arrays: dict[str, NDArray[np.int16]] = {}
@@ -189,7 +189,8 @@ def table(file: Path) -> dict[str, list[str]]:
         with gzip.open(file, "rt", newline="") if file.suffix == ".gz" else file.open(newline="") as lines:
             rows = csv.reader(lines)
             header = next(rows)
-            return dict(zip(header, (list(column) for column in zip(*rows, strict=True)), strict=True))
+            columns = [list(column) for column in zip(*rows, strict=True)]
+            return dict(zip(header, columns or [[] for _ in header], strict=True))
     except FileNotFoundError:
         raise ConfigError(f"{file}: no such file") from None
     except (OSError, ValueError, StopIteration) as error:

@@ -77,7 +77,7 @@ def read_voice(file: Path) -> Voice:
     speech = [(a * _GRAIN, b * _GRAIN) for a, b in runs(active) if b - a >= 5]
     if not speech:
         raise ConfigError(f"{file}: no speech found in it")
-    pieces, ends, total = [], [], 0
+    pieces, breaks, total = [], [], 0
     for number, (start, end) in enumerate(speech):
         piece = audio[start:end].copy()
         piece[:_JOIN] *= np.linspace(0, 1, _JOIN, dtype=np.float32)
@@ -85,12 +85,15 @@ def read_voice(file: Path) -> Voice:
         pieces.append(piece)
         total += len(piece)
         if number + 1 == len(speech) or speech[number + 1][0] - end >= _PHRASE:
-            ends.append(total)
+            breaks.append(total)
     joined = np.concatenate(pieces)
     joined = _levelled(joined)
-    origin = np.concatenate([np.arange(start, end, _GRAIN) for start, end in speech])
+    keep = ~_lulls(joined)
+    ends = np.cumsum(keep)[np.array(breaks) // _GRAIN - 1] * _GRAIN
+    joined = joined.reshape(-1, _GRAIN)[keep].reshape(-1)
+    origin = np.concatenate([np.arange(start, end, _GRAIN) for start, end in speech])[keep]
     name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
-    return Voice(name, joined, origin, np.array(ends), _mouth(file), _pause_spectrum(audio, active))
+    return Voice(name, joined, origin, ends, _mouth(file), _pause_spectrum(audio, active))
 
 
 def _levelled(speech: Floats) -> Floats:
@@ -99,6 +102,14 @@ def _levelled(speech: Floats) -> Floats:
     power = uniform_filter1d(speech.astype(np.float64) ** 2, window, mode="nearest")
     even = speech * (power + 1e-4 * power.max()) ** -0.35
     return np.asarray(np.clip(even * (_LEVEL / np.sqrt(np.mean(even**2))), -1, 1), np.float32)
+
+
+def _lulls(speech: Floats) -> NDArray[np.bool_]:
+    """Grains (n // 320,) inside pauses that only show once loudness is levelled; 40 ms of each end of one stay."""
+    out = ~voice_activity(speech, AUDIO_HZ, _GRAIN / AUDIO_HZ)
+    for start, end in runs(out):
+        out[start : start + 2] = out[max(start, end - 2) : end] = False
+    return out
 
 
 def _mouth(file: Path) -> Floats | None:

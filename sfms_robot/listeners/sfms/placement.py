@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 Strategy = Literal["exact", "static", "static_paper", "learned"]
-EPSILON = 1e-6
+EPSILON = 1e-20  # a chosen frame falls back by 46: more than any two scores differ
 
 
 def place(
@@ -65,7 +65,7 @@ def place_learned(
     if temperature == 0.0:
         hard = torch.cat([_top_k(scores[..., g], c)[..., None] for g, c in enumerate(k)], dim=-1)
         return hard, hard
-    uniform = torch.rand(scores.shape, generator=generator, device=scores.device).clamp(EPSILON, 1 - EPSILON)
+    uniform = torch.rand(scores.shape, generator=generator, device=scores.device).clamp(1e-7, 1 - 1e-7)
     noisy = scores - torch.log(-torch.log(uniform))  # lines 3 to 6
     relaxed = torch.stack([_relaxed_k_hot(noisy[..., g], c, temperature) for g, c in enumerate(k)], dim=-1)
     hard = torch.stack([_top_k(relaxed[..., g], c) for g, c in enumerate(k)], dim=-1)  # lines 14 to 16
@@ -126,7 +126,7 @@ def _segment_errors(gram: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     norm = square.cumsum(-1)
 
     own0, own1 = p0.diagonal(dim1=-2, dim2=-1), p1.diagonal(dim1=-2, dim2=-1)  # at s = i
-    # Sums over i < s <= j, as matrices (i, j); at s = j the interpolation error is zero, so including j changes nothing.
+    # Sums over i < s <= j, as matrices (i, j); the interpolation error is zero at s = j, so j may be included.
     sum0_i = p0.transpose(-1, -2) - own0[..., :, None]  # of <x_s, x_i>
     sum1_i = p1.transpose(-1, -2) - own1[..., :, None]
     sum0_j = own0[..., None, :] - p0  # of <x_s, x_j>

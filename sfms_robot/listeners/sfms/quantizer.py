@@ -80,4 +80,5 @@ class Quantizer(nn.Module):
 
     def decode(self, codes: Tensor) -> Tensor:
         """(B, T, G, D) -> (B, T, C): each channel from its own group's code."""
-        return (self.decoder(codes) * self.member).sum(-2)
+        out: Tensor = (self.decoder(codes) * self.member).sum(-2)
+        return out

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from sfms_robot import config
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats, Plan, SpeakerFrame
@@ -108,7 +109,7 @@ class SfmsListener:
         decoded = self.model.tokenizer.decode(torch.cat([heard.past, ahead])[None])[0, -self.horizon - 2 :]
         path = join(heard.path[:2], decoded, self.settings.sampling.seam_frames)
         now = replace(heard, ahead=ahead, path=path, random=generator.get_state())
-        times_s = speaker.time_s + FRAME_S * np.arange(1, self.horizon + 1)
+        times_s = np.asarray(speaker.time_s + FRAME_S * np.arange(1, self.horizon + 1), dtype=np.float64)
         return Plan(speaker.time_s, times_s, self.model.restore(path[2:]).numpy()), now
 
     def _hear(self, speaker: SpeakerFrame, memory: Memory) -> Memory:
@@ -144,9 +145,7 @@ def _push(queue: Tensor, new: Tensor) -> Tensor:
 
 def _context(memory: Memory) -> Context:
     """A batch of one."""
-    return Context(
-        memory.face[None], memory.face_known[None], memory.mel[None], memory.heard[None], memory.past[None]
-    )
+    return Context(memory.face[None], memory.face_known[None], memory.mel[None], memory.heard[None], memory.past[None])
 
 
 def draw(
@@ -157,26 +156,27 @@ def draw(
     future = torch.full((h, ahead.shape[1]), UNDECIDED)
     future[: len(ahead)] = ahead
     memory = model.predictor.remember(context)
-    bias = [group.transition_bias for group in settings.groups.values()]
+    bias = torch.tensor([group.transition_bias for group in settings.groups.values()])
     together = settings.sampling.frames_per_pass
     for first in range(len(ahead), h, together):
-        frames = range(first, min(first + together, h))
+        last = min(first + together, h)
         logits = model.predictor.decode(memory, context.tokens, future[None])
-        for group, group_logits in enumerate(logits):
-            for frame in frames:
-                future[frame, group] = sample(group_logits[0, frame], bias[group], settings.sampling, generator)
+        rows = pad_sequence([values[0, first:last].T for values in logits], padding_value=-torch.inf)  # (V, G, frames)
+        future[first:last] = sample(rows.permute(2, 1, 0), bias, settings.sampling, generator)
     return future
 
 
-def sample(logits: Tensor, bias: float, sampling: config.Sampling, generator: torch.Generator) -> int:
-    """One class of (V + 1,) logits: temperature, bias on class 0, then the nucleus of most probable classes."""
+def sample(logits: Tensor, bias: Tensor, sampling: config.Sampling, generator: torch.Generator) -> Tensor:
+    """One class of each (..., G, V) logits: temperature, bias (G,) on class 0, then the nucleus of likeliest classes."""
     scaled = logits / sampling.temperature
-    scaled[0] += bias
+    scaled = torch.cat([scaled[..., :1] + bias[:, None], scaled[..., 1:]], dim=-1)
     order = torch.softmax(scaled, dim=-1).sort(descending=True, stable=True)
     mass = order.values.cumsum(-1)
-    kept = int((mass - order.values < sampling.nucleus).sum())
-    u = float(torch.rand((), generator=generator)) * float(mass[kept - 1])
-    return int(order.indices[min(int((mass[:kept] <= u).sum()), kept - 1)])
+    kept = ((mass - order.values) < sampling.nucleus).sum(-1, keepdim=True)
+    whole = mass.gather(-1, kept - 1)
+    drawn = torch.rand(whole.shape, generator=generator) * whole
+    place = torch.minimum((mass <= drawn).sum(-1, keepdim=True), kept - 1)
+    return order.indices.gather(-1, place)[..., 0]
 
 
 def join(tail: Tensor, decoded: Tensor, seam: int) -> Tensor:
@@ -188,7 +188,7 @@ def join(tail: Tensor, decoded: Tensor, seam: int) -> Tensor:
         seam: frames over which the difference fades.
 
     Returns:
-        (2 + H, C): `tail`, then `decoded` plus a cubic that starts with the difference in place and speed and ends flat.
+        (2 + H, C): `tail`, then `decoded` plus a cubic that starts with the difference (place and speed), ends flat.
     """
     offset, before = tail[1] - decoded[1], tail[0] - decoded[0]
     speed = offset - before

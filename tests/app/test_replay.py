@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
+from sfms_robot.app.replay import plot, read_recording, sheet, summary
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.replay import plot, read_recording, sheet, summary
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
 
 JOINTS = ("neck_pitch", "jaw", "brow")

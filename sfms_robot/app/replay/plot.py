@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.signal import find_peaks
 
+from sfms_robot.app.replay.recording import RunRecording
 from sfms_robot.errors import ConfigError, MissingExtra
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_S, Doubles, Floats
-from sfms_robot.replay.recording import RunRecording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

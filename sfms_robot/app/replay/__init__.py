@@ -1,0 +1,22 @@
+"""Looking at a recorded run: read it back, plot it, draw the head at twelve instants."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sfms_robot.app.replay.plot import plot
+from sfms_robot.app.replay.recording import RunRecording, read_recording, summary
+from sfms_robot.app.replay.sheet import sheet
+
+__all__ = ["RunRecording", "plot", "read_recording", "replay_run", "sheet", "summary"]
+
+
+def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> dict[str, Any]:
+    """Draw what is asked for, and say what is in the recording. Raises ConfigError, MissingExtra."""
+    recording = read_recording(folder)
+    if plot_png is not None:
+        plot(recording, plot_png)
+    if sheet_png is not None:
+        sheet(recording, sheet_png)
+    return summary(recording)

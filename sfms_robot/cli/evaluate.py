@@ -1,0 +1,46 @@
+"""`sfms-robot evaluate`: what a listener's parts are worth on held-out dyads."""
+
+from __future__ import annotations
+
+import json as json_module
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+app = typer.Typer(help="Evaluate on held-out dyads.", no_args_is_help=True)
+
+LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
+DATA = typer.Option(..., help="Folder with validation/ (see `sfms-robot data compose`).")
+JSON = typer.Option(False, "--json", help="Print one JSON object.")
+
+
+@app.command()
+def tokenizer(listener: str = LISTENER, data: Path = DATA, json: bool = JSON) -> None:
+    """Reconstruction error (standardised units) by keyframe placement."""
+    from sfms_robot.app.learn import evaluate_tokenizer
+
+    _print(evaluate_tokenizer(listener, data), json)
+
+
+@app.command("listener")
+def listener_(
+    listener: str = LISTENER,
+    data: Path = DATA,
+    seed: int = typer.Option(1, min=0, help="Of the sampling."),
+    json: bool = JSON,
+) -> None:
+    """Nods, blinks, smiles and smoothness of the listener, beside those of the dyads' own listeners."""
+    from sfms_robot.app.learn import evaluate_listener
+
+    _print(evaluate_listener(listener, data, seed), json)
+
+
+def _print(result: Mapping[str, Any], json: bool) -> None:
+    if json:
+        print(json_module.dumps(result))
+    else:
+        from sfms_robot.cli.tables import print_rows
+
+        print_rows(result["rows"])

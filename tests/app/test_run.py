@@ -1,0 +1,96 @@
+"""`run` from end to end in virtual time: the shipped listener, a recorded person, emulated servos on a pty."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import soundfile
+
+from sfms_robot.app.replay import read_recording
+from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.config import load_head
+from sfms_robot.errors import ConfigError
+
+SHORT = RunOptions(duration_s=3.0, fast=True, seed=3)
+
+
+@pytest.fixture(scope="module")
+def report():
+    return run_head(SHORT)
+
+
+def test_the_report_has_what_it_promises(report):
+    assert report["version"] == 1 and report["head"] == "face28" and report["exit"] == "done"
+    assert (report["frames"], report["duration_s"], report["seed"]) == (75, 3.0, 3)
+    assert report["ticks"] > 300
+    assert set(report["joints"]) == set(load_head("face28").joints)
+    assert set(report["motion"]) == {"nods", "blinks", "smiles"}
+    assert report["limits"]["violations"] == 0
+    bus = report["bus"]
+    assert bus["writes"] == bus["reads"] == report["ticks"]
+    assert (bus["errors"], bus["silent"], bus["faults"]) == (0, [], [])
+
+
+def test_in_virtual_time_wall_clock_figures_are_null(report):
+    assert report["tick"]["achieved_hz"] is None and report["tick"]["jitter_ms"]["p99"] is None
+    assert report["latency_ms"] == {
+        "frame_to_wire": {"p50": None, "p99": None},
+        "speech_to_wire": {"p50": None, "p95": None},
+    }
+    assert report["listener_step_ms"] == {"p50": None, "p99": None}
+
+
+def test_one_seed_is_one_command_stream_and_another_seed_another(report):
+    assert run_head(SHORT) == report
+    other = run_head(dataclasses.replace(SHORT, seed=4))
+    assert other["wire"]["main"]["sha256"] != report["wire"]["main"]["sha256"]
+
+
+@pytest.mark.parametrize(("audio", "face"), [("katie", "none"), ("none", "none"), ("none", "face.csv.gz")])
+def test_a_missing_modality_is_normal(audio, face, tmp_path):
+    if face != "none":
+        from sfms_robot.data import data_dir
+
+        face = str(data_dir("sim") / "speakers" / "facegood_1114_3_16" / face)
+    done = run_head(dataclasses.replace(SHORT, audio=audio, face=face))
+    assert done["exit"] == "done" and done["limits"]["violations"] == 0
+    assert sum(joint["travel_rad"] for joint in done["joints"].values()) > 0.1
+
+
+def test_a_stereo_file_of_another_rate_is_taken(tmp_path):
+    voice = np.random.default_rng(0).normal(0, 0.1, (44_100, 2))
+    soundfile.write(tmp_path / "voice.wav", voice, 44_100)
+    assert run_head(dataclasses.replace(SHORT, audio=str(tmp_path / "voice.wav")))["frames"] == 75
+
+
+def test_a_run_is_recorded_whole(tmp_path):
+    done = run_head(dataclasses.replace(SHORT, record=tmp_path / "run"))
+    recording = read_recording(tmp_path / "run")
+    assert recording.whole and recording.joints == tuple(load_head("face28").joints)
+    assert len(recording.times_s) == 301
+    assert (tmp_path / "run" / "report.json").is_file()
+    assert done["exit"] == "done"
+
+
+def test_a_dry_run_reads_every_joint_and_moves_none():
+    seen = run_head(dataclasses.replace(SHORT, dry_run=True))
+    assert all(reading["position_rad"] is not None for reading in seen["readings"].values())
+    assert "joints" not in seen
+
+
+def test_virtual_time_needs_an_end_and_emulated_servos():
+    with pytest.raises(ConfigError, match="never ends"):
+        run_head(dataclasses.replace(SHORT, audio="none", duration_s=None))
+    with pytest.raises(ConfigError, match="emulated servos"):
+        run_head(dataclasses.replace(SHORT, port="/dev/ttyUSB0"))
+
+
+@pytest.mark.slow
+def test_in_real_time_every_figure_is_measured():
+    done = run_head(RunOptions(duration_s=4.0))
+    assert done["exit"] == "done" and done["limits"]["violations"] == 0
+    assert done["tick"]["achieved_hz"] > 0 and done["tick"]["jitter_ms"]["max"] >= 0
+    assert done["latency_ms"]["frame_to_wire"]["p50"] > 0
+    assert done["latency_ms"]["speech_to_wire"]["p95"] > done["latency_ms"]["frame_to_wire"]["p50"]
+    assert done["listener_step_ms"]["p50"] > 0
+    assert "wire" not in done

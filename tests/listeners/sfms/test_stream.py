@@ -1,0 +1,158 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from conftest import plans_of, speech, tiny_listener
+
+from sfms_robot.frames import FRAME_S, SpeakerFrame
+from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.sfms.stream import draw, join, neutral_tokens, sample
+from sfms_robot.signals import mel
+
+
+def test_a_plan_comes_on_every_hop_and_starts_one_frame_later(tiny):
+    plans = plans_of(tiny, speech(13))
+    assert list(plans) == [0, 4, 8, 12]
+    for index, plan in plans.items():
+        assert plan.frames.shape == (8, 58) and plan.frames.dtype == np.float32
+        assert plan.made_at_s == pytest.approx((index + 1) * FRAME_S)
+        np.testing.assert_allclose(plan.times_s, plan.made_at_s + FRAME_S * np.arange(1, 9))
+        assert np.isfinite(plan.frames).all() and 0 <= plan.frames[:, 6:].min() and plan.frames[:, 6:].max() <= 1
+
+
+@torch.no_grad()
+def offline(listener, speaker, seed):
+    """The same motion computed from whole arrays: features of everything first, then windows cut out of them."""
+    model, settings = listener.model, listener.settings
+    p, h, hop, n = settings.past_frames, settings.future_frames, settings.hop, len(speaker)
+    rows = torch.from_numpy(mel.log_mel(np.concatenate([frame.audio for frame in speaker]), mel.start())[0])
+    sound = torch.cat([torch.zeros(4 * p, 128), model.standardise_mel(rows)])
+    face = torch.from_numpy(np.stack([frame.face.motion for frame in speaker]))
+    face = torch.cat([torch.zeros(p, 58), model.standardise(face)])
+    known = torch.cat([torch.zeros(p), torch.ones(n)]).bool()
+    tokens = torch.cat([neutral_tokens(model, p), torch.zeros(n + h, 2).long()])  # frame t at index p + t
+    generator = torch.Generator().manual_seed(seed)
+    still = model.standardise(torch.zeros(n + h + 2, 58))  # frame t at index 2 + t; two before the start
+    path, plans, decided = still, {}, 1
+    for now in range(0, n, hop):  # newest frame heard
+        past = slice(now + 1, now + 1 + p)
+        seen = Context(
+            face[None, past], known[None, past], sound[None, 4 * past.start : 4 * past.stop], known[None, past],
+            tokens[None, past],
+        )  # fmt: skip
+        ahead = tokens[p + now + 1 : p + decided]
+        tokens[p + now + 1 : p + now + 1 + h] = draw(model, settings, seen, ahead, generator)
+        decided = now + 1 + h
+        window = model.tokenizer.decode(tokens[None, past.start : past.stop + h])[0]
+        joined = join(path[now + 1 : now + 3], window[-h - 2 :], settings.sampling.seam_frames)
+        path = torch.cat([path[: now + 1], joined, path[now + 1 + len(joined) :]])
+        plans[now] = model.restore(joined[2:]).numpy()
+    return plans
+
+
+@pytest.mark.parametrize("hop", [1, 4, 8])
+@pytest.mark.parametrize("together", [1, 8])
+def test_stream_equals_offline(hop: int, together: int):
+    listener = tiny_listener(hop=hop, sampling={"frames_per_pass": together})
+    speaker = speech(61)
+    expected = offline(listener, speaker, seed=3)
+    streamed = plans_of(listener, speaker, seed=3)
+    assert list(streamed) == list(expected)
+    for index, plan in streamed.items():
+        np.testing.assert_allclose(plan.frames, expected[index], atol=1e-5)
+
+
+@pytest.mark.parametrize("changed_from", [1, 22, 40])
+def test_later_speech_never_changes_earlier_plans(tiny, changed_from: int):
+    speaker = speech(48)
+    other = speaker[:changed_from] + speech(48, seed=9)[changed_from:]
+    before, after = plans_of(tiny, speaker), plans_of(tiny, other)
+    for index in before:
+        if index < changed_from:
+            np.testing.assert_array_equal(before[index].frames, after[index].frames)
+
+
+def test_a_plan_keeps_the_tokens_of_the_one_before(tiny):
+    memory, last = tiny.start(1), None
+    for frame in speech(30):
+        plan, memory = tiny.step(frame, memory)
+        if plan is not None and last is not None:
+            assert torch.equal(memory.ahead[:4], last[-4:])
+        last = memory.ahead if plan is not None else last
+
+
+def test_memory_is_not_changed(tiny):
+    speaker = speech(9)
+    memory = tiny.start(1)
+    for frame in speaker[:8]:
+        _, memory = tiny.step(frame, memory)
+    copies = {field.name: np.copy(np.asarray(getattr(memory, field.name))) for field in dataclasses.fields(memory)}
+    first, _ = tiny.step(speaker[8], memory)
+    second, _ = tiny.step(speaker[8], memory)
+    np.testing.assert_array_equal(first.frames, second.frames)
+    for name, copy in copies.items():
+        np.testing.assert_array_equal(np.asarray(getattr(memory, name)), copy)
+
+
+def test_one_seed_repeats_and_two_differ(tiny):
+    speaker = speech(20)
+    one, again, other = (plans_of(tiny, speaker, seed) for seed in (1, 1, 2))
+    assert all(np.array_equal(one[i].frames, again[i].frames) for i in one)
+    assert any(not np.array_equal(one[i].frames, other[i].frames) for i in one)
+
+
+def test_two_streams_of_one_listener_do_not_meet(tiny):
+    a, b = speech(20), speech(20, seed=5)
+    memory_a, memory_b, woven = tiny.start(1), tiny.start(2), {}
+    for index in range(20):
+        plan, memory_a = tiny.step(a[index], memory_a)
+        _, memory_b = tiny.step(b[index], memory_b)
+        if plan is not None:
+            woven[index] = plan
+    alone = plans_of(tiny, a, 1)
+    assert all(np.array_equal(woven[i].frames, alone[i].frames) for i in alone)
+
+
+@pytest.mark.parametrize("face", [True, False])
+@pytest.mark.parametrize("audio", [True, False])
+def test_a_missing_modality_is_normal(tiny, face: bool, audio: bool):
+    plans = plans_of(tiny, speech(12, face=face, audio=audio))
+    assert all(np.isfinite(plan.frames).all() for plan in plans.values())
+
+
+def test_a_face_that_is_not_finite_is_a_face_not_known(tiny):
+    speaker = speech(12)
+    lost = [SpeakerFrame(f.time_s, f.audio, dataclasses.replace(f.face, pose=f.face.pose * np.nan)) for f in speaker]
+    without = plans_of(tiny, speech(12, face=False))
+    for index, plan in plans_of(tiny, lost).items():
+        np.testing.assert_array_equal(plan.frames, without[index].frames)
+
+
+def test_frames_of_another_length_are_refused(tiny):
+    with pytest.raises(ValueError, match="640 samples or none, got 100"):
+        tiny.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), tiny.start(1))
+
+
+def test_sampling_follows_the_probabilities_of_the_nucleus(tiny):
+    sampling = tiny.settings.sampling.model_copy(update={"nucleus": 0.65})
+    logits = torch.log(torch.tensor([0.1, 0.4, 0.3, 0.2]))
+    generator = torch.Generator().manual_seed(0)
+    drawn = sample(logits.expand(2000, 1, 4), torch.zeros(1), sampling, generator)
+    counts = torch.bincount(drawn[:, 0], minlength=4)
+    assert counts[0] == counts[3] == 0
+    assert counts[1] / 2000 == pytest.approx(4 / 7, abs=0.04)
+
+
+def test_a_plan_goes_on_in_place_and_speed():
+    tail = torch.tensor([[0.0], [1.0]])
+    decoded = torch.full((10, 1), 5.0)
+    path = join(tail, decoded, seam=4)[:, 0]
+    assert path[:2].tolist() == [0.0, 1.0]
+    assert path[5:].tolist() == [5.0] * 5
+    assert path.diff().min() >= 0 and path.diff().max() < 2
+
+
+def test_a_plan_that_agrees_with_the_past_is_left_as_it_is():
+    decoded = torch.randn(10, 3)
+    torch.testing.assert_close(join(decoded[:2], decoded, seam=4), decoded)

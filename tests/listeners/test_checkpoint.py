@@ -1,0 +1,78 @@
+import pytest
+import torch
+from conftest import plans_of, speech, tiny_listener, tiny_settings
+from safetensors.torch import load_file, save_file
+
+from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.listeners import checkpoint, sfms
+from sfms_robot.listeners.sfms.model import SfmsModel
+
+
+@pytest.fixture
+def folder(tmp_path, tiny):
+    checkpoint.save_config(tmp_path, tiny.settings)
+    checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, tiny.model)
+    return tmp_path
+
+
+def test_a_saved_listener_plans_as_before(folder, tiny):
+    loaded = sfms.load(folder)
+    assert loaded.settings == tiny.settings
+    speaker = speech(9)
+    for index, plan in plans_of(loaded, speaker).items():
+        assert (plan.frames == plans_of(tiny, speaker)[index].frames).all()
+
+
+def test_missing_files_are_named(folder):
+    (folder / "model.safetensors").unlink()
+    with pytest.raises(ModelError, match=r"model\.safetensors: no such weights file"):
+        sfms.load(folder)
+    (folder / "config.yaml").unlink()
+    with pytest.raises(ConfigError, match=r"config\.yaml: no such file"):
+        sfms.load(folder)
+
+
+@pytest.mark.parametrize("size", [0, 7, 200])
+def test_corrupt_weights_are_named(folder, size):
+    file = folder / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:size])
+    with pytest.raises(ModelError, match=r"model\.safetensors: not a readable safetensors file"):
+        sfms.load(folder)
+
+
+def _rewrite(folder, change):
+    file = folder / "model.safetensors"
+    tensors = load_file(file)
+    change(tensors)
+    save_file(tensors, file)
+
+
+def test_a_missing_tensor_is_named(folder):
+    _rewrite(folder, lambda tensors: tensors.pop("predictor.slots"))
+    with pytest.raises(ModelError, match="tensor predictor.slots is missing"):
+        sfms.load(folder)
+
+
+def test_a_tensor_too_many_is_named(folder):
+    _rewrite(folder, lambda tensors: tensors.update(stray=torch.zeros(1)))
+    with pytest.raises(ModelError, match="tensor stray is not part of the configured model"):
+        sfms.load(folder)
+
+
+def test_a_tensor_that_is_not_finite_is_named(folder):
+    _rewrite(folder, lambda tensors: tensors["motion_mean"].fill_(float("nan")))
+    with pytest.raises(ModelError, match="tensor motion_mean holds values that are not finite"):
+        sfms.load(folder)
+
+
+def test_weights_of_another_configuration_are_told_by_their_shapes(folder):
+    checkpoint.save_config(folder, tiny_settings(predictor_width=32))
+    with pytest.raises(ModelError, match=r"tensor predictor\.\S+ has shape \(.*16.*\), the configuration needs \(.*32"):
+        sfms.load(folder)
+
+
+def test_a_learned_placement_carries_its_scores(tmp_path):
+    listener = tiny_listener(placement="learned")
+    names = listener.model.state_dict()
+    assert any(name.startswith("tokenizer.score.") for name in names)
+    assert not any(name.startswith("tokenizer.score.") for name in SfmsModel(tiny_settings()).state_dict())

@@ -1,0 +1,192 @@
+import numpy as np
+import pytest
+import ruckig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.config import load_head
+from sfms_robot.motion.limits import JerkLimiter, JointLimits, Stop, reference
+
+DT_S = 0.01
+LIMITS = JointLimits.of(load_head("face28"))
+J = len(LIMITS.low)
+LIMITER = JerkLimiter(LIMITS, DT_S)
+FREE = (LIMITS.low < -np.radians(4)) & (LIMITS.high > np.radians(4))  # joints that can swing 4 degrees either way
+
+
+def standing(angles) -> np.ndarray:
+    angles = np.broadcast_to(np.asarray(angles, dtype=float), (J,))
+    return np.stack([angles, np.zeros(J), np.zeros(J)])
+
+
+def followed(references, start=None):
+    """Positions sent, the three before the start included, and the last state."""
+    start = np.zeros(J) if start is None else start
+    state, sent = LIMITER.start(start), [start] * 3
+    for wanted in references:
+        goals, state = LIMITER.step(wanted, state)
+        sent.append(goals)
+    return np.array(sent), state
+
+
+def excess(sent) -> float:
+    """Largest share by which finite differences exceed a limit; inf when a position does at all."""
+    if not (np.isfinite(sent).all() and (sent >= LIMITS.low).all() and (sent <= LIMITS.high).all()):
+        return np.inf
+    bounds = (LIMITS.speed, LIMITS.acceleration, LIMITS.jerk)
+    return max(np.abs(np.diff(sent, n, axis=0) / DT_S**n / bound).max() - 1 for n, bound in enumerate(bounds, 1))
+
+
+def square_wave(rng, ticks):
+    """From edge to edge, every joint at its own time."""
+    half = rng.integers(2, 60, J)
+    return [standing(np.where((k // half) % 2, LIMITS.low, LIMITS.high)) for k in range(ticks)]
+
+
+def jumps(rng, ticks):
+    """Anywhere, also outside the range, with any speed and acceleration."""
+    spread = np.stack([LIMITS.high - LIMITS.low, 2 * LIMITS.speed, 2 * LIMITS.acceleration])
+    hold = int(rng.integers(1, 8))
+    values = [rng.normal(size=(3, J)) * spread for _ in range(ticks // hold + 1)]
+    return [values[k // hold] for k in range(ticks)]
+
+
+def random_walk(rng, ticks):
+    walk = np.cumsum(rng.normal(size=(ticks + 2, J)) * rng.uniform(1e-4, 0.1), axis=0)
+    return [reference(walk[k : k + 3], DT_S) for k in range(ticks)]
+
+
+def bang_bang_jerk(rng, ticks):
+    """Rides on the limits themselves: full jerk one way or the other, integrated, range ignored."""
+    motion, out = np.zeros((3, J)), []
+    for _ in range(ticks):
+        jerk = LIMITS.jerk * rng.choice([-1.0, 0.0, 1.0], J)
+        p, v, a = motion
+        motion = np.stack([p + v * DT_S + a * DT_S**2 / 2 + jerk * DT_S**3 / 6, v + a * DT_S + jerk * DT_S**2 / 2, a])
+        motion[2] = np.clip(a + jerk * DT_S, -LIMITS.acceleration, LIMITS.acceleration)
+        motion[1] = np.clip(motion[1], -LIMITS.speed, LIMITS.speed)
+        out.append(motion)
+    return out
+
+
+def into_the_edge(rng, ticks):
+    """Full speed at the very edge of the range."""
+    edge = np.where(rng.random(J) < 0.5, LIMITS.low, LIMITS.high)
+    way = np.sign(edge - (LIMITS.low + LIMITS.high) / 2)
+    return [np.stack([edge, way * LIMITS.speed, way * LIMITS.acceleration * rng.choice([-1, 0, 1])])] * ticks
+
+
+def broken(rng, ticks):
+    """NaN and infinities among jumps, and numbers that overflow when squared."""
+    out = []
+    for wanted in jumps(rng, ticks):
+        bad = wanted.copy()
+        bad[rng.random((3, J)) < 0.2] = rng.choice([np.nan, np.inf, -np.inf, 1e300, -1e300])
+        out.append(bad)
+    return out
+
+
+ADVERSARIES = [square_wave, jumps, random_walk, bang_bang_jerk, into_the_edge, broken]
+
+
+@pytest.mark.parametrize("adversary", ADVERSARIES)
+def test_no_command_ever_exceeds_a_limit(adversary):
+    rng = np.random.default_rng(0)
+    sent, _ = followed(adversary(rng, 1500))
+    assert excess(sent) < 1e-6
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from(ADVERSARIES), min_size=1, max_size=4))
+def test_no_mixture_of_adversaries_exceeds_a_limit(seed, adversaries):
+    rng = np.random.default_rng(seed)
+    start = rng.uniform(LIMITS.low, LIMITS.high)
+    sent, _ = followed([wanted for adversary in adversaries for wanted in adversary(rng, 50)], start)
+    assert excess(sent) < 1e-6
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_any_pose_is_a_fixed_point(seed):
+    pose = np.random.default_rng(seed).uniform(LIMITS.low, LIMITS.high)
+    sent, state = followed([standing(pose)] * 20, pose)
+    assert np.array_equal(sent, np.broadcast_to(pose, sent.shape)) and state.chased == 0
+
+
+@pytest.mark.parametrize("edge", [LIMITS.low, LIMITS.high])
+def test_the_edges_of_the_range_are_reached_and_kept(edge):
+    sent, _ = followed([standing(edge)] * 200)
+    assert np.abs(sent[-20:] - edge).max() < 1e-9
+
+
+def test_a_slow_nod_passes_unchanged():
+    t = DT_S * np.arange(-1, 400)
+    rise = np.clip(t / 0.5, 0, 1)
+    nod = np.radians(2.5) * rise**3 * (10 - 15 * rise + 6 * rise**2) * np.sin(2 * np.pi * 2 * t)
+    angles = np.outer(nod, FREE)
+    sent, state = followed([reference(angles[k - 1 : k + 2], DT_S) for k in range(1, 400)])
+    assert state.chased == 0 and np.array_equal(sent[3:], angles[1:400])
+
+
+def test_the_reference_is_met_again_after_a_jump():
+    t = DT_S * np.arange(402)
+    angles = np.outer(np.radians(2) * np.sin(2 * np.pi * 0.5 * t), FREE)
+    references = [reference(angles[k : k + 3], DT_S) for k in range(400)]
+    start = np.clip(np.full(J, np.radians(15)), LIMITS.low, LIMITS.high)
+    sent, _ = followed(references, start)
+    assert np.array_equal(sent[-200:], angles[201:401])
+
+
+def test_what_is_not_finite_is_refused_and_the_joint_comes_to_a_stop():
+    moving = [np.stack([LIMITS.speed * 0.2 * DT_S * k, LIMITS.speed * 0.2, 0 * LIMITS.speed]) for k in range(4)]
+    sent, state = followed([*moving, *[np.full((3, J), np.nan)] * 60])
+    assert excess(sent) < 1e-6 and state.refused == 60 * J
+    assert not np.diff(sent[-20:], axis=0).any() and not state.motion[1:].any()
+
+
+def test_one_broken_joint_does_not_disturb_the_others():
+    t = DT_S * np.arange(102)
+    angles = np.outer(np.radians(1) * np.sin(2 * np.pi * 0.5 * t) ** 3, FREE)
+    good = [reference(angles[k : k + 3], DT_S) for k in range(100)]
+    bad = [np.where(np.arange(J) == 3, np.nan, wanted) for wanted in good]
+    others = np.arange(J) != 3
+    assert np.array_equal(followed(good)[0][:, others], followed(bad)[0][:, others])
+
+
+def test_it_starts_inside_the_range_and_not_from_nonsense():
+    assert np.array_equal(LIMITER.start(LIMITS.high + 1).motion[0], LIMITS.high)
+    with pytest.raises(ValueError, match="joint 2 starts at an angle that is not finite"):
+        LIMITER.start(np.where(np.arange(J) == 2, np.nan, 0.0))
+
+
+def test_a_step_leaves_its_state_alone():
+    state = LIMITER.start(np.zeros(J))
+    goals, after = LIMITER.step(standing(LIMITS.high), state)
+    goals += 1.0
+    assert not state.motion.any() and (after.motion[0] <= LIMITS.high).all()
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(-3, 3), st.floats(-30, 30))
+def test_the_stop_is_the_one_that_ruckig_finds(speed, acceleration):
+    given_ = ruckig.InputParameter(1)
+    given_.control_interface = ruckig.ControlInterface.Velocity
+    given_.current_position, given_.current_velocity, given_.current_acceleration = [0.0], [speed], [acceleration]
+    given_.target_velocity, given_.target_acceleration = [0.0], [0.0]
+    given_.max_velocity, given_.max_acceleration, given_.max_jerk = [1000.0], [30.0], [1500.0]
+    path = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(given_, path)
+    stop = Stop.of(np.array([[0.0], [speed], [acceleration]]), np.array([30.0]), np.array([1500.0]))
+    ways = []
+    for time_s in np.linspace(0, path.duration, 40):
+        theirs = np.array(path.at_time(time_s))[:, 0]
+        assert stop.after(time_s)[:, 0] == pytest.approx(theirs, abs=1e-6)
+        ways.append(theirs[0])
+    below, above = stop.extent()
+    assert below[0] <= min(ways) + 1e-9 and above[0] >= max(ways) - 1e-9
+    assert below[0] == pytest.approx(min(ways), abs=2e-3) and above[0] == pytest.approx(max(ways), abs=2e-3)
+
+
+def test_the_reference_of_a_parabola_is_exact():
+    t = np.array([[0.99], [1.0], [1.01]])
+    assert reference(1 + 2 * t + 3 * t**2, 0.01)[:, 0] == pytest.approx([6, 8, 6])

@@ -1,0 +1,99 @@
+"""The default head: what its file promises."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.config import load_head
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
+from sfms_robot.retarget.mapping import Mapping
+
+HEAD = load_head("face28")
+MAPPING = Mapping(HEAD)
+JOINTS = list(HEAD.joints)
+REST = np.array([joint.rest_rad for joint in HEAD.joints.values()])
+TURNS_ROUND = {"neck_yaw", "neck_roll", "tongue_side", "eye_pan_left", "eye_pan_right"}  # + is to one side
+
+
+def angle_deg(joint: str, **channels: float) -> float:
+    motion = np.zeros(MOTION_DIM, np.float32)
+    for name, size in channels.items():
+        motion[CHANNEL_INDEX[name]] = size
+    return float(np.degrees(MAPPING.angles(motion)[JOINTS.index(joint)]))
+
+
+def other_side(name: str) -> str:
+    for a, b in (("Left", "Right"), ("left", "right")):
+        if name.endswith(a):
+            return name.removesuffix(a) + b
+        if name.endswith(b):
+            return name.removesuffix(b) + a
+    return name
+
+
+def test_twenty_five_face_joints_and_three_of_the_neck_with_ids_from_1():
+    assert len(JOINTS) == 28 and sum(name.startswith("neck_") for name in JOINTS) == 3
+    assert [joint.id for joint in HEAD.joints.values()] == list(range(1, 29))
+
+
+def test_the_neutral_face_is_the_rest_pose_exactly():
+    assert np.array_equal(MAPPING.angles(np.zeros(MOTION_DIM, np.float32)), REST)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_mirrored_face_gives_mirrored_joints(seed):
+    rng = np.random.default_rng(seed)
+    motion = rng.uniform(0, 1, MOTION_DIM).astype(np.float32)
+    motion[:6] = rng.uniform(-0.5, 0.5, 6)
+    mirrored = motion[[CHANNEL_INDEX[other_side(name)] for name in CHANNELS]]
+    for name in ("roll", "yaw", "y"):
+        mirrored[CHANNEL_INDEX[name]] *= -1
+    wanted = MAPPING.angles(motion)[[JOINTS.index(other_side(name)) for name in JOINTS]]
+    signs = np.array([-1.0 if name in TURNS_ROUND else 1.0 for name in JOINTS])
+    assert MAPPING.angles(mirrored) == pytest.approx(signs * wanted, abs=1e-6)
+
+
+def test_channels_that_this_head_cannot_show_are_listed():
+    assert MAPPING.blind_channels == (
+        "x", "y", "z", "cheekPuff", "jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight",
+    )  # fmt: skip
+
+
+def test_every_joint_but_the_sideways_tongue_is_driven_to_a_good_part_of_its_range():
+    rng = np.random.default_rng(0)
+    motion = rng.choice([0.0, 1.0], (400, MOTION_DIM)).astype(np.float32)
+    motion[:, :6] = rng.uniform(-1.1, 1.1, (400, 6))
+    angles = np.array([MAPPING.angles(row) for row in motion])
+    for name, span in zip(JOINTS, np.ptp(angles, axis=0), strict=True):
+        joint = HEAD.joints[name]
+        share = span / (joint.max_rad - joint.min_rad)
+        assert share == 0 if name == "tongue_side" else share > 0.75, name
+
+
+@pytest.mark.parametrize("joint", ["lid_left", "lid_right"])
+def test_a_lid_closes_with_a_blink_whatever_else_the_eye_does(joint):
+    side = joint.removeprefix("lid_").capitalize()
+    top = HEAD.joints[joint].max_deg
+    for other in ({}, {f"eyeLookUp{side}": 1.0}, {f"eyeWide{side}": 1.0}):
+        assert angle_deg(joint, **{f"eyeBlink{side}": 0.86}, **other) == pytest.approx(top)
+
+
+def test_a_lid_follows_gaze_squint_and_surprise():
+    half = angle_deg("lid_left", eyeLookDownLeft=1.0)
+    assert 0 < angle_deg("lid_left", eyeSquintLeft=0.5) < half < HEAD.joints["lid_left"].max_deg
+    assert angle_deg("lid_left", eyeWideLeft=1.0) < 0 and angle_deg("lid_left", eyeLookUpLeft=1.0) < 0
+    assert angle_deg("lid_left", eyeBlinkLeft=1.0) > angle_deg("lid_left", eyeBlinkLeft=0.5) > 0
+
+
+def test_the_neck_is_the_pose():
+    assert angle_deg("neck_pitch", pitch=np.radians(10)) == pytest.approx(10, abs=1e-4)
+    assert angle_deg("neck_yaw", yaw=np.radians(-20)) == pytest.approx(-20, abs=1e-4)
+    assert angle_deg("neck_roll", roll=np.radians(40)) == pytest.approx(HEAD.joints["neck_roll"].max_deg)
+
+
+def test_a_smile_lifts_corners_and_cheeks_and_a_frown_lowers_corners():
+    assert angle_deg("corner_left", mouthSmileLeft=1.0) == pytest.approx(HEAD.joints["corner_left"].max_deg)
+    assert angle_deg("cheek_left", mouthSmileLeft=1.0) > 0 == angle_deg("corner_right", mouthSmileLeft=1.0)
+    assert angle_deg("corner_left", mouthFrownLeft=1.0) < 0

@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.config import Bus, Expression, Head, Joint, LimitClass
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
+from sfms_robot.retarget.mapping import Mapping
+
+
+def head_of(*drives, **joint) -> Head:
+    settings = {"min_deg": -10.0, "rest_deg": 2.0, "max_deg": 30.0} | joint
+    return Head(
+        name="test",
+        description="",
+        buses={"main": Bus(family="dynamixel", baud=1000000)},
+        limits={"any": LimitClass(speed_deg_s=1, acceleration_deg_s2=1, jerk_deg_s3=1)},
+        joints={
+            f"joint{i}": Joint(bus="main", id=i, model="m", zero_ticks=2048, limits="any", drive=drive, **settings)
+            for i, drive in enumerate(drives)
+        },
+    )
+
+
+def value(node: Expression, motion) -> float:
+    """The meaning of an expression, written the slow way."""
+    if node.channel:
+        inner = float(motion[CHANNEL_INDEX[node.channel]])
+    else:
+        parts = [value(child, motion) for child in node.sum or node.max or node.mean]
+        inner = max(parts) if node.max else sum(parts) / (len(parts) if node.mean else 1)
+    inner = inner * node.gain + node.offset
+    return inner if node.clamp is None else min(max(inner, node.clamp[0]), node.clamp[1])
+
+
+small = st.floats(-2, 2)
+leaves = st.builds(
+    lambda channel, gain, offset: Expression(channel=channel, gain=gain, offset=offset),
+    st.sampled_from(CHANNELS),
+    small,
+    small,
+)
+
+
+def grown(children):
+    return st.builds(
+        lambda kind, parts, gain, offset, clamp: Expression(
+            **{kind: tuple(parts)}, gain=gain, offset=offset, clamp=(-0.5, 0.5) if clamp else None
+        ),
+        st.sampled_from(["sum", "max", "mean"]),
+        st.lists(children, min_size=1, max_size=4),
+        small,
+        small,
+        st.booleans(),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.none() | st.recursive(leaves, grown, max_leaves=10), min_size=1, max_size=6),
+    st.sampled_from(["range", "rad"]),
+    st.integers(0, 2**32 - 1),
+)
+def test_angles_are_what_the_expressions_mean(drives, unit, seed):
+    head = head_of(*drives, unit=unit)
+    motion = np.random.default_rng(seed).uniform(-1, 1, (len(drives), MOTION_DIM)).astype(np.float32)
+    angles = Mapping(head).angles(motion)
+    for angle, joint, row in zip(angles, head.joints.values(), motion, strict=True):
+        u = value(joint.drive, row) if joint.drive else 0.0
+        span = joint.max_rad - joint.rest_rad if u > 0 else joint.rest_rad - joint.min_rad
+        wanted = joint.rest_rad + u * (span if unit == "range" else 1.0)
+        assert angle == pytest.approx(min(max(wanted, joint.min_rad), joint.max_rad), abs=1e-9)
+
+
+def test_each_joint_reads_its_own_row():
+    motion = np.zeros((2, MOTION_DIM), np.float32)
+    motion[0, CHANNEL_INDEX["jawOpen"]] = 1
+    angles = Mapping(head_of(Expression(channel="jawOpen"), Expression(channel="jawOpen"))).angles(motion)
+    assert np.degrees(angles) == pytest.approx([30.0, 2.0])
+
+
+def test_one_row_serves_all_joints_and_a_stack_is_done_at_once():
+    mapping = Mapping(head_of(Expression(channel="jawOpen"), Expression(channel="yaw")))
+    motion = np.random.default_rng(0).uniform(0, 1, MOTION_DIM).astype(np.float32)
+    once = mapping.angles(motion)
+    stacked = mapping.angles(np.broadcast_to(motion, (3, 2, MOTION_DIM)))
+    assert once.shape == (2,) and np.array_equal(stacked, np.broadcast_to(once, (3, 2)))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused_by_name(bad):
+    motion = np.zeros(MOTION_DIM, np.float32)
+    motion[CHANNEL_INDEX["mouthPucker"]] = bad
+    with pytest.raises(ValueError, match="mouthPucker is"):
+        Mapping(head_of(Expression(channel="jawOpen"))).angles(motion)
+
+
+@pytest.mark.parametrize("shape", [(57,), (2, 58), (3, 2, 58), ()])
+def test_a_wrong_shape_is_refused(shape):
+    with pytest.raises(ValueError, match="not"):
+        Mapping(head_of(Expression(channel="jawOpen"))).angles(np.zeros(shape, np.float32))
+
+
+def test_blind_channels_are_those_that_nothing_follows():
+    mapping = Mapping(head_of(Expression(max=(Expression(channel="jawOpen"), Expression(channel="roll"))), None))
+    assert set(CHANNELS) - set(mapping.blind_channels) == {"jawOpen", "roll"}

@@ -1,0 +1,218 @@
+"""The loop on emulated servos in virtual time, under a hand-written listener: whatever happens, it comes to rest."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.heads import HANGING, build_bus, build_motion, emulated
+from sfms_robot.config import load_head
+from sfms_robot.errors import ModelError, RobotError
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.servo.dxl2_link import Dxl2Link
+from sfms_robot.servo.port import VirtualTimePort
+from sfms_robot.simulator.launch import Chain, launch
+from sfms_robot.sources.recording import Recording
+
+RATE_HZ = 100.0
+HEAD = load_head("face28")
+
+
+class Nodder:
+    """A listener with a known face: a slow nod, and what the test puts on top of it."""
+
+    hop = 4
+    horizon = 8
+
+    def __init__(self, broken_from: int | None = None, raises_from: int | None = None) -> None:
+        self._broken_from = broken_from
+        self._raises_from = raises_from
+
+    def start(self, seed: int) -> int:
+        return 0
+
+    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
+        if self._raises_from is not None and memory >= self._raises_from:
+            raise ModelError("the listener broke")
+        if memory % self.hop:
+            return None, memory + 1
+        times_s = speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1)
+        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
+        frames[:, CHANNEL_INDEX["pitch"]] = 0.1 * np.sin(2 * np.pi * times_s)
+        if self._broken_from is not None and memory >= self._broken_from:
+            frames[:] = np.nan
+        return Plan(speaker.time_s, times_s, frames), memory + 1
+
+
+class Watcher:
+    """ports.Observer that keeps every tick."""
+
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+        self.frames = 0
+        self.plans = 0
+
+    def tick(self, seen: Tick) -> None:
+        self.ticks.append(seen)
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        self.frames += 1
+
+    def planned(self, plan: Plan) -> None:
+        self.plans += 1
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def chain() -> Iterator[Chain]:
+    with launch(emulated(HEAD)["main"], virtual=True) as running:
+        yield running
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What became of a run: how it ended, what was seen, and what the servos themselves say afterwards."""
+
+    outcome: str
+    log: RunLog
+    watcher: Watcher
+    statistics: Mapping[str, Any]
+    servos: dict[int, dict[str, int]]
+
+
+def run(
+    chain: Chain,
+    listener: Nodder,
+    interrupt_at: int | None = None,
+    watcher: Watcher | None = None,
+    seconds: float = 2.0,
+) -> Ran:
+    clock, watcher = VirtualClock(), watcher or Watcher()
+    motion = build_motion(HEAD, RATE_HZ)
+    bus = build_bus(HEAD, {"main": chain}, clock)
+    log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
+    parts = Parts(
+        Recording(None, None, seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.mapping, motion.limiter,
+        bus, [watcher], motion.leads_s, motion.rest_rad,
+    )  # fmt: skip
+
+    def interrupted() -> bool:
+        return interrupt_at is not None and len(watcher.ticks) >= interrupt_at
+
+    bus.connect()
+    try:
+        outcome = drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=interrupted)
+    except RobotError as error:
+        outcome = str(error)
+    finally:
+        statistics = bus.statistics()
+        bus.close()
+    return Ran(outcome, log, watcher, statistics, chain_state(chain, clock))
+
+
+def chain_state(chain: Chain, clock: VirtualClock) -> dict[int, dict[str, int]]:
+    """Torque and position of every servo, read by the vendor-independent codec over a second port."""
+    link = Dxl2Link(VirtualTimePort(chain.device, chain.control, 4_000_000, clock), 4_000_000, 0.05)
+    try:
+        ids = [joint.id for joint in HEAD.joints.values()]
+        torque = link.sync_read(64, 1, ids)
+        present = link.sync_read(132, 4, ids)
+    finally:
+        link.port.close()
+    return {
+        i: {"torque": torque[i].params[0], "ticks": int.from_bytes(present[i].params, "little", signed=True)}
+        for i in present
+    }
+
+
+def assert_at_rest(servos: dict[int, dict[str, int]]) -> None:
+    for name, joint in HEAD.joints.items():
+        assert servos[joint.id]["torque"] == 0, f"{name} still has torque"
+        assert abs(servos[joint.id]["ticks"] - joint.zero_ticks) <= 3, f"{name} is not at rest"
+
+
+def test_a_run_ends_at_rest_without_torque_and_without_a_violation(chain: Chain) -> None:
+    ran = run(chain, Nodder())
+    assert ran.outcome == "done"
+    assert (ran.log.frames, ran.watcher.frames, ran.watcher.plans) == (50, 50, 13)
+    assert len(ran.watcher.ticks) == 201
+    assert ran.log.audited.violations == 0
+    assert_at_rest(ran.servos)
+
+
+def test_torque_comes_on_without_a_jump_and_the_face_eases_in(chain: Chain) -> None:
+    ticks = run(chain, Nodder()).watcher.ticks
+    hanging_rad = HANGING * HEAD.joints["neck_pitch"].min_rad  # where the emulated head hangs when switched on
+    row = list(HEAD.joints).index("neck_pitch")
+    assert ticks[0].goals_rad[row] == pytest.approx(hanging_rad, abs=2e-3)
+    steps = np.abs(np.diff([tick.goals_rad[row] for tick in ticks[:20]]))
+    assert steps.max() < 0.005
+
+
+def test_a_joint_outside_its_limits_comes_in_from_where_it_stands(chain: Chain) -> None:
+    joint = HEAD.joints["neck_pitch"]
+    outside = joint.zero_ticks - 700  # 61 degrees back, the range ends at 30
+    chain.turn(joint.id, outside)
+    ran = run(chain, Nodder())
+    row = list(HEAD.joints).index("neck_pitch")
+    pitches = np.array([tick.goals_rad[row] for tick in ran.watcher.ticks])
+    assert pitches[0] == pytest.approx(-700 * 2 * np.pi / 4096, abs=2e-3)
+    assert np.abs(np.diff(pitches)).max() <= np.radians(150) / RATE_HZ * (1 + 1e-6)
+    assert pitches[-1] > joint.min_rad
+    assert ran.log.audited.violations == 0
+    assert_at_rest(ran.servos)
+
+
+def test_the_head_follows_the_listener(chain: Chain) -> None:
+    ticks = run(chain, Nodder()).watcher.ticks
+    pitches = [tick.readings["neck_pitch"].position_rad for tick in ticks if tick.time_s > 1.2]
+    assert max(p for p in pitches if p is not None) == pytest.approx(0.1, abs=0.01)
+
+
+def test_an_interruption_still_comes_to_rest(chain: Chain) -> None:
+    ran = run(chain, Nodder(), interrupt_at=130)
+    assert ran.outcome == "interrupted" and len(ran.watcher.ticks) == 130
+    assert_at_rest(ran.servos)
+
+
+def test_an_exception_still_comes_to_rest_and_is_passed_on(chain: Chain) -> None:
+    ran = run(chain, Nodder(raises_from=30))
+    assert ran.outcome == "the listener broke"
+    assert_at_rest(ran.servos)
+
+
+def test_a_plan_that_is_not_finite_is_refused_and_the_face_stays_safe(chain: Chain) -> None:
+    ran = run(chain, Nodder(broken_from=20))
+    assert ran.outcome == "done" and ran.log.refused_plans > 0
+    assert all(np.isfinite(tick.goals_rad).all() for tick in ran.watcher.ticks)
+    assert ran.log.audited.violations == 0
+    assert_at_rest(ran.servos)
+
+
+class Killer(Watcher):
+    """Pulls the plug of one servo after half a second."""
+
+    def __init__(self, chain: Chain, servo: int) -> None:
+        super().__init__()
+        self._chain, self._servo = chain, servo
+
+    def tick(self, seen: Tick) -> None:
+        super().tick(seen)
+        if len(self.ticks) == 50:
+            self._chain.kill(self._servo)
+
+
+def test_a_servo_that_falls_silent_leaves_the_others_moving(chain: Chain) -> None:
+    ran = run(chain, Nodder(), watcher=Killer(chain, 4))
+    last = ran.watcher.ticks[-1].readings
+    assert ran.outcome == "done" and ran.statistics["silent"] == [4]
+    assert last["eye_tilt_right"].age_s > 1.0
+    assert last["neck_pitch"].age_s == 0.0
