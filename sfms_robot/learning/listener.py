@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,10 +25,13 @@ from sfms_robot.listeners.sfms.stream import neutral_tokens
 LN_PER_DB = math.log(10) / 10  # of power
 
 
-def train_listener(settings: config.Training, data: Path, out: Path) -> dict[str, float]:
+def train_listener(
+    settings: config.Training, data: Path, out: Path, each_step: Callable[[int, float], None] | None = None
+) -> dict[str, float]:
     """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
 
     Returns final and held-out loss. Ctrl-C saves what there is and goes on upward.
+    `each_step(step, loss)` is called after every step.
     """
     torch.manual_seed(settings.seed)
     model = SfmsModel(settings.listener)
@@ -36,7 +40,7 @@ def train_listener(settings: config.Training, data: Path, out: Path) -> dict[str
     held_out = gather(clips.load(data / "validation"), settings.listener.window_frames)
     model.train()
     try:
-        loss = _fit(model, corpus, settings)
+        loss = _fit(model, corpus, settings, each_step)
     finally:
         checkpoint.save_config(out, corrected(settings))
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
@@ -62,7 +66,12 @@ def tokenise(model: SfmsModel, corpus: Corpus) -> Tensor:
     return torch.cat([model.tokenizer.encode(m[None], k[None])[0] for m, k in parts])
 
 
-def _fit(model: SfmsModel, corpus: Corpus, settings: config.Training) -> float:
+def _fit(
+    model: SfmsModel,
+    corpus: Corpus,
+    settings: config.Training,
+    each_step: Callable[[int, float], None] | None,
+) -> float:
     training, listener = settings.predictor, settings.listener
     tokens = tokenise(model, corpus)
     starts = corpus.starts(listener.window_frames)
@@ -76,7 +85,7 @@ def _fit(model: SfmsModel, corpus: Corpus, settings: config.Training) -> float:
 
     optimizers = [optimizer(model.predictor.parameters(), training.learning_rate, training.weight_decay)]
     frames = training.batch * listener.window_frames
-    return fit("listener", training.steps, loss_of, optimizers, training.clip_norm, frames)
+    return fit("listener", training.steps, loss_of, optimizers, training.clip_norm, frames, each_step)
 
 
 def _loss(model: SfmsModel, seen: Context, target: Tensor, training: config.PredictorTraining) -> Tensor:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
@@ -27,8 +28,9 @@ def fit(
     optimizers: Sequence[torch.optim.Optimizer],
     clip_norm: float,
     frames_per_step: int,
+    each_step: Callable[[int, float], None] | None = None,
 ) -> float:
-    """Run `steps` steps of `loss_of(step)`; returns the smoothed loss at the end.
+    """Run `steps` steps of `loss_of(step)`; returns the smoothed loss at the end. `each_step(step, loss)` looks on.
 
     Raises ModelError as soon as a loss or gradient is not finite. KeyboardInterrupt passes through: the caller saves.
     """
@@ -50,6 +52,8 @@ def fit(
                 one.step()
             smooth = value if step == 0 else SMOOTHING * smooth + (1 - SMOOTHING) * value
             speed = frames_per_step * (progress.tasks[0].speed or 0.0)
+            if each_step is not None:
+                each_step(step, value)
             progress.update(task, advance=1, loss=smooth, speed=speed)
     return smooth
 
@@ -61,6 +65,7 @@ def _progress() -> Progress:
         MofNCompleteColumn(),
         TextColumn("loss {task.fields[loss]:.4f}  {task.fields[speed]:,.0f} frames/s"),
         TimeRemainingColumn(),
+        console=Console(stderr=True),  # stdout is for figures
     )
 
 

@@ -21,10 +21,13 @@ WEIGHTS = "tokenizer.safetensors"
 DRAWS = 2  # placements tried per window; the better one is the target of the masking loss
 
 
-def train_tokenizer(settings: config.Training, data: Path, out: Path) -> dict[str, float]:
-    """Train on `data`/train and write `out`/tokenizer.safetensors (with untrained predictor left out of use).
+def train_tokenizer(
+    settings: config.Training, data: Path, out: Path, each_step: Callable[[int, float], None] | None = None
+) -> dict[str, float]:
+    """Train on `data`/train and write `out`/tokenizer.safetensors; its predictor is as good as new.
 
     Returns the final loss and the held-out error. Ctrl-C saves what there is and goes on upward.
+    `each_step(step, loss)` is called after every step.
     """
     torch.manual_seed(settings.seed)
     corpus = gather(clips.load(data / "train"), settings.listener.window_frames)
@@ -33,14 +36,19 @@ def train_tokenizer(settings: config.Training, data: Path, out: Path) -> dict[st
     fit_scales(model, corpus)
     model.train()
     try:
-        loss = _fit(model, corpus, settings.tokenizer)
+        loss = _fit(model, corpus, settings.tokenizer, each_step)
     finally:
         checkpoint.save_config(out, settings.listener)
         checkpoint.save_weights(out / WEIGHTS, model)
     return {"loss": loss, "mse": reconstruction_error(model, held_out)}
 
 
-def _fit(model: SfmsModel, corpus: Corpus, settings: config.TokenizerTraining) -> float:
+def _fit(
+    model: SfmsModel,
+    corpus: Corpus,
+    settings: config.TokenizerTraining,
+    each_step: Callable[[int, float], None] | None,
+) -> float:
     tokenizer = model.tokenizer
     motion = model.standardise(corpus.motion)
     starts = corpus.starts(tokenizer.window)
@@ -66,7 +74,7 @@ def _fit(model: SfmsModel, corpus: Corpus, settings: config.TokenizerTraining) -
         return _loss(tokenizer, batch, mask, settings.velocity_loss)[0]
 
     frames = settings.batch * tokenizer.window
-    return fit("tokenizer", settings.steps, loss_of, optimizers, settings.clip_norm, frames)
+    return fit("tokenizer", settings.steps, loss_of, optimizers, settings.clip_norm, frames, each_step)
 
 
 def _loss(tokenizer: Tokenizer, batch: Tensor, mask: Tensor, velocity: float = 0.0) -> tuple[Tensor, Tensor]:

@@ -28,6 +28,7 @@ def save_weights(file: Path, module: nn.Module) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(".part")
     save_file({name: value.contiguous() for name, value in module.state_dict().items()}, part)
+    part.chmod(0o644)  # safetensors leaves it readable by its owner alone
     part.replace(file)
 
 

@@ -44,14 +44,16 @@ class Audit:
     def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: AuditState) -> AuditState:
         """Count one command (J,) against the limits, and against `wanted_rad` (J,), what the limiter was asked for.
 
-        A joint that breaks several limits in one tick counts once. An angle that is not finite is a violation, and
+        A joint that breaks several limits in one tick counts once. One that was found outside its range may stay
+        there and come in, not go further out. An angle that is not finite is a violation, and
         is not carried on.
         """
         finite = np.isfinite(angles_rad)
         angles = np.where(finite, angles_rad, state.recent_rad[-1])
         stream = np.concatenate([state.recent_rad, angles[None]])
         rates = [np.diff(stream, order, axis=0)[-1] / self._dt_s**order for order in (1, 2, 3)]
-        bad = ~finite | (angles < self._limits.low) | (angles > self._limits.high)
+        last = state.recent_rad[-1]
+        bad = ~finite | (angles < np.minimum(self._limits.low, last)) | (angles > np.maximum(self._limits.high, last))
         bad |= (np.abs(rates) > self._bounds).any(axis=0)
 
         ticks = self._calibration.to_ticks(angles)

@@ -10,6 +10,8 @@ range, its speed and acceleration being within their limits all the way. A tick 
 3. Otherwise the joint brakes for one tick. The braking curve of a lawful state stays lawful, so by induction there
    is always a way out.
 
+A joint that is found outside its range starts there, and the range reaches out to it until it has come in.
+
 Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, hence within
 the same limits. A reference that is not finite is refused: the joint brakes, and the tick is counted.
 """
@@ -67,19 +69,16 @@ class LimiterState:
     """Position, speed, acceleration (3, J) after the last tick, and what was counted.
 
     Attributes:
+        low, high: (J,) the range in force: that of the joint, and out to where it was found until it has come in.
         chased: ticks x joints where the reference was out of reach.
         refused: ticks x joints where the reference was not finite.
     """
 
     motion: Doubles
+    low: Doubles
+    high: Doubles
     chased: int = 0
     refused: int = 0
-
-
-def reference(samples_rad: Doubles, step_s: float) -> Doubles:
-    """Angles (3, J) at t - step, t, t + step -> angle, speed, acceleration (3, J) at t, by central differences."""
-    before, here, after = samples_rad
-    return np.stack([here, (after - before) / (2 * step_s), (after - 2 * here + before) / step_s**2])
 
 
 class JerkLimiter:
@@ -97,40 +96,48 @@ class JerkLimiter:
         self._inputs = [_input(*bound, dt_s) for bound in bounds]
 
     def start(self, angles_rad: Doubles) -> LimiterState:
-        """At rest at `angles_rad` (J,), moved to the edge of the range where it lies outside.
-
-        Raises ValueError when an angle is not finite.
-        """
+        """At rest at `angles_rad` (J,), in its range or not. Raises ValueError when an angle is not finite."""
         if not np.isfinite(angles_rad).all():
             raise ValueError(f"joint {int(np.argmin(np.isfinite(angles_rad)))} starts at an angle that is not finite")
         still = np.zeros_like(self._low)
-        return LimiterState(np.stack([np.clip(angles_rad, self._low, self._high), still, still]))
+        low, high = np.minimum(self._low, angles_rad), np.maximum(self._high, angles_rad)
+        return LimiterState(np.stack([angles_rad, still, still]), low, high)
 
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Reference (3, J) one tick ahead -> angles (J,) that may be sent, and the state after the tick."""
         finite: Bools = np.logical_and.reduce(np.isfinite(reference_rad), axis=0)
-        wanted = self._near(np.where(finite, reference_rad, state.motion))
+        low, high = state.low, state.high
+        wanted = self._near(np.where(finite, reference_rad, state.motion), low, high)
         after = wanted.copy()
-        passes = finite & self._in_one_tick(state.motion, wanted) & self._lawful(wanted)
+        passes = finite & self._in_one_tick(state.motion, wanted) & self._lawful(wanted, low, high)
         hard = np.flatnonzero(~passes)
         if len(hard):
-            targets = self._targets(wanted)
+            targets = self._targets(wanted, low, high)
             for j in hard.tolist():
                 after[:, j] = self._chased(j, state.motion[:, j], targets[:, j]) if finite[j] else np.nan
-            brakes = ~(passes | self._lawful(after))
+            brakes = ~(passes | self._lawful(after, low, high))
             if brakes.any():
                 stop = Stop.of(state.motion, self._acceleration, self._jerk).after(self._dt_s)
                 stop[0] += state.motion[0]
                 after = np.where(brakes, stop, after)
-        after[0] = np.minimum(np.maximum(after[0], self._low), self._high)
+        after[0] = np.minimum(np.maximum(after[0], low), high)
+        if low is not self._low or high is not self._high:
+            low, high = self._come_in(after, low, high)
         refused = int(len(finite) - np.count_nonzero(finite))
-        counted = LimiterState(after, state.chased + len(hard) - refused, state.refused + refused)
-        return after[0].copy(), counted
+        chased = state.chased + len(hard) - refused
+        return after[0].copy(), LimiterState(after, low, high, chased, state.refused + refused)
 
-    def _near(self, wanted: Doubles) -> Doubles:
+    def _come_in(self, motion: Doubles, low: Doubles, high: Doubles) -> tuple[Doubles, Doubles]:
+        """The range in force, without the way out where a joint is lawful in its own range."""
+        inside = self._lawful(motion, self._low, self._high)
+        if inside.all():
+            return self._low, self._high
+        return np.where(inside, self._low, low), np.where(inside, self._high, high)
+
+    def _near(self, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
         """`wanted` (3, J) with what is absurdly far out of its limits brought just out of them: 1e300 overflows."""
-        bound = np.stack([1 + self._high, 2 * self._speed, 2 * self._acceleration])
-        floor = np.stack([self._low - 1, -bound[1], -bound[2]])
+        bound = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
+        floor = np.stack([low - 1, -bound[1], -bound[2]])
         near: Doubles = np.minimum(np.maximum(wanted, floor), bound)
         return near
 
@@ -151,7 +158,7 @@ class JerkLimiter:
         ok &= np.abs(wanted[0] - p) <= self._speed * dt
         return ok
 
-    def _lawful(self, motion: Doubles) -> Bools:
+    def _lawful(self, motion: Doubles, low: Doubles, high: Doubles) -> Bools:
         """Whether states (3, J) can stop inside the range, speed and acceleration within limits all the way.
 
         Nothing that is not finite is lawful.
@@ -162,24 +169,24 @@ class JerkLimiter:
         top = np.abs(v) + a**2 / (2 * self._jerk)
         last = top * ((np.abs(a) + self._acceleration) / self._jerk + top / (2 * self._acceleration))
         first = -last
-        if not ((p + first >= self._low) & (p + last <= self._high)).all():
+        if not ((p + first >= low) & (p + last <= high)).all():
             first, last = Stop.of(motion, self._acceleration, self._jerk).extent()
         loose = 1 + _SLACK
         ok: Bools = (np.abs(v) <= self._speed * loose) & (np.abs(peak) <= self._speed * loose)
         ok &= np.abs(a) <= self._acceleration * loose
-        ok &= (p + first >= self._low - _POSITION_SLACK_RAD) & (p + last <= self._high + _POSITION_SLACK_RAD)
-        ok &= (p >= self._low - _POSITION_SLACK_RAD) & (p <= self._high + _POSITION_SLACK_RAD)
+        ok &= (p + first >= low - _POSITION_SLACK_RAD) & (p + last <= high + _POSITION_SLACK_RAD)
+        ok &= (p >= low - _POSITION_SLACK_RAD) & (p <= high + _POSITION_SLACK_RAD)
         return ok
 
-    def _targets(self, wanted: Doubles) -> Doubles:
+    def _targets(self, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
         """`wanted` (3, J) made something ruckig may aim at: inside the range, lawful, or else standing still."""
-        p = np.minimum(np.maximum(wanted[0], self._low), self._high)
+        p = np.minimum(np.maximum(wanted[0], low), high)
         v = np.minimum(np.maximum(wanted[1], -self._speed), self._speed)
         a = np.minimum(np.maximum(wanted[2], -self._acceleration), self._acceleration)
         outside = p != wanted[0]
         target = np.stack([p, np.where(outside, 0.0, v), np.where(outside, 0.0, a)])
-        target[2] *= self._lawful(target)
-        target[1:] *= self._lawful(target)
+        target[2] *= self._lawful(target, low, high)
+        target[1:] *= self._lawful(target, low, high)
         return target
 
     def _chased(self, j: int, motion: Doubles, target: Doubles) -> Doubles:

@@ -9,8 +9,9 @@ it has nothing to repair. Two rules for slope and curvature at a frame:
 - blendshapes: the harmonic-mean slopes of Fritsch and Carlson (1980), no curvature beside a flat stretch, and the
   curve kept between the two frames' values: it never overshoots, so 0 stays 0 and a closed lid stays closed.
 
-A blink is two frames long, and a peak that falls between two ticks would be shaved off. The blink channels are
-therefore widened by half a tick on either side: the tick nearest to the peak sees the peak.
+A blink is two frames long; a peak that falls between two ticks would be shaved off, and a lid servo that is slower
+than the blink would turn back before it has closed. The blink channels are therefore widened by half a frame on
+either side: the lid starts a little early and stays closed for as long as the frame that says so.
 
 A newer plan replaces the older from its first time on. Where both have a frame they are blended over two frames,
 blinks by maximum. What was played already (leads included), and the piece of curve that is in play, stay as they
@@ -113,11 +114,12 @@ class PlanTimeline:
     """Implements `ports.Timeline`.
 
     Args:
-        tick_s: period of the ticks it will be sampled at; only the widening of blinks depends on it.
+        tick_s: period of the ticks it will be sampled at; blinks are widened by half of it where it is longer than
+            a frame.
     """
 
     def __init__(self, tick_s: float) -> None:
-        self._half_tick_s = tick_s / 2
+        self._widening_s = max(tick_s, FRAME_S) / 2
 
     def start(self) -> TimelineState:
         return TimelineState()
@@ -159,7 +161,7 @@ class PlanTimeline:
             return np.zeros((len(times_s), MOTION_DIM), np.float32), replace(state, played_s=played_s)
         asked_s = times_s - curve.delay_s
         motion = _motion(curve, asked_s)
-        around_s = np.concatenate([asked_s - self._half_tick_s, asked_s + self._half_tick_s])
+        around_s = np.concatenate([asked_s - self._widening_s, asked_s + self._widening_s])
         widened = _motion(curve, around_s, _BLINKS).reshape(2, len(asked_s), -1).max(axis=0)
         motion[:, _BLINKS] = np.maximum(motion[:, _BLINKS], widened)
         motion[:, _BLINKS] = np.maximum(motion[:, _BLINKS], self._near(curve, asked_s))
@@ -170,10 +172,10 @@ class PlanTimeline:
         )
 
     def _near(self, curve: Curve, asked_s: Doubles) -> Doubles:
-        """Blink (N, 2) of a frame less than half a tick away, 0 where there is none."""
+        """Blink (N, 2) of a frame close enough to be widened to here, 0 where there is none."""
         times_s = curve.knots.times_s
-        nearest = np.searchsorted(times_s, asked_s + self._half_tick_s, side="right") - 1
-        near = np.abs(times_s[np.maximum(nearest, 0)] - asked_s) <= self._half_tick_s
+        nearest = np.searchsorted(times_s, asked_s + self._widening_s, side="right") - 1
+        near = np.abs(times_s[np.maximum(nearest, 0)] - asked_s) <= self._widening_s
         blinks: Doubles = curve.knots.values[np.maximum(nearest, 0), _BLINKS]
         return blinks * (near & (nearest >= 0) & (asked_s - curve.made_at_s < STALL_S))[:, None]
 

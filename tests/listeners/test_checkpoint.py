@@ -1,7 +1,7 @@
 import pytest
 import torch
-from conftest import plans_of, speech, tiny_listener, tiny_settings
 from safetensors.torch import load_file, save_file
+from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
 
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.listeners import checkpoint, sfms

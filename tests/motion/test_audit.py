@@ -60,10 +60,19 @@ def test_a_speed_acceleration_or_jerk_just_over_its_limit_is_a_violation(order):
         assert state.violations == found
 
 
-def test_a_position_outside_the_range_is_a_violation_however_little():
+def test_a_position_that_leaves_the_range_is_a_violation_however_little():
     lid = list(HEAD.joints).index("lid_left")
-    stream = steps(lid, np.full(4, LIMITS.high[lid] + 1e-9))
-    assert audited(stream).violations == 4
+    edge = LIMITS.high[lid]
+    state = AUDIT.start(steps(lid, [edge])[0])
+    assert AUDIT.step(steps(lid, [edge + 1e-9])[0], np.zeros(J), state).violations == 1
+
+
+def test_a_joint_found_outside_its_range_may_come_in_but_not_go_further_out():
+    lid = list(HEAD.joints).index("lid_left")
+    outside = LIMITS.high[lid] + 0.1
+    state = AUDIT.start(steps(lid, [outside])[0])
+    assert AUDIT.step(steps(lid, [outside - 1e-9])[0], np.zeros(J), state).violations == 0
+    assert AUDIT.step(steps(lid, [outside + 1e-9])[0], np.zeros(J), state).violations == 1
 
 
 def test_an_angle_that_is_not_finite_is_a_violation_and_does_not_spread():

@@ -5,7 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
-from sfms_robot.motion.limits import JerkLimiter, JointLimits, Stop, reference
+from sfms_robot.motion.limits import JerkLimiter, JointLimits, Stop
+from sfms_robot.runtime.loop import difference
 
 DT_S = 0.01
 LIMITS = JointLimits.of(load_head("face28"))
@@ -53,7 +54,7 @@ def jumps(rng, ticks):
 
 def random_walk(rng, ticks):
     walk = np.cumsum(rng.normal(size=(ticks + 2, J)) * rng.uniform(1e-4, 0.1), axis=0)
-    return [reference(walk[k : k + 3], DT_S) for k in range(ticks)]
+    return [difference(*walk[k : k + 3], DT_S) for k in range(ticks)]
 
 
 def bang_bang_jerk(rng, ticks):
@@ -124,14 +125,14 @@ def test_a_slow_nod_passes_unchanged():
     rise = np.clip(t / 0.5, 0, 1)
     nod = np.radians(2.5) * rise**3 * (10 - 15 * rise + 6 * rise**2) * np.sin(2 * np.pi * 2 * t)
     angles = np.outer(nod, FREE)
-    sent, state = followed([reference(angles[k - 1 : k + 2], DT_S) for k in range(1, 400)])
+    sent, state = followed([difference(*angles[k - 1 : k + 2], DT_S) for k in range(1, 400)])
     assert state.chased == 0 and np.array_equal(sent[3:], angles[1:400])
 
 
 def test_the_reference_is_met_again_after_a_jump():
     t = DT_S * np.arange(402)
     angles = np.outer(np.radians(2) * np.sin(2 * np.pi * 0.5 * t), FREE)
-    references = [reference(angles[k : k + 3], DT_S) for k in range(400)]
+    references = [difference(*angles[k : k + 3], DT_S) for k in range(400)]
     start = np.clip(np.full(J, np.radians(15)), LIMITS.low, LIMITS.high)
     sent, _ = followed(references, start)
     assert np.array_equal(sent[-200:], angles[201:401])
@@ -147,14 +148,29 @@ def test_what_is_not_finite_is_refused_and_the_joint_comes_to_a_stop():
 def test_one_broken_joint_does_not_disturb_the_others():
     t = DT_S * np.arange(102)
     angles = np.outer(np.radians(1) * np.sin(2 * np.pi * 0.5 * t) ** 3, FREE)
-    good = [reference(angles[k : k + 3], DT_S) for k in range(100)]
+    good = [difference(*angles[k : k + 3], DT_S) for k in range(100)]
     bad = [np.where(np.arange(J) == 3, np.nan, wanted) for wanted in good]
     others = np.arange(J) != 3
     assert np.array_equal(followed(good)[0][:, others], followed(bad)[0][:, others])
 
 
-def test_it_starts_inside_the_range_and_not_from_nonsense():
-    assert np.array_equal(LIMITER.start(LIMITS.high + 1).motion[0], LIMITS.high)
+@pytest.mark.parametrize("adversary", ADVERSARIES)
+def test_a_joint_found_outside_its_range_comes_in_lawfully_and_stays(adversary):
+    rng = np.random.default_rng(3)
+    start = np.where(np.arange(J) % 2, LIMITS.high + 0.7, LIMITS.low - 0.3)
+    middle = (LIMITS.low + LIMITS.high) / 2
+    state, sent = LIMITER.start(start), [start] * 3
+    for wanted in [*adversary(rng, 100), *[standing(middle)] * 300, *adversary(rng, 300)]:
+        goals, state = LIMITER.step(wanted, state)
+        sent.append(goals)
+    sent = np.array(sent)
+    assert (sent >= np.minimum(LIMITS.low, start)).all() and (sent <= np.maximum(LIMITS.high, start)).all()
+    assert (sent[403:] >= LIMITS.low).all() and (sent[403:] <= LIMITS.high).all()
+    for n, bound in enumerate((LIMITS.speed, LIMITS.acceleration, LIMITS.jerk), 1):
+        assert (np.abs(np.diff(sent, n, axis=0)) / DT_S**n <= bound * (1 + 1e-6)).all()
+
+
+def test_it_does_not_start_from_nonsense():
     with pytest.raises(ValueError, match="joint 2 starts at an angle that is not finite"):
         LIMITER.start(np.where(np.arange(J) == 2, np.nan, 0.0))
 
@@ -189,4 +205,4 @@ def test_the_stop_is_the_one_that_ruckig_finds(speed, acceleration):
 
 def test_the_reference_of_a_parabola_is_exact():
     t = np.array([[0.99], [1.0], [1.01]])
-    assert reference(1 + 2 * t + 3 * t**2, 0.01)[:, 0] == pytest.approx([6, 8, 6])
+    assert difference(*(1 + 2 * t + 3 * t**2), 0.01)[:, 0] == pytest.approx([6, 8, 6])

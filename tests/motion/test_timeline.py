@@ -70,7 +70,7 @@ def test_blendshapes_stay_between_the_frames_around_them(seed, hop, lead_s):
     shapes, given_shapes = rows[:, SHAPES], frames[:, SHAPES]
     assert shapes.min() >= 0 and shapes.max() <= 1
     for t, row in zip(times[40:], shapes[40:], strict=True):
-        around = given_shapes[int(np.floor(t / FRAME_S - 0.2)) : int(np.floor(t / FRAME_S + 0.2)) + 2]
+        around = given_shapes[int(np.floor(t / FRAME_S - 0.51)) : int(np.floor(t / FRAME_S + 0.51)) + 2]
         assert (row >= around.min(axis=0) - 1e-5).all() and (row <= around.max(axis=0) + 1e-5).all()
 
 
@@ -121,8 +121,9 @@ def test_what_was_played_is_never_changed_by_a_later_plan():
     seen = np.arange(0.0, 0.2, 0.003)
     before, state = TIMELINE.sample(seen, 0.15, state)
     state = TIMELINE.accept(plan(0.12, rng.uniform(0, 1, (8, MOTION_DIM))), state)
-    late = seen < seen.max() - TICK_S  # widening a blink looks half a tick ahead
-    assert at(state, *seen, now_s=0.15)[late] == pytest.approx(before[late], abs=1e-6)
+    after = at(state, *seen, now_s=0.15)
+    after[-10:, BLINK : BLINK + 2] = before[-10:, BLINK : BLINK + 2]  # widening a blink looks half a frame ahead
+    assert after == pytest.approx(before, abs=1e-6)
 
 
 @pytest.mark.parametrize("horizon, hop, lead_s", [(8, 4, 0.03), (8, 1, 0.03), (8, 7, 0.0), (1, 1, 0.0), (1, 1, 0.04)])

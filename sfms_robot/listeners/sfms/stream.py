@@ -167,7 +167,7 @@ def draw(
 
 
 def sample(logits: Tensor, bias: Tensor, sampling: config.Sampling, generator: torch.Generator) -> Tensor:
-    """One class of each (..., G, V) logits: temperature, bias (G,) on class 0, then the nucleus of likeliest classes."""
+    """One class of each (..., G, V) logits: temperature, bias (G,) on class 0, then the likeliest classes only."""
     scaled = logits / sampling.temperature
     scaled = torch.cat([scaled[..., :1] + bias[:, None], scaled[..., 1:]], dim=-1)
     order = torch.softmax(scaled, dim=-1).sort(descending=True, stable=True)

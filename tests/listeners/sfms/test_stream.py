@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from conftest import plans_of, speech, tiny_listener
+from tiny_sfms import plans_of, speech, tiny_listener
 
 from sfms_robot.frames import FRAME_S, SpeakerFrame
 from sfms_robot.listeners.sfms.predictor import Context

@@ -1,0 +1,152 @@
+"""Both phases on half a minute of made-up conversation."""
+
+import numpy as np
+import pytest
+import torch
+
+from sfms_robot import config
+from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
+from sfms_robot.learning import listener, loop, tokenizer
+from sfms_robot.learning.corpus import Corpus, fit_scales, gather, place_all, windows
+from sfms_robot.learning.datasets import clips
+from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.learning.rollout import evaluate_rollout
+from sfms_robot.listeners import checkpoint, sfms
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
+
+
+def settings(placement: str = "exact", **phases) -> config.Training:
+    raw = {
+        "listener": {
+            "kind": "sfms",
+            "placement": placement,
+            "groups": {
+                "neck": {"channels": POSE_CHANNELS, "levels": (5, 3), "keyframes": 8},
+                "face": {"channels": BLENDSHAPES, "levels": (4, 4), "keyframes": 8},
+            },
+            "tokenizer_width": 16,
+            "predictor_width": 16,
+            "predictor_layers": 1,
+            "heads": 2,
+        },
+        "tokenizer": {"steps": 30, "batch": 8, "learning_rate": 5e-3},
+        "predictor": {"steps": 20, "batch": 8, "learning_rate": 5e-3},
+    }
+    return config.parse(config.Training, raw | phases, "tiny")
+
+
+def dyad(name: str, frames: int = 300, seed: int = 0) -> Dyad:
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(frames)[:, None] / 25
+    size = np.random.default_rng(0).uniform(-0.2, 0.2, 58)  # the whole face moves as one
+    motion = (0.2 + size * np.sin(2 * np.pi * 0.7 * time_s + seed)).astype(np.float32)
+    speaker = motion[::-1].copy()
+    speaker[frames // 2 :] = np.nan
+    audio = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
+    return Dyad(name, audio, speaker, motion, np.ones(frames, bool))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    clips.save(folder / "train", [dyad("a"), dyad("b", seed=1)])
+    clips.save(folder / "validation", [dyad("c", 160, seed=2)])
+    return folder
+
+
+@pytest.mark.parametrize("placement", ["exact", "static", "learned"])
+def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placement):
+    chosen = settings(placement)
+    first = tokenizer.train_tokenizer(chosen, data, tmp_path)
+    second = listener.train_listener(chosen, data, tmp_path)
+    assert np.isfinite([*first.values(), *second.values()]).all()
+    loaded = sfms.load(tmp_path)
+    own, people, motions = evaluate_rollout(loaded, [dyad("c", 160, seed=2)])
+    assert motions[0].shape == (160, 58) and np.isfinite(motions[0]).all()
+    assert people.blinks >= 0 and own.jerk_deg_s3 > 0
+
+
+def test_training_repeats_bit_for_bit(data, tmp_path):
+    for out in ("one", "two"):
+        tokenizer.train_tokenizer(settings(), data, tmp_path / out)
+    one, two = (tmp_path / out / tokenizer.WEIGHTS for out in ("one", "two"))
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_more_training_reconstructs_better(data, tmp_path):
+    few = settings(tokenizer={"steps": 1, "batch": 8, "learning_rate": 5e-3})
+    many = settings(tokenizer={"steps": 120, "batch": 8, "learning_rate": 5e-3})
+    before = tokenizer.train_tokenizer(few, data, tmp_path)["mse"]
+    assert tokenizer.train_tokenizer(many, data, tmp_path)["mse"] < 0.7 * before
+
+
+def test_a_loss_that_is_not_finite_stops_the_training():
+    weight = torch.nn.Parameter(torch.ones(1))
+    with pytest.raises(ModelError, match="toy: loss inf.* at step 3: not finite"):
+        loop.fit("toy", 5, lambda s: weight.sum() / (s != 3), [loop.optimizer([weight], 1e-3, 0.0)], 1.0, 1)
+
+
+def test_an_interrupted_training_leaves_weights_that_load(data, tmp_path):
+    calls = []
+
+    def interrupt(*_args):
+        calls.append(1)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tokenizer.train_tokenizer(settings(), data, tmp_path, each_step=interrupt)
+    model = SfmsModel(settings().listener)
+    checkpoint.load_weights(tmp_path / tokenizer.WEIGHTS, model)
+
+
+def test_the_weight_of_class_0_is_taken_out_of_its_probability():
+    weight = settings(predictor={"steps": 1, "batch": 1, "learning_rate": 1, "transition_weight": 0.25})
+    assert [g.transition_bias for g in listener.corrected(weight).groups.values()] == [1.386, 1.386]
+
+
+def _corpus() -> Corpus:
+    return gather([dyad("a"), dyad("short", 40), dyad("b", 130, seed=1)], 48)
+
+
+def test_windows_never_cross_from_one_dyad_into_the_next():
+    corpus = _corpus()
+    assert corpus.lengths == (300, 130)  # the one shorter than a window is left out
+    starts = corpus.starts(48)
+    assert len(starts) == (300 - 47) + (130 - 47)
+    assert not ((starts < 300) & (starts + 48 > 300)).any()
+    assert torch.equal(windows(corpus.motion, starts[-1:], 48)[0], corpus.motion[-48:])
+
+
+def test_only_short_dyads_are_refused():
+    with pytest.raises(ConfigError, match="none of 1 dyads is as long as a window of 48"):
+        gather([dyad("short", 40)], 48)
+
+
+@pytest.mark.parametrize("placement", ["exact", "static"])
+def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement):
+    model, corpus = SfmsModel(settings(placement).listener), _corpus()
+    fit_scales(model, corpus)
+    mask = place_all(model.tokenizer, model.standardise(corpus.motion), corpus.lengths)
+    assert mask.mean(0) * 48 == pytest.approx(torch.tensor([8.0, 8.0]), rel=0.1)
+    for part in mask.split(corpus.lengths):
+        assert (part[:, 0].nonzero()[:, 0].diff() <= 48).all()
+
+
+def test_a_perturbed_history_moves_keyframes_by_one_level_and_nothing_else():
+    levels = as_levels([[5, 3]])
+    tokens = torch.randint(0, 16, (4, 40, 1))
+    torch.manual_seed(0)
+    moved = listener.perturb(tokens, levels, 1.0)
+    assert torch.equal(moved > 0, tokens > 0)
+    key = (tokens > 0)[..., 0]
+    before, after = (indices_to_codes((t - 1).clamp(min=0), levels)[key] for t in (tokens, moved))
+    steps = (after - before).abs() / (2 / (levels - 1))
+    assert (steps.sum(-1) < 1.001).all()
+
+
+def test_missing_data_is_one_line(tmp_path):
+    with pytest.raises(ConfigError, match=r"train: no dyads \(\*\.npz\) here"):
+        tokenizer.train_tokenizer(settings(), tmp_path, tmp_path)

@@ -1,0 +1,44 @@
+"""A 16-wide model with seeded weights against outputs kept in tests/assets."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_sfms import plans_of, speech, tiny_listener
+
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
+
+GOLDEN = Path(__file__).parents[2] / "assets" / "sfms_tiny.npz"
+
+
+@torch.no_grad()
+def outputs() -> dict[str, np.ndarray]:
+    model = tiny_listener().model
+    drawn = torch.Generator().manual_seed(5)
+    tokens = torch.randint(0, 7, (1, 48, 2), generator=drawn)
+    seen = Context(
+        face=torch.randn(1, 40, 58, generator=drawn),
+        face_known=torch.rand(1, 40, generator=drawn) > 0.3,
+        mel=torch.randn(1, 160, 128, generator=drawn),
+        heard=torch.rand(1, 40, generator=drawn) > 0.3,
+        tokens=tokens[:, :40],
+    )
+    future = torch.cat([tokens[:, 40:43], torch.full((1, 5, 2), UNDECIDED)], dim=1)
+    logits = model.predictor.decode(model.predictor.remember(seen), seen.tokens, future)
+    named = {f"logits_{group}": values.numpy() for group, values in enumerate(logits)}
+    return named | {"motion": model.tokenizer.decode(tokens).numpy()}
+
+
+@pytest.mark.parametrize("name", ["motion", "logits_0", "logits_1"])
+def test_outputs_are_those_on_file(name: str):
+    np.testing.assert_allclose(outputs()[name], np.load(GOLDEN)[name], rtol=1e-3, atol=1e-4)
+
+
+def test_the_streamed_plan_is_the_one_on_file():
+    plans = plans_of(tiny_listener(), speech(9), seed=1)
+    np.testing.assert_allclose(plans[8].frames, np.load(GOLDEN)["plan"], atol=1e-3)
+
+
+if __name__ == "__main__":  # writes the file anew, for a change of the architecture that is meant
+    np.savez_compressed(GOLDEN, plan=plans_of(tiny_listener(), speech(9), seed=1)[8].frames, **outputs())

@@ -1,0 +1,52 @@
+"""A listener small enough to build in every test."""
+
+import numpy as np
+import torch
+
+from sfms_robot import config
+from sfms_robot.frames import BLENDSHAPES, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.stream import SfmsListener
+
+
+def tiny_settings(**changes) -> config.Listener:
+    raw = {
+        "kind": "sfms",
+        "groups": {
+            "neck": {"channels": POSE_CHANNELS, "levels": (3, 2), "keyframes": 6},
+            "face": {"channels": BLENDSHAPES, "levels": (2, 4), "keyframes": 5},
+        },
+        "tokenizer_width": 16,
+        "predictor_width": 16,
+        "predictor_layers": 1,
+        "heads": 2,
+    }
+    return config.parse(config.Listener, raw | changes, "tiny")
+
+
+def tiny_listener(**changes) -> SfmsListener:
+    settings = tiny_settings(**changes)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return SfmsListener(settings, SfmsModel(settings))
+
+
+def speech(frames: int, seed: int = 0, face: bool = True, audio: bool = True) -> list[SpeakerFrame]:
+    rng = np.random.default_rng(seed)
+    out = []
+    for index in range(frames):
+        time_s = (index + 1) * FRAME_S
+        sound = rng.normal(0, 0.1, FRAME_SAMPLES).astype(np.float32)
+        shown = FaceFrame.of(time_s, rng.uniform(0, 0.3, 58))
+        out.append(SpeakerFrame(time_s, sound if audio else sound[:0], shown if face else None))
+    return out
+
+
+def plans_of(listener, speaker, seed=1):
+    """Every plan of a stream, by the index of the frame it was made at."""
+    memory, plans = listener.start(seed), {}
+    for index, frame in enumerate(speaker):
+        plan, memory = listener.step(frame, memory)
+        if plan is not None:
+            plans[index] = plan
+    return plans
