@@ -35,7 +35,10 @@ def run(
     from sfms_robot.cli.tables import print_dry_run, print_run
 
     options = RunOptions(head, port, listener, audio, face, duration, fast, seed, record, dry_run)
-    report = run_head(options, RunProgress)
+    try:
+        report = run_head(options, RunProgress)
+    except KeyboardInterrupt:  # before torque came on; after that an interruption is a flag, and the head comes to rest
+        sys.exit(INTERRUPTED)
     if json:
         print(json_module.dumps(report))
     elif dry_run:

@@ -6,11 +6,14 @@ that were missed altogether are skipped, never chased: catching up would mean mo
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sfms_robot.ports import Clock
+
+_SAME = 1e-6  # of a period: a clock this close to a tick is at it
 
 
 class RealClock:
@@ -43,23 +46,21 @@ class VirtualClock:
 
 @dataclass(frozen=True)
 class Beat:
-    """One tick: its nominal time, how late it started, and how many ticks were skipped before it."""
+    """One tick: its nominal time since the start, how late it began, and how many ticks were skipped before it."""
 
     time_s: float
     late_s: float
     skipped: int
 
 
-def beats(clock: Clock, rate_hz: float) -> Iterator[Beat]:
-    """Endless ticks at `rate_hz` from the clock's present time on; nominal times are exact multiples."""
-    period_s = 1.0 / rate_hz
-    start_s = clock.now_s()
-    index = 0
+def beats(clock: Clock, rate_hz: float, start_s: float) -> Iterator[Beat]:
+    """Endless ticks from now on, at `rate_hz`; nominal times are exact multiples of the period since `start_s`."""
+    index = max(0, math.ceil((clock.now_s() - start_s) * rate_hz - _SAME))
     while True:
-        due_s = start_s + index * period_s
+        due_s = start_s + index / rate_hz
         clock.wait_until(due_s)
         late_s = max(0.0, clock.now_s() - due_s)
-        skipped = int(late_s / period_s)
+        skipped = int(late_s * rate_hz)
         index += skipped
-        yield Beat(start_s + index * period_s, late_s - skipped * period_s if skipped else late_s, skipped)
+        yield Beat(index / rate_hz, late_s - skipped / rate_hz, skipped)
         index += 1

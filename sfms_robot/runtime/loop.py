@@ -62,25 +62,28 @@ def drive(
 
     Whatever is raised on the way, the head comes to rest and `bus.stop` is called before it goes on.
     """
-    held_rad = parts.bus.enable(parts.retargeter.joints)
-    log.start(held_rad)
-    state = State(parts.timeline.start(), parts.limiter.start(held_rad), held_rad, held_rad, held_rad)
-    start_s = clock.now_s()
     try:
-        for beat in beats(clock, rate_hz):
-            if interrupted():
-                return "interrupted"
-            if beat.time_s - start_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
-                break
-            state = _tick(parts, log, clock, beat, state, start_s, 1.0 / rate_hz)
-        return "done"
+        held_rad = parts.bus.enable(parts.retargeter.joints)
+        log.start(held_rad)
+        state = State(parts.timeline.start(), parts.limiter.start(held_rad), held_rad, held_rad, held_rad)
+        start_s = clock.now_s()
+        try:
+            for beat in beats(clock, rate_hz, start_s):
+                if interrupted():
+                    return "interrupted"
+                if beat.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
+                    break
+                state = _tick(parts, log, clock, beat, state, start_s, 1.0 / rate_hz)
+            return "done"
+        finally:
+            ticks = beats(clock, rate_hz, start_s)
+            come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, ticks, log)
     finally:
-        come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, clock, log, rate_hz)
         parts.bus.stop(stop)
 
 
 def _tick(parts: Parts, log: RunLog, clock: Clock, beat: Beat, state: State, start_s: float, period_s: float) -> State:
-    now_s = beat.time_s - start_s  # the run's own time: 0 when torque came on
+    now_s = beat.time_s  # the run's own time: 0 when torque came on
     for frame in parts.source.read(now_s):
         parts.feed.push(frame, now_s)
         log.heard(frame)

@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -15,8 +15,8 @@ import numpy as np
 
 from sfms_robot.errors import RobotError
 from sfms_robot.frames import Doubles
-from sfms_robot.ports import Bus, Clock, Limiter
-from sfms_robot.runtime.clock import beats
+from sfms_robot.ports import Bus, Limiter
+from sfms_robot.runtime.clock import Beat
 from sfms_robot.runtime.log import RunLog
 
 EASE_S = 1.0  # torque-on pose -> live face, and live face -> rest
@@ -34,37 +34,22 @@ def smooth(u: float) -> float:
 
 
 def come_to_rest(
-    bus: Bus,
-    limiter: Limiter,
-    state: Any,
-    from_rad: Doubles,
-    rest_rad: Doubles,
-    clock: Clock,
-    log: RunLog,
-    rate_hz: float,
+    bus: Bus, limiter: Limiter, state: Any, from_rad: Doubles, rest_rad: Doubles, ticks: Iterable[Beat], log: RunLog
 ) -> None:
     """Ease every joint to its rest angle under the limits. A bus that fails on the way ends it early, with a line."""
-    period_s = 1.0 / rate_hz
     span = rest_rad - from_rad
-    start_s = clock.now_s()
+    period_s = log.period_s
     try:
-        for beat in beats(clock, rate_hz):
-            now_s = beat.time_s - start_s
-            weights = [smooth((now_s + k * period_s) / EASE_S) for k in (-1, 0, 1)]
-            angle, before, ahead = weights[1], weights[0], weights[2]
-            reference = np.stack(
-                [
-                    from_rad + angle * span,
-                    (ahead - before) / (2 * period_s) * span,
-                    (ahead - 2 * angle + before) / period_s**2 * span,
-                ]
-            )
+        for count, beat in enumerate(ticks):
+            before, angle, ahead = (smooth((count + k) * period_s / EASE_S) for k in (-1, 0, 1))
+            speed, acceleration = (ahead - before) / (2 * period_s), (ahead - 2 * angle + before) / period_s**2
+            reference = np.stack([from_rad + angle * span, speed * span, acceleration * span])
             goals_rad, state = limiter.step(reference, state)
             bus.write(goals_rad, beat.time_s)
             log.ease(beat, goals_rad, reference[0])
             bus.poll(beat.time_s)
             arrived = bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD))
-            if now_s >= EASE_S + SETTLE_S or (arrived and now_s >= EASE_S):
+            if arrived and count * period_s >= EASE_S or count * period_s >= EASE_S + SETTLE_S:
                 return
     except RobotError as error:
         logger.error("could not ease to rest: %s", error)

@@ -8,13 +8,13 @@ from sfms_robot.runtime.clock import VirtualClock, beats
 
 
 def test_ticks_are_exact_multiples_of_the_period() -> None:
-    times = [beat.time_s for beat in itertools.islice(beats(VirtualClock(), 100), 1000)]
+    times = [beat.time_s for beat in itertools.islice(beats(VirtualClock(), 100, 0.0), 1000)]
     assert times == [pytest.approx(i / 100, abs=1e-12) for i in range(1000)]
 
 
 def test_work_shorter_than_a_period_does_not_shift_the_next_tick() -> None:
     clock = VirtualClock()
-    ticks = beats(clock, 50)
+    ticks = beats(clock, 50, 0.0)
     next(ticks)
     clock.wait_until(0.015)
     assert next(ticks).time_s == pytest.approx(0.020)
@@ -22,7 +22,7 @@ def test_work_shorter_than_a_period_does_not_shift_the_next_tick() -> None:
 
 def test_a_late_tick_is_reported_and_missed_ticks_are_skipped_not_chased() -> None:
     clock = VirtualClock()
-    ticks = beats(clock, 50)
+    ticks = beats(clock, 50, 0.0)
     next(ticks)
     clock.wait_until(0.075)  # 75 ms of work in a 20 ms period
     late = next(ticks)
@@ -37,3 +37,10 @@ def test_virtual_time_never_runs_backwards() -> None:
     clock.wait_until(2.0)
     clock.wait_until(1.0)
     assert clock.now_s() == 2.0
+
+
+def test_ticks_go_on_from_where_the_clock_is() -> None:
+    clock = VirtualClock()
+    clock.wait_until(5.013)
+    assert next(beats(clock, 100, 5.0)).time_s == pytest.approx(0.02)
+    assert next(beats(clock, 100, 3.0)).time_s == pytest.approx(2.02)

@@ -216,3 +216,11 @@ def test_a_servo_that_falls_silent_leaves_the_others_moving(chain: Chain) -> Non
     assert ran.outcome == "done" and ran.statistics["silent"] == [4]
     assert last["eye_tilt_right"].age_s > 1.0
     assert last["neck_pitch"].age_s == 0.0
+
+
+def test_a_servo_that_refuses_torque_leaves_none_of_them_with_torque(chain: Chain) -> None:
+    chain.fault(5, 0x20)  # overload, latched until reboot
+    ran = run(chain, Nodder())
+    assert "lid_left (id 5)" in ran.outcome
+    assert ran.watcher.ticks == []
+    assert all(servo["torque"] == 0 for servo in ran.servos.values())
