@@ -15,7 +15,7 @@ from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.signals import mel
 
-STRETCH_WINDOWS = 5  # exact placement shares its keyframes among this many windows
+STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,10 @@ def fit_scales(model: SfmsModel, corpus: Corpus) -> None:
     floor[:3], floor[3:6] = 0.01, 0.01  # [rad], [m]
     model.motion_mean.copy_(corpus.motion.mean(0))
     model.motion_std.copy_(torch.maximum(corpus.motion.std(0), floor))
+    steps = (corpus.motion.diff(dim=0) / model.motion_std).abs()
+    model.motion_speed.copy_(
+        torch.stack([one.sort().values[int(0.9995 * len(one))] for one in steps.T]).clamp(min=0.05)
+    )
     rows = corpus.mel[:: max(1, len(corpus.mel) // 20_000)].float().flatten(0, 1)
     model.mel_mean.copy_(rows.mean(0))
     model.mel_std.copy_(rows.std(0).clamp(min=0.5))

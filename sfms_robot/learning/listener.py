@@ -81,20 +81,22 @@ def _fit(
         chosen = starts[torch.randint(len(starts), (training.batch,))]
         seen = context(model, corpus, tokens, chosen, listener.past_frames)
         seen = augment(seen, model.predictor.levels, neutral, training)
-        return _loss(model, seen, windows(tokens, chosen + listener.past_frames, listener.future_frames), training)
+        return _loss(model, seen, windows(tokens, chosen + listener.past_frames, listener.future_frames), settings)
 
     optimizers = [optimizer(model.predictor.parameters(), training.learning_rate, training.weight_decay)]
     frames = training.batch * listener.window_frames
     return fit("listener", training.steps, loss_of, optimizers, training.clip_norm, frames, each_step)
 
 
-def _loss(model: SfmsModel, seen: Context, target: Tensor, training: config.PredictorTraining) -> Tensor:
+def _loss(model: SfmsModel, seen: Context, target: Tensor, settings: config.Training) -> Tensor:
     """Loss (14) on the future frames behind a random number of given ones (0: the paper's parallel prediction)."""
     b, h, _ = target.shape
     given = torch.arange(h) < torch.randint(h, (b, 1))  # (B, H)
     future = torch.where(given[..., None], target, UNDECIDED)
     logits = model.predictor.decode(model.predictor.remember(seen), seen.tokens, future)
-    return next_tokens(logits, target, ~given, training.transition_weight)
+    training = settings.predictor
+    weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
+    return next_tokens(logits, target, ~given, training.transition_weight, weights)
 
 
 def augment(seen: Context, levels: Tensor, neutral: Tensor, training: config.PredictorTraining) -> Context:
@@ -130,7 +132,7 @@ def perturb(tokens: Tensor, levels: Tensor, share: float) -> Tensor:
 @torch.no_grad()
 def held_out_loss(model: SfmsModel, corpus: Corpus, settings: config.Training, batches: int = 20) -> float:
     """Loss (14) without augmentation on windows drawn with a fixed seed."""
-    listener, training = settings.listener, settings.predictor
+    listener = settings.listener
     model.eval()
     tokens = tokenise(model, corpus)
     starts = corpus.starts(listener.window_frames)
@@ -141,5 +143,5 @@ def held_out_loss(model: SfmsModel, corpus: Corpus, settings: config.Training, b
             chosen = starts[torch.randint(len(starts), (64,))]
             seen = context(model, corpus, tokens, chosen, listener.past_frames)
             target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
-            total += float(_loss(model, seen, target, training))
+            total += float(_loss(model, seen, target, settings))
     return total / batches

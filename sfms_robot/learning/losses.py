@@ -34,8 +34,14 @@ def masking(relaxed: Tensor, best: Tensor) -> Tensor:
     return (relaxed - best.detach()).abs().sum(1).mean()
 
 
-def next_tokens(logits: Sequence[Tensor], target: Tensor, counted: Tensor, transition_weight: float) -> Tensor:
-    """Equation (14): weighted cross-entropy, class 0 weighing `transition_weight` and a keyframe 1.
+def next_tokens(
+    logits: Sequence[Tensor],
+    target: Tensor,
+    counted: Tensor,
+    transition_weight: float,
+    group_weights: Sequence[float],
+) -> Tensor:
+    """Equation (14): weighted cross-entropy, class 0 weighing `transition_weight` and a keyframe 1; mean over groups.
 
     Args:
         logits: per group (B, H, V_g + 1).
@@ -46,5 +52,6 @@ def next_tokens(logits: Sequence[Tensor], target: Tensor, counted: Tensor, trans
     for group, values in enumerate(logits):
         truth = target[..., group][counted]
         weight = torch.where(truth == 0, transition_weight, 1.0)
-        total = total + (F.cross_entropy(values[counted], truth, reduction="none") * weight).sum() / weight.sum()
-    return total / len(logits)
+        loss = F.cross_entropy(values[counted], truth, reduction="none")
+        total = total + group_weights[group] * (loss * weight).sum() / weight.sum()
+    return total / sum(group_weights)

@@ -39,4 +39,4 @@ def test_next_token_loss_is_weighted_cross_entropy_of_the_counted_frames():
     target = torch.tensor([[[0], [1], [2]]])
     counted = torch.tensor([[True, True, False]])
     expected = (0.2 * -torch.tensor(0.5).log() - torch.tensor(0.8).log()) / 1.2
-    torch.testing.assert_close(next_tokens([logits], target, counted, 0.2), expected)
+    torch.testing.assert_close(next_tokens([logits], target, counted, 0.2, [1.0]), expected)

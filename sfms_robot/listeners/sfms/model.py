@@ -78,6 +78,7 @@ class SfmsModel(nn.Module):
 
     motion_mean: Tensor
     motion_std: Tensor
+    motion_speed: Tensor
     mel_mean: Tensor
     mel_std: Tensor
 
@@ -85,6 +86,8 @@ class SfmsModel(nn.Module):
         super().__init__()
         self.register_buffer("motion_mean", torch.zeros(MOTION_DIM))
         self.register_buffer("motion_std", torch.ones(MOTION_DIM))
+        # Fastest natural change of each channel from one frame to the next, standardised.
+        self.register_buffer("motion_speed", torch.full((MOTION_DIM,), 1e6))
         self.register_buffer("mel_mean", torch.zeros(MEL_BINS))
         self.register_buffer("mel_std", torch.ones(MEL_BINS))
         self.tokenizer = Tokenizer(settings)

@@ -67,6 +67,7 @@ class SpeakerEncoder(nn.Module):
         super().__init__()
         self.face_in = nn.Linear(channels, width)
         self.voice_in = nn.Conv1d(mel_bins, width, kernel_size=5, padding=2)
+        self.loudness_in = nn.Linear(2, width)
         self.no_face = nn.Parameter(torch.zeros(width))
         self.no_voice = nn.Parameter(torch.zeros(width))
         self.face = nn.ModuleList(GatedCross(width, heads) for _ in range(layers))
@@ -77,12 +78,27 @@ class SpeakerEncoder(nn.Module):
         x = torch.where(context.face_known[..., None], self.face_in(context.face), self.no_face)
         voice = F.gelu(self.voice_in(context.mel.transpose(1, 2)))
         y = F.max_pool1d(voice, 4).transpose(1, 2)  # four mel rows -> one frame
+        y = y + self.loudness_in(_loudness(context.mel, context.heard))
         y = torch.where(context.heard[..., None], y, self.no_voice)
         places = sinusoidal(p, x.shape[-1]).to(x)
         x, y = x + places, y + places
         for face, voice_layer in zip(self.face, self.voice, strict=True):
             x, y = face(x, y), voice_layer(y, x)
         return torch.cat([x, y], dim=1)
+
+
+def _loudness(mel: Tensor, heard: Tensor) -> Tensor:
+    """Level of each frame below the loudest and above the quietest of the window (B, P, 2).
+
+    Whatever the gain of the microphone, it tells speech from pause: an addition to the paper, whose Wav2Vec tokens
+    know that by themselves.
+    """
+    b, p = heard.shape
+    level = mel.view(b, p, -1).mean(-1)
+    loudest = level.masked_fill(~heard, -torch.inf).amax(1, keepdim=True)
+    quietest = level.masked_fill(~heard, torch.inf).amin(1, keepdim=True)
+    both = torch.stack([level - loudest, level - quietest], dim=-1)
+    return torch.where(heard[..., None], both, 0.0)
 
 
 class Predictor(nn.Module):

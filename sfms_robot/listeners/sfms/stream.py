@@ -20,6 +20,7 @@ from sfms_robot import config
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
+from sfms_robot.listeners.sfms.reach import Reach
 from sfms_robot.signals import mel
 
 NEUTRAL_STRIDE = 8  # frames between the keyframes of the neutral face a stream begins with
@@ -67,6 +68,7 @@ class SfmsListener:
     def __init__(self, settings: config.Listener, model: SfmsModel) -> None:
         self.settings = settings
         self.model = model.eval()
+        self.reach = Reach(self.model)
         self._neutral = neutral_tokens(self.model, settings.past_frames)
 
     @property
@@ -105,7 +107,7 @@ class SfmsListener:
             return None, heard
         generator = torch.Generator()
         generator.set_state(memory.random)
-        ahead = draw(self.model, self.settings, _context(heard), heard.ahead, generator)
+        ahead = draw(self.model, self.settings, self.reach, _context(heard), heard.ahead, generator)
         decoded = self.model.tokenizer.decode(torch.cat([heard.past, ahead])[None])[0, -self.horizon - 2 :]
         path = join(heard.path[:2], decoded, self.settings.sampling.seam_frames)
         now = replace(heard, ahead=ahead, path=path, random=generator.get_state())
@@ -149,21 +151,37 @@ def _context(memory: Memory) -> Context:
 
 
 def draw(
-    model: SfmsModel, settings: config.Listener, context: Context, ahead: Tensor, generator: torch.Generator
+    model: SfmsModel,
+    settings: config.Listener,
+    reach: Reach,
+    context: Context,
+    ahead: Tensor,
+    generator: torch.Generator,
 ) -> Tensor:
     """The tokens (H, G) of the plan: those of `ahead` (A, G) stay, the rest are drawn, some frames at a time."""
-    h = settings.future_frames
+    h, known = settings.future_frames, len(ahead)
     future = torch.full((h, ahead.shape[1]), UNDECIDED)
-    future[: len(ahead)] = ahead
+    future[:known] = ahead
     memory = model.predictor.remember(context)
     bias = torch.tensor([group.transition_bias for group in settings.groups.values()])
+    last, at = _last_keyframes(torch.cat([context.tokens[0], ahead]))
+    at = at - settings.past_frames  # future frame 0 is frame 0
     together = settings.sampling.frames_per_pass
-    for first in range(len(ahead), h, together):
-        last = min(first + together, h)
+    for first in range(known, h, together):
         logits = model.predictor.decode(memory, context.tokens, future[None])
-        rows = pad_sequence([values[0, first:last].T for values in logits], padding_value=-torch.inf)  # (V, G, frames)
-        future[first:last] = sample(rows.permute(2, 1, 0), bias, settings.sampling, generator)
+        for frame in range(first, min(first + together, h)):
+            rows = pad_sequence([v[0, frame] for v in logits], batch_first=True, padding_value=-torch.inf)  # (G, V)
+            rows = rows.masked_fill(~reach.allowed(last, frame - at), -torch.inf)
+            drawn = sample(rows, bias, settings.sampling, generator)
+            future[frame] = drawn
+            last, at = torch.where(drawn > 0, drawn, last), torch.where(drawn > 0, frame, at)
     return future
+
+
+def _last_keyframes(tokens: Tensor) -> tuple[Tensor, Tensor]:
+    """Tokens (T, G) -> the last token above 0 of each group, or 0, and its frame."""
+    at = torch.where(tokens > 0, torch.arange(len(tokens))[:, None], -1).amax(0)
+    return tokens.gather(0, at.clamp(min=0)[None])[0].clamp(min=0), at
 
 
 def sample(logits: Tensor, bias: Tensor, sampling: config.Sampling, generator: torch.Generator) -> Tensor:

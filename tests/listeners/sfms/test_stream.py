@@ -42,7 +42,7 @@ def offline(listener, speaker, seed):
             tokens[None, past],
         )  # fmt: skip
         ahead = tokens[p + now + 1 : p + decided]
-        tokens[p + now + 1 : p + now + 1 + h] = draw(model, settings, seen, ahead, generator)
+        tokens[p + now + 1 : p + now + 1 + h] = draw(model, settings, listener.reach, seen, ahead, generator)
         decided = now + 1 + h
         window = model.tokenizer.decode(tokens[None, past.start : past.stop + h])[0]
         joined = join(path[now + 1 : now + 3], window[-h - 2 :], settings.sampling.seam_frames)
