@@ -1,0 +1,105 @@
+"""Frechet, variance, entropy and the rest: against scipy and plain loops, and what must hold."""
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from sfms_robot import metrics
+
+RNG = np.random.default_rng(3)
+
+
+def test_frechet_equals_the_matrix_root():
+    a, b = RNG.normal(size=(3, 200, 6)), RNG.normal(0.5, 2.0, size=(3, 200, 6))
+    x, y = a.reshape(-1, 6), b.reshape(-1, 6)
+    sx, sy = np.cov(x.T), np.cov(y.T)
+    gap = x.mean(0) - y.mean(0)
+    expected = gap @ gap + np.trace(sx + sy - 2 * np.real(linalg.sqrtm(sx @ sy)))
+    assert metrics.frechet_distance(a, b) == pytest.approx(expected, rel=1e-9)
+    per_clip = [metrics.frechet_distance(p, q) for p, q in zip(a, b, strict=True)]
+    assert metrics.frechet_distance(a, b, pool=False) == pytest.approx(np.mean(per_clip))
+
+
+def test_frechet_of_a_set_with_itself_is_zero_and_of_a_shift_its_square():
+    a = RNG.normal(size=(2, 100, 4))
+    assert metrics.frechet_distance(a, a) == pytest.approx(0.0, abs=1e-9)
+    assert metrics.frechet_distance(a, a + [1.0, 0, 2.0, 0]) == pytest.approx(5.0)
+
+
+def test_too_few_frames_are_said(caplog):
+    metrics.frechet_distance(RNG.normal(size=(5, 9)), RNG.normal(size=(5, 9)))
+    assert "singular" in caplog.text
+
+
+def test_paired_frechet_sees_what_frechet_cannot():
+    speaker = RNG.normal(size=(4, 500, 2))
+    target, other = speaker.copy(), RNG.normal(size=(4, 500, 2))
+    assert metrics.frechet_distance(target, other) < 0.02
+    assert metrics.paired_frechet_distance(target, other, speaker) > 1.0
+
+
+def test_the_three_variances():
+    x = RNG.normal(size=(5, 30, 4)) * [1, 2, 3, 4] + [0, 10, 20, 30]
+    assert metrics.variance(x) == pytest.approx(np.var(x))
+    assert metrics.variance(x, "time") == pytest.approx(np.mean([np.var(c, axis=0).mean() for c in x]))
+    assert metrics.variance(x, "sum") == pytest.approx(sum(np.var(x[..., d]) for d in range(4)))
+
+
+def test_l2_definitions():
+    a, b = RNG.normal(size=(2, 40, 3)), RNG.normal(size=(2, 40, 3))
+    assert metrics.l2(a, b, start=32) == pytest.approx(
+        np.mean([np.linalg.norm(x) for x in (a - b)[:, 32:].reshape(-1, 3)])
+    )
+    assert metrics.l2(a, b, "mse") == pytest.approx(((a - b) ** 2).mean())
+
+
+def test_shannon_index_of_even_use_is_log_k_and_of_one_cluster_nothing():
+    centres = np.arange(8.0)[:, None] * 10
+    even = np.repeat(centres, 50, axis=0)[None]
+    assert metrics.shannon_index(even, even, 8, eps=0.0, centres=centres) == pytest.approx(np.log(8))
+    assert metrics.shannon_index(even, even, 8, unit="bits", eps=0.0, centres=centres) == pytest.approx(3.0)
+    still = np.zeros((1, 100, 1))
+    assert metrics.shannon_index(still, even, 8, eps=0.0, centres=centres) == 0.0
+    assert metrics.shannon_index(even, even, 8) == pytest.approx(np.log(8), abs=0.4)  # own k-means
+
+
+def test_rpcc():
+    speaker = RNG.normal(size=(3, 200, 2))
+    target, pred = 2 * speaker, RNG.normal(size=(3, 200, 2))
+    r = np.corrcoef(pred.ravel(), speaker.ravel())[0, 1]
+    assert metrics.rpcc_flat(target, pred, speaker) == pytest.approx(1 - r)
+    assert metrics.rpcc_channels(target, target, speaker) == 0.0
+    assert metrics.rpcc_channels(target, pred, speaker) == pytest.approx(1.0, abs=0.15)
+
+
+def test_sts_counts_the_borders_of_clips():
+    a = np.zeros((2, 3, 1))
+    b = a + np.array([0.0, 1.0])[:, None, None]
+    assert metrics.sts(a, b) == pytest.approx(np.sqrt(1 / 0.1))
+
+
+def test_l2l_std_is_the_std_of_stds():
+    x = RNG.normal(size=(6, 20, 2)) * np.arange(1, 7)[:, None, None]
+    mean, std = metrics.l2l_mean_std(x)
+    assert mean.shape == std.shape == (1, 1, 2)
+    assert std[0, 0, 1] == pytest.approx(np.std([np.std(clip[:, 1]) for clip in x]), rel=1e-9)
+
+
+def test_the_bilateral_filter_is_the_five_tap_kernel_on_small_values():
+    x = 0.1 * RNG.normal(size=(1, 50, 2))
+    padded = np.pad(x, ((0, 0), (2, 2), (0, 0)), mode="reflect")
+    kernel = np.array([1, 3, 5, 3, 1]) / 13
+    expected = sum(w * padded[:, i : i + 50] for i, w in enumerate(kernel))
+    np.testing.assert_allclose(metrics.l2l_bilateral(x), expected, atol=2e-3)
+    np.testing.assert_allclose(metrics.l2l_bilateral(np.full((3, 7, 1), 4.0)), 4.0)
+
+
+def test_faceverse_rotation_is_zyx_and_a_rotation():
+    angles = RNG.uniform(-3, 3, (10, 3))
+    rotation = metrics.faceverse_rotation(angles)
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (10, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1.0)
+    quarter = metrics.faceverse_rotation([0.0, 0.0, np.pi / 2])
+    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    both = metrics.faceverse_rotation([np.pi / 2, 0.0, np.pi / 2])
+    np.testing.assert_allclose(both @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # x first, then z
