@@ -1,63 +1,254 @@
-"""A servo model's control table as data: adding a servo touches no Python."""
+"""A servo model's control table as data: adding a servo touches no Python.
+
+One YAML file per model. A file is refused whole when its registers overlap, do not fit their size, or a role names a
+register that is not there, so that nothing past the loader has to ask. A model whose table changed with its firmware
+has one file per layout (`xl330-m288.yaml`, `xl330-m288_fw52.yaml`): `variant` picks by the number read from the servo.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, computed_field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, Positive, load
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 
+Family = Literal["dynamixel", "feetech", "maestro", "ssc32"]
+Unit = Literal[
+    "", "V", "address", "baud_code_dxl1", "baud_code_dxl2", "baud_code_feetech", "baud_code_xl320", "bits", "bool",
+    "code", "deg", "degC", "deg_per_s", "deg_per_s2", "id", "mA", "mV_per_ms", "ms", "percent", "rev_per_min2", "rpm",
+    "us",
+]  # fmt: skip
+Role = Literal[
+    "goal_position", "present_position", "present_speed", "present_load", "present_current", "voltage", "temperature",
+    "torque_enable", "id", "baud_rate", "return_delay", "status_level", "error_status", "lock", "moving_speed",
+    "torque_limit", "bus_watchdog", "operating_mode",
+]  # fmt: skip
+Bit = Annotated[int, Field(ge=0, le=15)]
+
+
+def _sign_rule(value: Any) -> Any:
+    """`true` and `false` are short for two's complement and no sign; YAML reads a bare `no` as false."""
+    if isinstance(value, bool):
+        return "twos_complement" if value else "no"
+    if value in ("no", "twos_complement", "offset_2048"):
+        return value
+    bit = str(value).removeprefix("sign_bit_")
+    if str(value).startswith("sign_bit_") and bit.isdecimal() and int(bit) < 32:
+        return value
+    raise ValueError("is no sign rule (no, twos_complement, sign_bit_N with N 0..31, offset_2048)")
+
+
+def value_range(size: int, signed: str) -> tuple[int, int]:
+    """Smallest and largest value that a register of `size` bytes holds under a sign rule."""
+    bits = 8 * size
+    if signed == "twos_complement":
+        return -(1 << bits - 1), (1 << bits - 1) - 1
+    if signed == "offset_2048":
+        return -2048, 2047
+    if signed.startswith("sign_bit_"):
+        magnitude = (1 << int(signed.removeprefix("sign_bit_"))) - 1
+        return -magnitude, magnitude
+    return 0, (1 << bits) - 1
+
 
 class Register(Model):
-    """One row of a control table. `scale` turns the raw value into `unit`."""
+    """One row of a control table. `scale` turns the value into `unit`.
+
+    `signed` says how negative values are written: `twos_complement`; `sign_bit_N`, where bit N set is minus and the
+    bits below are the magnitude; `offset_2048`, where 2048 stands for zero. `min`, `max` and `initial` come after it.
+    """
 
     address: Annotated[int, Field(ge=0, le=65535)]
     size: Literal[1, 2, 4]
     access: Literal["R", "RW"]
     area: Literal["EEPROM", "RAM"]
-    unit: str = ""
+    unit: Unit = ""
     scale: Finite = 1.0
     min: int | None = None
     max: int | None = None
-    signed: bool = False
+    signed: Annotated[str, BeforeValidator(_sign_rule)] = "no"
     initial: int | None = None
+
+    @computed_field  # type: ignore[prop-decorator]  # mypy has no rule for decorated properties
+    @property
+    def low(self) -> int:
+        """Smallest value it takes: `min`, else what its size and sign rule hold."""
+        return value_range(self.size, self.signed)[0] if self.min is None else self.min
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def high(self) -> int:
+        """Largest value it takes: `max`, else what its size and sign rule hold."""
+        return value_range(self.size, self.signed)[1] if self.max is None else self.max
+
+    @property
+    def end(self) -> int:
+        """The address after its last byte."""
+        return self.address + self.size
+
+    def problems(self) -> Iterator[str]:
+        """What is impossible about this row, each as `key = value says why`."""
+        if self.signed.startswith("sign_bit_") and int(self.signed.removeprefix("sign_bit_")) >= 8 * self.size:
+            yield f"signed = {self.signed!r} does not fit {self.size} byte(s)"
+            return
+        if self.signed == "offset_2048" and self.size != 2:
+            yield f"signed = {self.signed!r} needs a size of 2"
+            return
+        low, high = value_range(self.size, self.signed)
+        for key, value in (("min", self.min), ("max", self.max), ("initial", self.initial)):
+            if value is not None and not low <= value <= high:
+                yield f"{key} = {value} does not fit {self.size} byte(s) ({low}..{high})"
+        if self.min is not None and self.max is not None and self.min > self.max:
+            yield f"min = {self.min} is above max = {self.max}"
+        elif self.initial is not None:
+            if (self.min is not None and self.initial < self.min) or (self.max is not None and self.initial > self.max):
+                yield f"initial = {self.initial} is outside min..max ({self.min}..{self.max})"
+
+
+class FirmwareRange(Model):
+    """The firmware versions that a map holds for; an end left out is open."""
+
+    min: Annotated[int, Field(ge=0, le=255)] = 0
+    max: Annotated[int, Field(ge=0, le=255)] = 255
+
+    @model_validator(mode="after")
+    def _ordered(self) -> FirmwareRange:
+        if self.min > self.max:
+            raise ValueError(f"min = {self.min} is above max = {self.max}")
+        return self
+
+    def overlaps(self, other: FirmwareRange) -> bool:
+        return self.min <= other.max and other.min <= self.max
+
+
+class PulseRange(Model):
+    """Pulse widths that a hobby-servo board produces, microseconds."""
+
+    min: Positive
+    max: Positive
 
 
 class FirmwareMap(Model):
-    """A servo model's control table: `firmware_maps/FAMILY/MODEL.yaml`."""
+    """A servo model's control table, or a servo board's channels: `firmware_maps/FAMILY/MODEL.yaml`.
+
+    A smart servo has `protocol` and `registers`; a board (maestro, ssc32) has `channels`, `pulse_us` and `tick_us`
+    instead, and one tick of position is `tick_us` of pulse.
+    """
 
     model: str
     vendor: str
-    model_number: int
-    family: Literal["dynamixel"]
-    protocol: Literal[2]
-    source: str
+    model_number: Annotated[int, Field(ge=0, le=65535)] | None = None  # None: not known, so it cannot be checked
+    family: Family
+    protocol: Literal[1, 2] | None = None
+    byte_order: Literal["little", "big"] = "little"
+    firmware: FirmwareRange = FirmwareRange()
+    variant_of: str | None = None  # the model this is another firmware's layout of
+    same_number_as: str | None = None  # a model that the number alone cannot tell from this one
+    source: Annotated[str, Field(min_length=1)]
     ticks_per_revolution: Positive
     center_ticks: int
-    no_load_speed_deg_s: Positive
-    baud_codes: dict[int, int]  # code in register baud_rate -> bits per second
-    faults: dict[int, str] = Field(default_factory=dict)  # bit of hardware_error_status -> what it means
-    registers: Annotated[dict[Name, Register], Field(min_length=1)]
+    no_load_speed_deg_s: Positive | None = None  # None: not known
+    watchdog: Literal["stops", "flags_only", "none"] = "none"  # what the servo does when its host falls silent
+    position_mode: int | None = None  # value of role operating_mode for position control
+    baud_codes: dict[int, Annotated[int, Field(gt=0)]] = Field(default_factory=dict)  # code in role baud_rate -> bit/s
+    faults: dict[Bit, str] = Field(default_factory=dict)  # bit of role error_status, or of a board's error word
+    status_faults: dict[Bit, str] = Field(default_factory=dict)  # bit of the error byte of every status packet
+    channels: Annotated[int, Field(gt=0, le=255)] | None = None
+    pulse_us: PulseRange | None = None
+    tick_us: Positive | None = None
+    roles: dict[Role, Name | None] = Field(default_factory=dict)  # where the register's name is not the role's own
+    registers: dict[Name, Register] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _no_overlap(self) -> FirmwareMap:
-        end, last = -1, ""
+    def _possible(self) -> FirmwareMap:
+        problems = [*self._shape(), *self._layout(), *self._references()]
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+    def _shape(self) -> Iterator[str]:
+        """A servo is not a board."""
+        allowed = {"dynamixel": (1, 2), "feetech": (1,)}.get(self.family, (None,))
+        if self.protocol not in allowed:
+            yield f"protocol = {self.protocol} is not one of family {self.family} ({', '.join(map(str, allowed))})"
+        board = {"channels": self.channels, "pulse_us": self.pulse_us, "tick_us": self.tick_us}
+        if self.family in ("maestro", "ssc32"):
+            yield from (f"{key} is missing: a {self.family} board has it" for key, value in board.items() if not value)
+            if self.pulse_us and self.pulse_us.min >= self.pulse_us.max:
+                yield f"pulse_us.min = {self.pulse_us.min} is not below pulse_us.max = {self.pulse_us.max}"
+            if self.registers:
+                yield f"registers: a {self.family} board has none"
+        else:
+            yield from (f"{key} belongs to a board, not to family {self.family}" for key, v in board.items() if v)
+            if not self.registers:
+                yield "registers is empty"
+
+    def _layout(self) -> Iterator[str]:
+        """Registers lie beside one another, inside the address space, and hold the values they promise."""
+        end, last = 0, ""
+        wide = any(register.size == 4 for register in self.registers.values())
+        space = 65536 if self.protocol == 2 else 256  # one address byte in the frame of protocol 1 and Feetech
         for name, register in sorted(self.registers.items(), key=lambda item: item[1].address):
             if register.address < end:
-                raise ValueError(f"registers.{name}.address = {register.address} overlaps {last} (ends at {end})")
-            end, last = register.address + register.size, name
-        return self
+                yield f"registers.{name}.address = {register.address} overlaps {last} (ends at {end})"
+            if register.end > space:
+                yield f"registers.{name}.address = {register.address} ends past the address space ({space} bytes)"
+            if wide and register.size > 1 and register.address % 2:
+                # Tables with 4-byte registers are read as words inside the servo: an odd address is a slip.
+                yield f"registers.{name}.address = {register.address} is odd, which {register.size} bytes cannot be"
+            yield from (f"registers.{name}.{problem}" for problem in register.problems())
+            end, last = max(end, register.end), name
+
+    def _references(self) -> Iterator[str]:
+        for role, name in self.roles.items():
+            if name is not None and name not in self.registers:
+                yield f"roles.{role} = {name!r} is not a register of this map"
+        rates: dict[int, int] = {}
+        for code, rate in self.baud_codes.items():
+            if rate in rates:
+                yield f"baud_codes.{code} = {rate} is also code {rates[rate]}"
+            rates.setdefault(rate, code)
+
+
+def map_files() -> list[Path]:
+    """Every shipped firmware map, sorted."""
+    return sorted(data_dir("firmware_maps").glob("*/*.yaml"))
 
 
 @lru_cache
 def load_firmware_map(model: str) -> FirmwareMap:
-    """A servo's control table by model name. Raises ConfigError listing the shipped models."""
-    root = data_dir("firmware_maps")
-    for file in sorted(root.glob(f"*/{model}.yaml")):
-        return load(FirmwareMap, file)
-    shipped = sorted(file.stem for file in root.glob("*/*.yaml"))
+    """A servo's control table by model name, or by the path of a `.yaml` file of one's own.
+
+    Raises ConfigError listing the shipped models.
+    """
+    if model.endswith(".yaml"):
+        return load(FirmwareMap, Path(model))
+    for file in sorted(data_dir("firmware_maps").glob("*")):
+        if (file / f"{model}.yaml").is_file():
+            return load(FirmwareMap, file / f"{model}.yaml")
+    shipped = [file.stem for file in map_files()]
     raise ConfigError.at("firmware_maps", "model", model, "has no firmware map", shipped)
+
+
+def variant(model: str | FirmwareMap, firmware: int) -> FirmwareMap:
+    """The layout of `model` that holds for the firmware number read from the servo.
+
+    Raises ConfigError when no layout does, naming those at hand.
+    """
+    named = load_firmware_map(model) if isinstance(model, str) else model
+    if named.firmware.min <= firmware <= named.firmware.max:
+        return named
+    root = named.variant_of or named.model
+    shipped = [load_firmware_map(file.stem) for file in map_files() if file.stem.startswith(root)]
+    layouts = [each for each in shipped if root in (each.model, each.variant_of)] or [named]
+    for layout in layouts:
+        if layout.firmware.min <= firmware <= layout.firmware.max:
+            return layout
+    known = [f"{each.model} {each.firmware.min}..{each.firmware.max}" for each in layouts]
+    raise ConfigError.at("firmware_maps", "firmware", firmware, f"of {named.model} has no firmware map", known)

@@ -1,42 +1,56 @@
 """Requests to Dynamixel Protocol 2.0 servos and their answers, over a `Port`.
 
-The vendor SDK builds the instruction packets, and this is the only file that knows it. Answers are not read by the
-SDK, which waits at least 34 ms, spins meanwhile and stops at the first failure, but from the byte stream by our own
-codec: by id and length, so that a late or foreign reply can never be taken for another one.
+The vendor SDK builds what is sent on every tick, and this is the only file that knows it. A request that is sent
+again is not built again: reads go out as they were, and of a sync write only the data and the crc are new. Single
+writes are built by our own codec, because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
+
+Answers are not read by the SDK, which waits at least 34 ms, spins meanwhile and stops at the first failure, but from
+the byte stream: by id and length, so that a late or foreign reply can never be taken for another one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Final
 
-from dynamixel_sdk import COMM_SUCCESS, GroupSyncWrite, Protocol2PacketHandler
+import numpy as np
+from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
+from numpy.typing import NDArray
 
 from sfms_robot.errors import PacketError
-from sfms_robot.servo.codecs.dxl2 import PING, REBOOT, STATUS, STATUS_OVERHEAD, Packet, maybe_packet
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, Packet, maybe_packet
+from sfms_robot.servo.link import Answer, Found
 from sfms_robot.servo.port import Port
 
-_CHUNK = 4096
-_NO_PATIENCE = 10  # read deadlines that rubbish on the wire may cost before a request is given up
+log = logging.getLogger(__name__)
+
+_CHUNK: Final = 4096
+_ADAPTER_S: Final = 0.05  # the longest that an adapter may hold an answer back
+_SAMPLES: Final = 3
+_MARGIN: Final = 1.25
+_NO_PATIENCE: Final = 10  # read deadlines that rubbish on the wire may cost before a request is given up
+_REQUESTS_KEPT: Final = 512
+_WRITES_KEPT: Final = 16  # each has a table of 0.5 KiB per byte of data
+_PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
+_HEADER: Final = b"\xff\xff\xfd"
+_SYNC_DATA: Final = 12  # where the first id of a sync write stands
 
 
-class _SdkPort:
-    """Our port as the SDK's packet builders see one: they clear, then write."""
+class _Draft:
+    """Our port as the SDK's packet builders see one: what they send is kept instead."""
 
-    def __init__(self, port: Port) -> None:
+    def __init__(self) -> None:
         self.is_using = False
-        self.sent = 0
-        self._port = port
+        self.packet = b""
 
     def clearPort(self) -> None:
-        self._port.discard_input()
+        """Sending does that."""
 
     def writePort(self, packet: Sequence[int]) -> int:
-        data = bytes(packet)
-        if data.find(b"\xff\xff\xfd", 7, len(data) - 2) >= 0:  # SDK 4.1.0 stuffs a copy and sends the original
-            raise PacketError(f"{self._port.name}: the SDK cannot send data that look like a header: {data.hex(' ')}")
-        self._port.write(data)
-        self.sent = len(packet)
+        self.packet = bytes(packet)
         return len(packet)
 
     def setPacketTimeout(self, packet_length: int) -> None:
@@ -44,7 +58,7 @@ class _SdkPort:
 
 
 class Dxl2Link:
-    """One wire of Protocol 2.0 servos.
+    """One wire of Protocol 2.0 servos; a `RegisterLink`.
 
     Args:
         port: owned by the link from now on.
@@ -56,9 +70,10 @@ class Dxl2Link:
         self.port = port
         self.silence_s = silence_s
         self._byte_s = 10.0 / baud
-        self._sdk_port = _SdkPort(port)
         self._sdk = Protocol2PacketHandler()
-        self._writers: dict[tuple[int, int, tuple[int, ...]], GroupSyncWrite] = {}
+        self._requests: dict[tuple[object, ...], bytes] = {}
+        self._writes: dict[tuple[int, int, tuple[int, ...]], _SyncWrite] = {}
+        self._sent = 0
 
     @contextmanager
     def patient(self, silence_s: float) -> Iterator[None]:
@@ -69,52 +84,160 @@ class Dxl2Link:
         finally:
             self.silence_s = usual
 
-    def ping(self, servo: int) -> Packet | None:
-        """Its answer holds model number (2) and firmware version (1)."""
-        self._bare(servo, PING)
-        return self._answers([servo], 3).get(servo)
+    def rest(self, duration_s: float) -> None:
+        """Leave the wire alone for so long; in virtual time that is no time. What comes meanwhile is dropped."""
+        end_s = self.port.now_s() + duration_s
+        while self.port.read(_CHUNK, end_s):
+            pass
 
-    def reboot(self, servo: int) -> Packet | None:
-        self._bare(servo, REBOOT)
-        return self._answers([servo], 0).get(servo)
+    def adapt(self, servo: int, address: int, length: int) -> float:
+        """Wait longer from now on where the adapter holds answers back: it would make every servo silent.
 
-    def read(self, servo: int, address: int, length: int) -> Packet | None:
-        self._sent(self._sdk.readTx(self._sdk_port, servo, address, length))
-        return self._answers([servo], length).get(servo)
+        Seconds of silence that are waited for now.
+        """
+        took_s = 0.0
+        with self.patient(_ADAPTER_S):
+            for _ in range(_SAMPLES):
+                asked_s = self.port.now_s()
+                if self.read(servo, address, length) is not None:
+                    took_s = max(took_s, self.port.now_s() - asked_s)
+        if took_s > self.silence_s:
+            self.silence_s = _MARGIN * took_s
+            log.warning(
+                "%s: an answer takes %.1f ms, so a silent servo costs %.1f ms; `sfms-robot doctor` says what to do",
+                self.port.name, took_s * 1e3, self.silence_s * 1e3,
+            )  # fmt: skip
+        return self.silence_s
 
-    def write(self, servo: int, address: int, data: bytes) -> Packet | None:
+    # --- one servo ----------------------------------------------------------------------------------------------
+
+    def ping(self, servo: int) -> Found | None:
+        self._send(dxl2.encode_instruction(servo, dxl2.PING))
+        packet = self._answers([servo], 3).get(servo)
+        return _found(packet) if packet is not None and len(packet.params) == 3 else None
+
+    def broadcast_ping(self) -> dict[int, Found]:
+        """Everybody who answers at this baud, by id; takes 253 answering times, and no more than it needs to."""
+        self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING))
+        everybody = range(dxl2.MAX_ID + 1)
+        with self.patient(len(everybody) * _PING_S):
+            packets = self._answers(everybody, 3)
+        return {servo: _found(packet) for servo, packet in packets.items() if len(packet.params) == 3}
+
+    def reboot(self, servo: int) -> Answer | None:
+        self._send(dxl2.encode_instruction(servo, dxl2.REBOOT))
+        return self._answer(servo, 0)
+
+    def factory_reset(self, servo: int, option: int) -> Answer | None:
+        """0xFF everything, 1 all but the id, 2 all but id and baud."""
+        self._send(dxl2.encode_instruction(servo, dxl2.FACTORY_RESET, bytes([option])))
+        return self._answer(servo, 0)
+
+    def clear_turns(self, servo: int) -> Answer | None:
+        """Forget whole turns: present position back into one revolution. Only at rest."""
+        self._send(dxl2.encode_instruction(servo, dxl2.CLEAR, b"\x01\x44\x58\x4c\x22"))
+        return self._answer(servo, 0)
+
+    def read(self, servo: int, address: int, length: int) -> Answer | None:
+        self._send(
+            self._request(
+                ("read", servo, address, length), lambda draft: self._sdk.readTx(draft, servo, address, length)
+            )
+        )
+        return self._answer(servo, length)
+
+    def write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """The servo's acknowledgement, or None when it did not answer."""
-        self._sent(self._sdk.writeTxOnly(self._sdk_port, servo, address, len(data), list(data)))
-        return self._answers([servo], 0).get(servo)
+        self._send(dxl2.encode_instruction(servo, dxl2.WRITE, address.to_bytes(2, "little") + data))
+        return self._answer(servo, 0)
+
+    def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
+        """As `write`, but kept by the servo until `action`."""
+        self._send(dxl2.encode_instruction(servo, dxl2.REG_WRITE, address.to_bytes(2, "little") + data))
+        return self._answer(servo, 0)
+
+    def action(self) -> None:
+        """All registered writes take effect at once. Nothing answers."""
+        self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.ACTION))
+
+    # --- many servos --------------------------------------------------------------------------------------------
 
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
         """One packet for all servos; all values have one length. Nothing answers."""
         length = len(next(iter(values.values())))
-        key = (address, length, tuple(values))
-        group = self._writers.get(key)
-        if group is None:
-            group = self._writers[key] = GroupSyncWrite(self._sdk_port, self._sdk, address, length)
-            for servo, data in values.items():
-                group.addParam(servo, data)
-        else:
-            for servo, data in values.items():
-                group.changeParam(servo, data)
-        self._sent(group.txPacket())
+        self.sync_write_block(address, tuple(values), length, b"".join(values.values()))
+
+    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
+        """As `sync_write`, the values one behind the other."""
+        key = (address, length, servos)
+        write = self._writes.get(key)
+        if write is None:
+            if len(self._writes) >= _WRITES_KEPT:
+                self._writes.clear()
+            blank = [byte for servo in servos for byte in (servo, *[0] * length)]
+            build = self._build(lambda draft: self._sdk.syncWriteTxOnly(draft, address, length, blank, len(blank)))
+            write = self._writes[key] = _SyncWrite(build, length)
+        self._send(write.packet(data))
 
     def sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Packet]:
         """Answers by id, of those that answered."""
-        self._sent(self._sdk.syncReadTx(self._sdk_port, address, length, servos, len(servos), False))
+        self._send(self._read_request(address, length, servos, fast=False))
         return self._answers(servos, length)
 
-    def _bare(self, servo: int, instruction: int) -> None:
-        packet = [0] * 10
-        packet[4], packet[5], packet[7] = servo, 3, instruction
-        self._sent(self._sdk.txPacket(self._sdk_port, packet))
+    def fast_sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Packet]:
+        """As `sync_read`, but all answer in one packet, which stops where somebody is silent."""
+        self._send(self._read_request(address, length, servos, fast=True))
+        size = 8 + len(servos) * (length + 4)
+        buffer, start = bytearray(), -1
+        deadline_s = self.port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
+        last_s = deadline_s + size * self._byte_s + _NO_PATIENCE * self.silence_s
+        while len(buffer) < max(start, 0) + size and self.port.now_s() < last_s:
+            data = self.port.read(_CHUNK, deadline_s)
+            if not data:
+                break
+            buffer += data
+            if start < 0:
+                start = buffer.find(_HEADER + b"\x00\xfe")
+            if len(buffer) > dxl2.MAX_PACKET + _CHUNK:
+                break
+            deadline_s = self.port.now_s() + self.silence_s
+        answers: dict[int, Packet] = {}
+        for servo, error, data in dxl2.split_fast_status(buffer[max(start, 0) :], length):
+            if servo in servos:
+                answers[servo] = Packet(servo, STATUS, data, error)
+        return answers
 
-    def _sent(self, result: int) -> None:
-        self._sdk_port.is_using = False
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    def _read_request(self, address: int, length: int, servos: Sequence[int], fast: bool) -> bytes:
+        return self._request(
+            (address, length, fast, *servos),
+            lambda draft: self._sdk.syncReadTx(draft, address, length, servos, len(servos), fast),
+        )
+
+    def _request(self, key: tuple[object, ...], build: Callable[[_Draft], int]) -> bytes:
+        packet = self._requests.get(key)
+        if packet is None:
+            if len(self._requests) >= _REQUESTS_KEPT:
+                self._requests.clear()
+            packet = self._requests[key] = self._build(build)
+        return packet
+
+    def _build(self, build: Callable[[_Draft], int]) -> bytes:
+        draft = _Draft()
+        result = build(draft)
         if result != COMM_SUCCESS:
-            raise PacketError(f"{self.port.name}: the request was not sent: {self._sdk.getTxRxResult(result)}")
+            raise PacketError(f"{self.port.name}: the request cannot be built: {self._sdk.getTxRxResult(result)}")
+        return draft.packet
+
+    def _send(self, packet: bytes) -> None:
+        self.port.discard_input()
+        self.port.write(packet)
+        self._sent = len(packet)
+
+    def _answer(self, servo: int, length: int) -> Answer | None:
+        packet = self._answers([servo], length).get(servo)
+        return None if packet is None else Answer(packet.error, packet.params)
 
     def _answers(self, servos: Sequence[int], length: int) -> dict[int, Packet]:
         """Status packets of `servos` with `length` bytes of data, or with an error and none.
@@ -124,7 +247,7 @@ class Dxl2Link:
         port, buffer, answers = self.port, bytearray(), dict[int, Packet]()
         pending = set(servos)
         size = STATUS_OVERHEAD + length
-        deadline_s = port.now_s() + self._sdk_port.sent * self._byte_s + self.silence_s
+        deadline_s = port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
         last_s = deadline_s + 2 * len(servos) * size * self._byte_s + _NO_PATIENCE * self.silence_s
         while pending and port.now_s() < last_s:
             data = port.read(_CHUNK, deadline_s)
@@ -139,3 +262,51 @@ class Dxl2Link:
                     pending.remove(servo)
             deadline_s = port.now_s() + self.silence_s
         return answers
+
+
+class _SyncWrite:
+    """A sync write as the SDK built it, with data and crc to be filled in.
+
+    A crc is linear: that of the packet is that of the packet with zeros, xored with what each byte adds on its own.
+    So one table per place and byte, looked up all at once, replaces the walk along the packet.
+    """
+
+    def __init__(self, blank: bytes, length: int) -> None:
+        count = (len(blank) - _SYNC_DATA - 2) // (length + 1)
+        starts = _SYNC_DATA + 1 + (length + 1) * np.arange(count)
+        self._at = (starts[:, None] + np.arange(length)).ravel()
+        self._length = length
+        self._packet = np.frombuffer(blank, np.uint8).copy()
+        self._blank_crc = dxl2.crc16(blank[:-2])
+        self._adds = _additions(len(blank) - 2, self._at)
+        self._rows = np.arange(len(self._at))
+
+    def packet(self, data: bytes) -> bytes:
+        """With the values `data`, one behind the other."""
+        values = np.frombuffer(data, np.uint8)
+        if len(values) != len(self._at):
+            raise ValueError(f"{len(data)} bytes of data for {len(self._at)}")
+        packet = self._packet
+        packet[self._at] = values
+        crc = self._blank_crc ^ int(np.bitwise_xor.reduce(self._adds[self._rows, values]))
+        packet[-2], packet[-1] = crc & 0xFF, crc >> 8
+        out = packet.tobytes()
+        if out.find(_HEADER, 7, len(out) - 2) < 0:
+            return out
+        # Data that look like a header have to be stuffed: the SDK's own stuffing (4.1.0) works on a copy it drops.
+        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, out[8:-2])
+
+
+def _additions(size: int, places: NDArray[np.intp]) -> NDArray[np.uint16]:
+    """(places, 256): what each byte at each place adds to the crc of a packet of `size` bytes before the crc."""
+    table = np.array([dxl2.crc16(bytes([byte])) for byte in range(256)], np.uint16)
+    adds = np.zeros((size, 256), np.uint16)
+    adds[size - 1] = table
+    for at in range(size - 2, -1, -1):  # one more zero byte behind it
+        crc = adds[at + 1]
+        adds[at] = (crc << 8) ^ table[crc >> 8]
+    return adds[places]
+
+
+def _found(packet: Packet) -> Found:
+    return Found(int.from_bytes(packet.params[:2], "little"), packet.params[2])

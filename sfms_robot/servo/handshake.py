@@ -1,59 +1,77 @@
 """First contact with the servos of a bus: who is there, is it what the head says, and torque on without a jump.
 
-Every servo must answer here; later, on the running bus, one may fall silent. Whatever is written is read back.
+Each job is a generator of *steps*: between two exchanges on the wire it yields how long it would like to wait. At
+start-up a job is run through at once; when a servo comes back while the bus is running, a tick takes a few steps and
+goes on with its own work. Whatever is written is read back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Generator, Mapping, Sequence
+from typing import Final, TypeVar
 
-from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.codecs.dxl2 import ALERT, Packet, error_text
+from sfms_robot.config import variant
+from sfms_robot.errors import BusError, ConfigError, ServoError
+from sfms_robot.servo.codecs.dxl2 import ALERT, error_text
 from sfms_robot.servo.dxl2_link import Dxl2Link
+from sfms_robot.servo.link import Answer, Found
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
+
+T = TypeVar("T")
+Steps = Generator[float, None, T]  # yields seconds to wait before it is asked to go on
 
 _TRIES: Final = 3
 _PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms
 _POSITION_MODE: Final = 3
+_CURRENT_POSITION_MODE: Final = 5
 _TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
+_REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
+_LONGEST_READ: Final = 128
 
 
-class Named(Protocol):
-    """The part of a bus servo that matters here."""
-
-    @property
-    def joint(self) -> str: ...
-
-    @property
-    def id(self) -> int: ...
+class Silent(ServoError):
+    """A servo did not answer, as opposed to one that refuses."""
 
 
 class Handshake:
-    """Checked, repeated requests to one servo after the other. `index` counts servos in bus order."""
+    """Checked, repeated requests to the servos of a bus. `index` counts servos in bus order.
 
-    def __init__(self, bus: str, link: Dxl2Link, servos: Sequence[Named], tables: Sequence[Table], baud: int) -> None:
+    Attributes:
+        tables: of each servo, in the layout of the firmware that it turned out to have.
+    """
+
+    def __init__(
+        self, bus: str, link: Dxl2Link, servos: Sequence[BusServo], tables: list[Table], baud: int, tries: int = _TRIES
+    ) -> None:
         self._bus = bus
         self._link = link
         self._servos = servos
-        self._tables = tables
+        self.tables = tables
         self._baud = baud
+        self._tries = tries
 
-    def run(self) -> list[str | None]:
-        """Identify and prepare every servo; the latched hardware errors, named, in bus order.
+    # --- start-up -----------------------------------------------------------------------------------------------
+
+    def run(self) -> list[int]:
+        """Identify and prepare every servo; the latched hardware errors, as bits, in bus order.
 
         Raises BusError listing the ids that do not answer, ServoError for one that is not what it should be.
         """
         with self._link.patient(_PATIENCE_S):
             self._identify()
-            level = self._tables[0]["status_return_level"]
-            everyone = dict.fromkeys([servo.id for servo in self._servos], level.to_bytes(2))
-            self._link.sync_write(level.address, everyone)  # unheard: at level 0 a servo acknowledges nothing
-            return [self._prepare(index) for index in range(len(self._servos))]
+            for index in range(len(self._servos)):
+                self._speak_up(index)
+            return [finish(self.prepare(index)) for index in range(len(self._servos))]
+
+    def switch_on(self, index: int) -> int:
+        """Torque on without a jump; the position held, in ticks."""
+        with self._link.patient(_PATIENCE_S):
+            return finish(self.torque_on(index))
 
     def _identify(self) -> None:
-        found: dict[int, Packet] = {}
-        for _ in range(_TRIES):
+        found: dict[int, Found] = {}
+        for _ in range(self._tries):
             for servo in self._servos:
                 if servo.id not in found and (answer := self._link.ping(servo.id)) is not None:
                     found[servo.id] = answer
@@ -64,68 +82,162 @@ class Handshake:
                 f"bus {self._bus!r} on {self._link.port.name} at {self._baud} baud: "
                 f"no answer from id {', '.join(absent)}; ids that answer: {there}"
             )
-        for servo, table in zip(self._servos, self._tables, strict=True):
-            model = int.from_bytes(found[servo.id].params[:2], "little")
-            if model != table.model_number:
-                raise ServoError(
-                    f"{servo.joint} (id {servo.id}) is model number {model}, "
-                    f"the head says {table.model} ({table.model_number})"
-                )
+        for index, servo in enumerate(self._servos):
+            self._recognise(index, found[servo.id])
 
-    def _prepare(self, index: int) -> str | None:
-        torque = self.get(index, "torque_enable")
-        mode = self.get(index, "operating_mode")
-        drive = self.get(index, "drive_mode")
-        wanted = {"operating_mode": (mode, _POSITION_MODE), "drive_mode": (drive, drive & ~_TORQUE_ON_BY_GOAL)}
-        for name, (value, target) in wanted.items():
-            if value != target and torque:
-                raise self._error(index, f"has torque on and {name} {value}, must be {target}: release it first")
-            if value != target:
-                self.put(index, name, target)
-        if not torque and self.get(index, "return_delay_time"):
-            self.put(index, "return_delay_time", 0)
-        for name in ("bus_watchdog", "profile_acceleration", "profile_velocity"):
-            if self.get(index, name):
-                self.put(index, name, 0)
-        return self._tables[index].fault_names(self.get(index, "hardware_error_status")) or None
+    def _recognise(self, index: int, found: Found) -> None:
+        """Refuse another model; take the table of the firmware that answers."""
+        table = self.tables[index]
+        if found.model_number != table.model_number:
+            raise self._error(
+                index, f"is model number {found.model_number}, the head says {table.model} ({table.model_number})"
+            )
+        low, high = table.firmware
+        if found.firmware is not None and not low <= found.firmware <= high:
+            try:
+                self.tables[index] = Table.of(variant(self._servos[index].map.model, found.firmware))
+            except ConfigError as error:
+                raise self._error(index, f"has firmware {found.firmware}: {error}") from error
 
-    def torque_on_without_a_jump(self, index: int) -> int:
-        """Goal := present, read back, torque on; the position held, in ticks."""
-        with self._link.patient(_PATIENCE_S):
-            present = self.get(index, "present_position")
-            self.put(index, "goal_position", present)
-            self.put(index, "torque_enable", 1)
+    def _speak_up(self, index: int) -> None:
+        """Unheard: at status level 0 a servo acknowledges nothing."""
+        level = self.tables[index].role("status_level")
+        if level is not None:
+            self._link.sync_write(level.address, {self._servos[index].id: level.to_bytes(2)})
+
+    # --- jobs ---------------------------------------------------------------------------------------------------
+
+    def prepare(self, index: int) -> Steps[int]:
+        """Mode, gains, profile and limits, before torque; the latched hardware errors."""
+        now = yield from self._snapshot(index)
+        wanted = self._wanted(index, now)
+        torque = now[self._name(index, "torque_enable")]
+        for name, target in wanted.items():
+            if now[name] == target:
+                continue
+            if self.tables[index][name].eeprom and torque:
+                if name == self._name(index, "return_delay"):
+                    continue  # slower, not wrong
+                raise self._error(index, f"has torque on and {name} {now[name]}, must be {target}: release it first")
+            yield from self._put(index, name, target)
+            if name == self._name(index, "operating_mode"):
+                now = yield from self._snapshot(index)  # another mode resets gains, profile and goals
+        error = self.tables[index].role("error_status")
+        return now[error.name] if error is not None else 0
+
+    def torque_on(self, index: int) -> Steps[int]:
+        """Goal := present, read back, torque on, read back; the position held, in ticks."""
+        present = self.get(index, self._name(index, "present_position"))
+        yield 0.0
+        yield from self._put(index, self._name(index, "goal_position"), present)
+        yield from self._put(index, self._name(index, "torque_enable"), 1)
         return present
 
-    def get(self, index: int, name: str) -> int:
-        """A register's raw value. Raises ServoError when the servo refuses or stays silent."""
-        field, servo = self._tables[index][name], self._servos[index].id
-        answer = self._repeat(index, f"reading {name}", lambda: self._link.read(servo, field.address, field.size))
-        return field.from_bytes(answer.params)
+    def bring_back(self, index: int, reboot: bool) -> Steps[int]:
+        """A servo that was away, from the beginning: is it still the same, settings, torque on; the position held."""
+        servo = self._servos[index].id
+        if reboot:
+            self._repeat(index, "reboot", lambda: self._link.reboot(servo))
+            yield _REBOOT_S
+        found = self._link.ping(servo)
+        if found is None:
+            raise self._silent(index, "a ping")
+        self._recognise(index, found)
+        self._speak_up(index)
+        yield 0.0
+        yield from self.prepare(index)
+        return (yield from self.torque_on(index))
 
-    def put(self, index: int, name: str, value: int) -> None:
+    def _wanted(self, index: int, now: Mapping[str, int]) -> dict[str, int]:
+        """Register values before torque; the mode comes before what it resets."""
+        table, safety = self.tables[index], self._servos[index].safety
+        current = table.fields.get("goal_current") if safety.current_limit_mA is not None else None
+        mode = table.position_mode or _POSITION_MODE
+        wanted = {
+            self._name(index, "operating_mode"): _CURRENT_POSITION_MODE if current is not None else mode,
+            "drive_mode": now.get("drive_mode", 0) & ~_TORQUE_ON_BY_GOAL,
+            self._name(index, "return_delay"): 0,
+            **dict.fromkeys(("bus_watchdog", "profile_acceleration", "profile_velocity"), 0),
+        }
+        if "pwm_limit" in now:  # an earlier run may have left it with less
+            wanted["goal_pwm"] = now["pwm_limit"]
+        if current is not None and safety.current_limit_mA is not None:
+            wanted[current.name] = min(current.high, round(safety.current_limit_mA / current.scale))
+        wanted |= safety.registers
+        return {name: target for name, target in wanted.items() if name in table.fields}
+
+    def _snapshot(self, index: int) -> Steps[dict[str, int]]:
+        """Values of all registers up to those that tell the present, in as few reads as they take."""
+        table = self.tables[index]
+        told = [table.role(role) for role in ("torque_enable", "present_position", "error_status")]
+        last = max(field.address for field in told if field is not None)
+        fields = [field for field in table.fields.values() if field.address <= last]
+        end = max(field.address + field.size for field in fields)
+        memory = bytearray()
+        for start in range(0, end, _LONGEST_READ):
+            length = min(_LONGEST_READ, end - start)
+            answer = self._ask(index, "reading its registers", start, length)
+            memory += answer.data
+            yield 0.0
+        return {field.name: field.from_bytes(memory[field.address :]) for field in fields}
+
+    # --- exchanges ----------------------------------------------------------------------------------------------
+
+    def get(self, index: int, name: str) -> int:
+        """A register's value. Raises ServoError when the servo refuses, `Silent` when it does not answer."""
+        field = self.tables[index][name]
+        return field.from_bytes(self._ask(index, f"reading {name}", field.address, field.size).data)
+
+    def _put(self, index: int, name: str, value: int) -> Steps[None]:
         """Write a register and read it back."""
-        field, servo = self._tables[index][name], self._servos[index].id
+        field, servo = self.tables[index][name], self._servos[index].id
         try:
             data = field.to_bytes(value)
         except OverflowError:
             raise self._error(index, f"{name} = {value} does not fit the register") from None
         self._repeat(index, f"{name} := {value}", lambda: self._link.write(servo, field.address, data))
+        yield 0.0
         if (now := self.get(index, name)) != value:
             raise self._error(index, f"{name} was set to {value} and reads {now}")
+        yield 0.0
 
-    def _repeat(self, index: int, what: str, request: Callable[[], Packet | None]) -> Packet:
-        for _ in range(_TRIES):
+    def _ask(self, index: int, what: str, address: int, length: int) -> Answer:
+        servo = self._servos[index].id
+        return self._repeat(index, what, lambda: self._link.read(servo, address, length))
+
+    def _repeat(self, index: int, what: str, request: Callable[[], Answer | None]) -> Answer:
+        for _ in range(self._tries):
             answer = request()
             if answer is not None:
                 break
         else:
-            raise self._error(index, f"does not answer to {what}")
+            raise self._silent(index, what)
         if answer.error & ~ALERT:
             alert = ", and reports a hardware error" if answer.error & ALERT else ""
             raise self._error(index, f"refuses {what}: {error_text(answer.error)}{alert}")
         return answer
 
+    def _name(self, index: int, role: str) -> str:
+        """Name of the register of a role; the role itself where the model has none."""
+        field = self.tables[index].role(role)
+        return role if field is None else field.name
+
     def _error(self, index: int, problem: str) -> ServoError:
+        return ServoError(self._about(index, problem))
+
+    def _silent(self, index: int, what: str) -> Silent:
+        return Silent(self._about(index, f"does not answer to {what}"))
+
+    def _about(self, index: int, problem: str) -> str:
         servo = self._servos[index]
-        return ServoError(f"{servo.joint} (id {servo.id}) {problem}")
+        return f"{servo.joint} (id {servo.id}) {problem}"
+
+
+def finish(steps: Steps[T]) -> T:
+    """Run a job through, without the pauses it would like."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result

@@ -1,6 +1,8 @@
 """Serial ports: the only file that touches one.
 
-`SerialPort` is a real port: reads block until bytes come or a deadline passes, and never spin.
+`SerialPort` is a real port: reads block until bytes come or a deadline passes, and never spin. It is ours alone: two
+programs on one wire take each other's answers, so a port that somebody holds is refused, to root as well. Any baud
+rate the adapter can do will do, and where the driver offers it, bytes are handed over without the usual 16 ms wait.
 
 `VirtualTimePort` is the same port when the servos are emulated and time is virtual. Bytes go over the same pseudo
 terminal, but before a read the port tells the emulator, on a control socket, how many bytes it has written so far
@@ -11,18 +13,29 @@ reply is and writes it. So nothing depends on scheduling, and a silence costs no
 from __future__ import annotations
 
 import errno
+import fcntl
+import logging
 import os
 import select
 import socket
 import termios
-from typing import Protocol
+from array import array
+from collections.abc import Sequence
+from typing import Final, Protocol
 
 import serial
 
 from sfms_robot.errors import BusError, PortError
+from sfms_robot.servo.discovery import Holder, describe, holders
+
+log = logging.getLogger(__name__)
 
 _REPLY_TIMEOUT_S = 5.0  # real seconds; only a stopped emulator takes so long
 _WRITE_TIMEOUT_S = 0.5  # a device that takes nothing for so long is as good as gone; stopping must not wait for it
+_TERMINALS: Final = "/dev/pts/"
+_TCGETS2: Final = 0x802C542A  # of asm-generic; where it is another number the ioctl fails and nothing is checked
+_OUTPUT_SPEED: Final = 10  # c_ospeed of struct termios2, in words
+_BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
 
 
 class Now(Protocol):
@@ -62,13 +75,19 @@ class SerialPort:
         self._clock = clock
         self._serial = _open(device, baud)
         self._fd = self._serial.fileno()
+        _low_latency(self._serial)
         self.discard_input()
 
     def write(self, data: bytes) -> None:
-        try:
-            self._serial.write(data)
-        except OSError as error:
-            raise BusError(f"{self.name}: cannot be written any more: {error}") from error
+        rest = memoryview(data)
+        while rest:
+            try:
+                rest = rest[os.write(self._fd, rest) :]
+            except BlockingIOError:  # pyserial's own write would spin here
+                if not select.select([], [self._fd], [], _WRITE_TIMEOUT_S)[1]:
+                    raise BusError(f"{self.name}: takes no more bytes") from None
+            except OSError as error:
+                raise BusError(f"{self.name}: cannot be written any more: {error}") from error
 
     def read(self, n: int, deadline_s: float) -> bytes:
         try:
@@ -92,8 +111,9 @@ class SerialPort:
     def set_baud(self, baud: int) -> None:
         try:
             self._serial.baudrate = baud
-        except (OSError, ValueError) as error:
+        except (OSError, OverflowError, ValueError) as error:
             raise PortError(f"{self.name}: does not take {baud} baud: {error}") from error
+        _check_baud(self._serial, self.name)
 
     def close(self) -> None:
         self._serial.close()
@@ -121,7 +141,7 @@ class VirtualTimePort:
             raise PortError(f"{control_path}: no emulator answers there: {error}") from error
         try:
             self._serial = _open(device, baud)
-        except PortError:
+        except BaseException:
             self._control.close()
             raise
 
@@ -133,13 +153,16 @@ class VirtualTimePort:
             chunk = data[start : start + self._WINDOW]
             if self._written + len(chunk) - self._told > self._WINDOW:
                 self._exchange(now_s)
-            self._serial.write(chunk)
+            try:
+                self._serial.write(chunk)
+            except OSError as error:
+                raise BusError(f"{self.name}: cannot be written any more: {error}") from error
             self._written += len(chunk)
         self._written_at_s = now_s
 
     def read(self, n: int, deadline_s: float) -> bytes:
         if not self._inbox:
-            self._exchange(self._clock.now_s())
+            self._exchange(self._clock.now_s(), deadline_s)
         data = bytes(self._inbox[:n])
         del self._inbox[:n]
         return data
@@ -165,10 +188,11 @@ class VirtualTimePort:
         self._serial.close()
         self._control.close()
 
-    def _exchange(self, now_s: float) -> None:
-        """Let the emulator take what was written, at `now_s`, and fetch its whole reply."""
+    def _exchange(self, now_s: float, until_s: float | None = None) -> None:
+        """Let the emulator take what was written, at `now_s`, and fetch the whole of what it sends by `until_s`."""
+        until_s = now_s if until_s is None else until_s
         try:
-            self._control.sendall(b"sync %d %d %r\n" % (self._written, self._wanted_from, now_s))
+            self._control.sendall(b"sync %d %d %r %r\n" % (self._written, self._wanted_from, now_s, until_s))
             answer = self._line()
             missing = int(answer.removeprefix(b"ack "))
             fd = self._serial.fileno()
@@ -197,16 +221,69 @@ class VirtualTimePort:
 def _open(device: str, baud: int) -> serial.Serial:
     """Raises PortError of one line: missing, not permitted, held by somebody else, not a serial device."""
     try:
-        return serial.serial_for_url(device, baudrate=baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True)
-    except (OSError, ValueError) as error:
+        port = serial.serial_for_url(device, baudrate=baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True)
+    except (OSError, OverflowError, ValueError) as error:
         raise PortError(f"{device}: {_reason(device, error)}") from error
+    try:
+        _claim(port, device)
+        _check_baud(port, device)
+    except BaseException:
+        port.close()
+        raise
+    return port
+
+
+def _claim(port: serial.Serial, device: str) -> None:
+    """Nobody else may open it from now on; nobody else may have it open already. pyserial's lock is only advice."""
+    if not device.startswith("/"):
+        return  # a socket has no other users
+    if os.path.realpath(device).startswith(_TERMINALS):
+        return  # an emulator holds the near end of its pseudo terminal open, and with it the lock of a dead host
+    fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+    others = holders(device)
+    if others:
+        raise PortError(f"{device}: is held by another program ({_named(others)})")
+
+
+def _check_baud(port: serial.Serial, device: str) -> None:
+    """Drivers take the nearest rate they can do, and say which one only when asked."""
+    if not device.startswith("/"):
+        return
+    settings = array("I", [0] * 64)
+    try:
+        fcntl.ioctl(port.fileno(), _TCGETS2, settings, True)
+    except OSError:
+        return  # this driver does not tell
+    actual = settings[_OUTPUT_SPEED]
+    if actual and abs(actual - port.baudrate) > _BAUD_TOLERANCE * port.baudrate:
+        raise PortError(f"{device}: the adapter cannot do {port.baudrate} baud (the nearest it has is {actual})")
+
+
+def _low_latency(port: serial.Serial) -> None:
+    try:
+        port.set_low_latency_mode(True)
+    except (AttributeError, OSError, ValueError) as error:
+        log.debug("%s: no low latency mode: %s", port.name, error)
 
 
 def _reason(device: str, error: Exception) -> str:
-    if getattr(error, "errno", None) in (errno.EAGAIN, errno.EBUSY):
-        return "is held by another program"
-    if device.startswith("/") and not os.path.exists(device):
-        return "no such device"
-    if device.startswith("/") and not os.access(device, os.R_OK | os.W_OK):
-        return "no permission to open it (on Debian and Ubuntu: sudo usermod -aG dialout $USER, then log in again)"
+    if device.startswith("/"):
+        if not os.path.exists(device):
+            return "no such device"
+        if os.path.isdir(device):
+            return "is a directory, not a serial port"
+        if getattr(error, "errno", None) in (errno.EAGAIN, errno.EBUSY):
+            others = holders(device)
+            return "is held by another program" + (f" ({_named(others)})" if others else "")
+        if not os.access(device, os.R_OK | os.W_OK):
+            return "no permission to open it (on Debian and Ubuntu: sudo usermod -aG dialout $USER, then log in again)"
     return f"cannot be opened as a serial port: {error}"
+
+
+def _named(others: Sequence[Holder]) -> str:
+    return ", ".join(f"pid {each.pid}: {each.command}" for each in others)
+
+
+def stable_name(device: str) -> str:
+    """The name under which the same adapter is found again after it was unplugged, or `device` itself."""
+    return (describe(device).by_id or device) if device.startswith("/dev/tty") else device

@@ -1,21 +1,30 @@
-"""A firmware map made ready for use: registers by name, raw values to bytes and back.
+"""A firmware map made ready for use: registers by name or by role, values to bytes and back.
 
 `Table` is plain data, so that an emulated servo in another process needs neither the loader nor its libraries.
-Multi-byte registers are little-endian; negative values are two's complement.
+
+A register's *value* is what the control loop reckons with; its *raw* form is what travels. Four rules lead from one to
+the other: unsigned, two's complement, a sign bit above the magnitude, and an offset (2048 stands for zero). Registers
+of two and four bytes travel in the byte order of the model: low byte first, but high byte first in the Feetech SCS.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from sfms_robot.config import FirmwareMap
 
+ASSUMED_SPEED_DEG_S = 300.0  # no-load speed of a model whose maker states none: only an emulated motor needs one
+ByteOrder = Literal["little", "big"]
+
+_EMPTY: Mapping[Any, Any] = MappingProxyType({})
+
 
 class Field(NamedTuple):
-    """One register. `low`..`high` are the raw values it takes when written."""
+    """One register. `low`..`high` are the values it takes when written; `sign` is its rule, as in the map."""
 
     name: str
     address: int
@@ -27,39 +36,79 @@ class Field(NamedTuple):
     low: int
     high: int
     initial: int
+    unit: str = ""
+    sign: str = "no"
+    byte_order: ByteOrder = "little"
 
-    def to_bytes(self, raw: int) -> bytes:
-        """Raises OverflowError when `raw` does not fit the register's size."""
-        return raw.to_bytes(self.size, "little", signed=self.signed)
+    def to_bytes(self, value: int) -> bytes:
+        """Raises OverflowError when `value` does not fit the register's size and sign rule."""
+        return self._raw(value).to_bytes(self.size, self.byte_order, signed=self.sign == "twos_complement")
 
     def from_bytes(self, data: bytes | bytearray) -> int:
-        return int.from_bytes(data[: self.size], "little", signed=self.signed)
+        """Value of the first `size` bytes."""
+        raw = int.from_bytes(data[: self.size], self.byte_order, signed=self.sign == "twos_complement")
+        if self.sign == "offset_2048":
+            return raw - 2048
+        if self.sign.startswith("sign_bit_"):
+            bit = 1 << int(self.sign[9:])
+            return -(raw & bit - 1) if raw & bit else raw & bit - 1
+        return raw
 
-    def to_unit(self, raw: int) -> float:
-        """Raw value -> the unit of the firmware map."""
-        return raw * self.scale
+    def to_unit(self, value: int) -> float:
+        """Value -> the unit of the firmware map."""
+        return value * self.scale
+
+    def _raw(self, value: int) -> int:
+        if self.sign == "offset_2048":
+            return value + 2048
+        if self.sign.startswith("sign_bit_"):
+            bit = 1 << int(self.sign[9:])
+            if abs(value) >= bit:
+                raise OverflowError(f"{self.name} = {value} does not fit below its sign bit ({1 - bit}..{bit - 1})")
+            return bit - value if value < 0 else value
+        return value
 
 
 @dataclass(frozen=True)
 class Table:
-    """A servo model's control table.
+    """A servo model's control table, or the channels of a servo board (which has no fields).
 
     Attributes:
+        model_number: None where it is not known.
         fields: registers by name.
         ticks_per_revolution: position ticks of one turn.
-        top_speed_ticks_s: no-load speed.
-        baud_codes: code in register `baud_rate` -> bits per second.
-        faults: bit of `hardware_error_status` -> what it means.
+        top_speed_ticks_s: no-load speed; at `ASSUMED_SPEED_DEG_S` where the maker states none.
+        baud_codes: code in role `baud_rate` -> bits per second; empty where the rate is no register.
+        faults: bit of role `error_status` (of the error word, on a board) -> what it means.
+        family: dynamixel, feetech, maestro or ssc32.
+        protocol: 1, 2, or None for a board.
+        status_faults: bit of the error byte of a status packet -> what is wrong with the servo (protocol 1, Feetech).
+        roles: role -> register name, where they differ; None where the model has no such register.
+        watchdog: what the servo does when its host falls silent: stops, flags_only or none.
+        position_mode: value of role `operating_mode` for position control.
+        firmware: first and last firmware number that the table holds for.
+        channels, pulse_us, tick_us: of a board: outputs, (shortest, longest) pulse, pulse width of one tick.
     """
 
     model: str
-    model_number: int
+    model_number: int | None
     fields: Mapping[str, Field]
     ticks_per_revolution: float
     center_ticks: int
     top_speed_ticks_s: float
     baud_codes: Mapping[int, int]
     faults: Mapping[int, str]
+    family: str = "dynamixel"
+    protocol: int | None = 2
+    byte_order: ByteOrder = "little"
+    status_faults: Mapping[int, str] = field(default_factory=lambda: _EMPTY)
+    roles: Mapping[str, str | None] = field(default_factory=lambda: _EMPTY)
+    watchdog: str = "none"
+    position_mode: int | None = None
+    firmware: tuple[int, int] = (0, 255)
+    channels: int | None = None
+    pulse_us: tuple[float, float] | None = None
+    tick_us: float | None = None
 
     @classmethod
     def of(cls, firmware_map: FirmwareMap) -> Table:
@@ -69,49 +118,77 @@ class Table:
     def from_plain(cls, plain: Mapping[str, Any]) -> Table:
         """From a validated firmware map dumped to plain data, also by way of JSON (which makes keys text)."""
         per_degree = plain["ticks_per_revolution"] / 360.0
+        pulse = plain["pulse_us"]
         return cls(
             model=plain["model"],
             model_number=plain["model_number"],
-            fields={name: _field(name, row) for name, row in plain["registers"].items()},
+            fields={name: _field(name, row, plain["byte_order"]) for name, row in plain["registers"].items()},
             ticks_per_revolution=plain["ticks_per_revolution"],
             center_ticks=plain["center_ticks"],
-            top_speed_ticks_s=plain["no_load_speed_deg_s"] * per_degree,
+            top_speed_ticks_s=(plain["no_load_speed_deg_s"] or ASSUMED_SPEED_DEG_S) * per_degree,
             baud_codes={int(code): baud for code, baud in plain["baud_codes"].items()},
             faults={int(bit): text for bit, text in plain["faults"].items()},
+            family=plain["family"],
+            protocol=plain["protocol"],
+            byte_order=plain["byte_order"],
+            status_faults={int(bit): text for bit, text in plain["status_faults"].items()},
+            roles=dict(plain["roles"]),
+            watchdog=plain["watchdog"],
+            position_mode=plain["position_mode"],
+            firmware=(plain["firmware"]["min"], plain["firmware"]["max"]),
+            channels=plain["channels"],
+            pulse_us=(pulse["min"], pulse["max"]) if pulse else None,
+            tick_us=plain["tick_us"],
         )
 
     def __getitem__(self, name: str) -> Field:
         return self.fields[name]
 
+    def role(self, role: str) -> Field | None:
+        """The register that plays `role` in this family; None when the model has none."""
+        name = self.roles.get(role, role)
+        return self.fields.get(name) if name is not None else None
+
     @property
     def size(self) -> int:
         """Bytes of the whole table."""
-        return max(field.address + field.size for field in self.fields.values())
+        return max((each.address + each.size for each in self.fields.values()), default=0)
+
+    @property
+    def default_baud(self) -> int | None:
+        """Bits per second as it leaves the factory; None where that is not known."""
+        code = self.role("baud_rate")
+        return self.baud_codes.get(code.initial) if code else None
 
     def span(self, names: Sequence[str]) -> tuple[int, int]:
         """(address, length) of the block that holds all of `names`."""
         fields = [self.fields[name] for name in names]
-        first = min(field.address for field in fields)
-        return first, max(field.address + field.size for field in fields) - first
+        first = min(each.address for each in fields)
+        return first, max(each.address + each.size for each in fields) - first
 
     def fault_names(self, status: int) -> str:
-        """`hardware_error_status` in words; empty when it is 0."""
-        bits = [bit for bit in range(8) if status >> bit & 1]
+        """Value of role `error_status` in words; empty when it is 0."""
+        bits = [bit for bit in range(16) if status >> bit & 1]
         return ", ".join(self.faults.get(bit, f"hardware error bit {bit}") for bit in bits)
 
+    def status_fault_names(self, error: int) -> str:
+        """What the error byte of a status packet says about the servo, in words; bits about the packet are left out."""
+        return ", ".join(text for bit, text in sorted(self.status_faults.items()) if error >> bit & 1)
 
-def _field(name: str, row: Mapping[str, Any]) -> Field:
-    bits, signed = 8 * row["size"], row["signed"]
-    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+
+def _field(name: str, row: Mapping[str, Any], byte_order: ByteOrder) -> Field:
     return Field(
         name=name,
         address=row["address"],
         size=row["size"],
-        signed=signed,
+        signed=row["signed"] != "no",
         writable=row["access"] == "RW",
         eeprom=row["area"] == "EEPROM",
         scale=row["scale"],
-        low=low if row["min"] is None else row["min"],
-        high=high if row["max"] is None else row["max"],
+        low=row["low"],
+        high=row["high"],
         initial=row["initial"] or 0,
+        unit=row["unit"],
+        sign=row["signed"],
+        byte_order=byte_order,
     )

@@ -1,37 +1,56 @@
-"""The moving part of an emulated servo: a profile generator, then a motor that follows it.
+"""The moving part of an emulated servo: a profile generator, then a motor that follows it and grows warm.
 
     reference   trapezoid towards the goal under profile velocity and acceleration (0 = no limit: it jumps)
-    motor       x'' = w^2 (reference - x) - 2 w x', with |x''| and |x'| held to what the motor can do
+    motor       x'' = w^2 (reference - x) - 2 w x' - load, with |x''| and |x'| held to what the motor can do
+    heat        T' = (ambient + _HEATING * effort^2 - T) / _COOLING_S
 
-Critically damped, so a servo lags a ramp by 2 / w = 33 ms and does not ring. Time runs on a fixed grid of `STEP_S`:
-where the servo is depends on what it was told when, never on how often somebody looked.
+Critically damped, so a servo lags a ramp by 2 / w = 33 ms and does not ring; under a load it hangs a little below its
+goal, as a proportional controller does. Time runs on a fixed grid of `STEP_S`: where the servo is depends on what it
+was told when, never on how often somebody looked.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 STEP_S: Final = 0.002
+AMBIENT_C: Final = 31.0
+OVERLOAD_S: Final = 1.0  # at full effort without turning
 _STIFFNESS: Final = 60.0  # w, 1/s
 _SPIN_UP_S: Final = 0.05  # from rest to top speed
 _FRICTION_MA: Final = 25.0
-_INERTIA_MA: Final = 500.0  # at full acceleration
+_CREEP: Final = 20.0  # ticks/s, from where on friction is whole
+_STALL_MA: Final = 1200.0  # at full effort
 _THERE: Final = 0.02  # ticks from the goal at which a motor counts as there
+_HEATING: Final = 110.0  # degrees above ambient of a motor that stalls for good
+_COOLING_S: Final = 45.0
+_HEAT_STEPS: Final = 100
+_DECAY: Final = 1.0 - math.exp(-_HEAT_STEPS * STEP_S / _COOLING_S)
+_STRAINED: Final = 0.95  # of full effort
 
 
 class Drive(NamedTuple):
-    """What a motor is told. Ticks and seconds; a profile limit of 0 is no limit."""
+    """What a motor is told. Ticks and seconds; a profile limit of 0 is no limit.
+
+    goal: a position, or a speed when `by_speed`. torque: share of its full torque that the motor may use.
+    """
 
     goal: float
     top_speed: float
     profile_speed: float = 0.0
     profile_acceleration: float = 0.0
+    torque: float = 1.0
+    by_speed: bool = False
 
 
 @dataclass(slots=True)
 class Plant:
-    """State of one motor, in ticks and seconds. `drive` None = no torque: it stays where it is."""
+    """State of one motor, in ticks and seconds. `drive` None = no torque: it stays where it is.
+
+    effort: share of full torque that the motor uses now, signed. load: share that holding its place takes.
+    """
 
     position: float
     speed: float = 0.0
@@ -39,32 +58,75 @@ class Plant:
     reference: float = 0.0
     reference_speed: float = 0.0
     step: int = 0
+    effort: float = 0.0
+    load: float = 0.0
+    stuck: bool = False
+    temperature_C: float = AMBIENT_C
+    strained_steps: int = 0
+    _heat: float = 0.0
+
+    @property
+    def overloaded(self) -> bool:
+        return self.strained_steps * STEP_S >= OVERLOAD_S
 
     def advance(self, now_s: float, drive: Drive | None) -> None:
         """Move on to the last grid point at or before `now_s`; going back in time does nothing."""
         steps = int(now_s / STEP_S + 1e-6) - self.step
         if steps <= 0:
             return
-        self.step += steps
         if drive is None:
             self.speed = self.acceleration = self.reference_speed = 0.0
             self.reference = self.position
+            self._rest(steps)
             return
-        for _ in range(steps):
-            if self.speed == 0.0 and self.position == drive.goal == self.reference:
+        for done in range(steps):
+            if self.speed == 0.0 and self._arrived(drive):
+                self._rest(steps - done)
                 return
-            self._follow(drive)
+            if drive.by_speed:
+                self._turn(drive)
+            else:
+                self._follow(drive)
+            self.step += 1
+            self._heat += self.effort * self.effort
+            if self.step % _HEAT_STEPS == 0:
+                self._warm()
+
+    def _arrived(self, drive: Drive) -> bool:
+        if drive.by_speed:
+            return drive.goal == 0.0 == self.reference_speed
+        return self.position == drive.goal == self.reference and self.load == 0.0
 
     def _follow(self, drive: Drive) -> None:
         self._plan(drive)
-        limit = drive.top_speed / _SPIN_UP_S
-        pull = _STIFFNESS * (_STIFFNESS * (self.reference - self.position) - 2.0 * self.speed)
-        self.acceleration = min(max(pull, -limit), limit)
-        speed = self.speed + self.acceleration * STEP_S
-        self.speed = min(max(speed, -drive.top_speed), drive.top_speed)
-        self.position += self.speed * STEP_S
+        self._move(drive, _STIFFNESS * (_STIFFNESS * (self.reference - self.position) - 2.0 * self.speed))
         if self.reference == drive.goal and abs(drive.goal - self.position) < _THERE and abs(self.speed) < 1.0:
-            self.position, self.speed, self.acceleration = drive.goal, 0.0, 0.0
+            if self.load == 0.0:
+                self.position, self.speed, self.acceleration, self.effort = drive.goal, 0.0, 0.0, 0.0
+
+    def _turn(self, drive: Drive) -> None:
+        change = drive.profile_acceleration * STEP_S or 2.0 * drive.top_speed
+        self.reference_speed += min(max(drive.goal - self.reference_speed, -change), change)
+        self._move(drive, 2.0 * _STIFFNESS * (self.reference_speed - self.speed))
+        self.reference = self.position
+        if drive.goal == 0.0 == self.reference_speed and abs(self.speed) < 1.0:
+            self.speed = self.acceleration = self.effort = 0.0
+
+    def _move(self, drive: Drive, pull: float) -> None:
+        """One step of a motor that wants to accelerate by `pull`."""
+        full = drive.top_speed / _SPIN_UP_S
+        limit = full * drive.torque
+        motor = min(max(pull, -limit), limit)
+        self.effort = motor / full
+        if self.stuck:
+            self.speed = self.acceleration = 0.0
+        else:
+            self.acceleration = motor - self.load * full
+            speed = self.speed + self.acceleration * STEP_S
+            self.speed = min(max(speed, -drive.top_speed), drive.top_speed)
+            self.position += self.speed * STEP_S
+        strained = abs(self.effort) >= _STRAINED and abs(self.speed) < 0.01 * drive.top_speed
+        self.strained_steps = self.strained_steps + 1 if strained else 0
 
     def _plan(self, drive: Drive) -> None:
         """Move the reference one step towards the goal."""
@@ -84,9 +146,26 @@ class Plant:
         if abs(drive.goal - self.reference) < 1e-6:
             self.reference, self.reference_speed = drive.goal, 0.0
 
+    def _rest(self, steps: int) -> None:
+        self.effort, self.strained_steps = 0.0, 0
+        times = (self.step + steps) // _HEAT_STEPS - self.step // _HEAT_STEPS
+        self.step += steps
+        for _ in range(times):
+            if self._heat == 0.0 and self.temperature_C == AMBIENT_C:
+                return
+            self._warm()
+
+    def _warm(self) -> None:
+        """Once every `_HEAT_STEPS`, with the effort of all of them."""
+        target = AMBIENT_C + _HEATING * self._heat / _HEAT_STEPS
+        self._heat = 0.0
+        self.temperature_C += _DECAY * (target - self.temperature_C)
+        if abs(self.temperature_C - AMBIENT_C) < 1e-3 and target == AMBIENT_C:
+            self.temperature_C = AMBIENT_C
+
     def current_mA(self, top_speed: float) -> float:
-        """Plausible winding current: friction while it turns, and what accelerates it."""
-        if self.speed == 0.0:
+        """Plausible winding current: friction while it turns, and its effort."""
+        if self.speed == 0.0 and self.effort == 0.0:
             return 0.0
-        friction = _FRICTION_MA if self.speed > 0.0 else -_FRICTION_MA
-        return friction + _INERTIA_MA * self.acceleration * _SPIN_UP_S / top_speed
+        friction = _FRICTION_MA * min(max(self.speed / _CREEP, -1.0), 1.0)
+        return friction + _STALL_MA * self.effort

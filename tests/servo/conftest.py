@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from sfms_robot.config import load_firmware_map
+from sfms_robot.config import Bus, Faults, Safety, load_firmware_map
 from sfms_robot.servo.dxl2_link import Dxl2Link
 from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
 from sfms_robot.servo.port import VirtualTimePort
@@ -75,25 +75,45 @@ class Rig:
             readings = self.bus.poll(self.clock.t)
         return readings
 
+    def until(self, goals_rad, done, limit_s: float):
+        """Ticks until `done(readings)`; the seconds it took, and the readings."""
+        began_s = self.clock.t
+        while self.clock.t - began_s < limit_s:
+            readings = self.ticks(goals_rad, 1)
+            if done(readings):
+                return self.clock.t - began_s, readings
+        raise AssertionError(f"not within {limit_s} s")
+
 
 LIMIT_RAD = 1.0
 
 
 @contextmanager
 def rig_of(
-    servos: Sequence[EmulatedServo], expected: Sequence[int] = (), baud: int = 1_000_000, firmware_map=None
+    servos: Sequence[EmulatedServo],
+    expected: Sequence[int] = (),
+    baud: int = 1_000_000,
+    firmware_map=None,
+    safety: Safety | None = None,
+    faults: Faults | None = None,
+    **config,
 ) -> Iterator[Rig]:
-    """`expected`, `firmware_map`: ids and model that the head names; those plugged in unless told otherwise."""
+    """`expected`, `firmware_map`: ids and model that the head names; those plugged in unless told otherwise.
+
+    `config`: of the bus, as in a head's file.
+    """
     table = firmware_map or load_firmware_map("xl330-m288")
     ids = expected or [servo.id for servo in servos]
     with launch(servos, virtual=True) as chain:
         clock = Time()
         bus = DynamixelBus(
             "face",
-            [BusServo(f"joint{i}", i, table, -LIMIT_RAD, LIMIT_RAD) for i in ids],
+            [BusServo(f"joint{i}", i, table, -LIMIT_RAD, LIMIT_RAD, safety or Safety()) for i in ids],
             Linear(LIMIT_RAD),
             lambda: VirtualTimePort(chain.device, chain.control, baud, clock),
             baud,
+            config=Bus(family="dynamixel", baud=baud, **config),
+            faults=faults,
         )
         try:
             yield Rig(chain, clock, bus, len(ids), baud)

@@ -1,9 +1,21 @@
+import threading
+import time
+
 import numpy as np
 import pytest
 
+from sfms_robot.config import load_firmware_map
 from sfms_robot.errors import BusError
+from sfms_robot.frames import Reading
 from sfms_robot.servo.composite import CompositeBus
-from sfms_robot.simulator.launch import EmulatedServo
+from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
+from sfms_robot.servo.port import SerialPort
+from sfms_robot.simulator.launch import EmulatedServo, launch
+
+
+class Monotonic:
+    def now_s(self) -> float:
+        return time.monotonic()
 
 
 def test_two_buses_answer_as_one_in_the_order_of_the_head(make_rig):
@@ -39,3 +51,105 @@ def test_bus_that_fails_to_connect_closes_the_others(make_rig):
         with pytest.raises(BusError, match="no answer from id 9"):
             bus.connect()
         good.bus.connect()  # its port is free again
+
+
+class Gate:
+    """A bus whose write waits until somebody opens it: a slow wire, without a stopwatch."""
+
+    capabilities = {"slow": frozenset({"torque"})}
+    joints = ("slow",)
+
+    def __init__(self):
+        self.open = threading.Event()
+        self.begun = threading.Event()
+        self.written = []
+        self.refuse = False
+
+    def connect(self): ...
+
+    def enable(self, joints):
+        return np.zeros(len(joints))
+
+    def write(self, goals_rad, now_s):
+        if self.refuse:
+            raise ValueError("goal of slow is not in range")
+        self.begun.set()
+        self.open.wait(30.0)
+        self.written.append((float(goals_rad[0]), now_s))
+
+    def poll(self, now_s):
+        return {"slow": Reading(0.5, 0.0, rejoined=len(self.written) == 1)}
+
+    def stop(self, policy): ...
+
+    def close(self): ...
+
+    def statistics(self):
+        return {"writes": len(self.written)}
+
+
+def test_slow_bus_does_not_hold_up_the_others_and_gets_the_newest_goals(linear):
+    slow, clock = Gate(), Monotonic()
+    with launch([EmulatedServo(1)]) as chain:
+        fast = DynamixelBus(
+            "fast",
+            [BusServo("quick", 1, load_firmware_map("xl330-m288"), -1.0, 1.0)],
+            linear(1.0),
+            lambda: SerialPort(chain.device, 1_000_000, clock),
+            1_000_000,
+            read_deadline_s=1.0,
+        )
+        bus = CompositeBus({"slow": slow, "fast": fast}, ["slow", "quick"], {"slow": 1000.0, "fast": 1000.0})
+        bus.connect()
+        bus.enable(["slow", "quick"])
+        goals = np.array([0.0, 0.0])
+        bus.write(goals, 0.0)
+        assert slow.begun.wait(30.0)
+        k = 0
+        while bus.statistics()["buses"]["fast"]["writes"] < 5:
+            k += 1
+            goals[0] = k / 1e6
+            bus.write(goals, 0.001 * k)
+            readings = bus.poll(0.001 * k)
+        assert slow.written == [] and readings["slow"].position_rad is None
+        slow.open.set()
+        while len(slow.written) < 2:
+            bus.write(goals, 0.001 * k)
+        bus.stop("release")
+        bus.close()
+    assert slow.written[0] == (0.0, 0.0)
+    assert slow.written[1][0] == goals[0]  # what came in between is forgotten
+
+
+def test_joint_that_came_back_is_told_once_however_often_its_bus_ticks():
+    slow = Gate()
+    slow.open.set()
+    bus = CompositeBus({"slow": slow}, ["slow"], {"slow": 1000.0})
+    told = 0
+    while len(slow.written) < 5:
+        bus.write(np.zeros(1), 0.0)
+        told += bus.poll(0.0)["slow"].rejoined
+    bus.stop("release")
+    bus.close()
+    assert told == 1
+
+
+def test_what_a_thread_refuses_is_raised_by_a_later_write():
+    slow = Gate()
+    slow.refuse = True
+    bus = CompositeBus({"slow": slow}, ["slow"], {"slow": 1000.0})
+    with pytest.raises(ValueError, match="not in range"):
+        while True:
+            bus.write(np.zeros(1), 0.0)
+    bus.close()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_goal_that_is_not_finite_reaches_no_thread(bad):
+    slow = Gate()
+    slow.open.set()
+    bus = CompositeBus({"slow": slow}, ["slow"], {"slow": 1000.0})
+    with pytest.raises(ValueError, match="goal of slow is not finite"):
+        bus.write(np.array([bad]), 0.0)
+    bus.close()
+    assert slow.written == []

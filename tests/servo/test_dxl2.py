@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
@@ -59,7 +59,7 @@ def test_instruction_round_trip(servo, code, data):
     assert take(bytearray(encode_instruction(servo, code, data))) == Packet(servo, code, data)
 
 
-@given(ids, st.integers(0, 255), params)
+@given(st.integers(0, dxl2.MAX_ID), st.integers(0, 255), params)
 def test_status_round_trip(servo, error, data):
     wire = encode_status(servo, error, data)
     assert take(bytearray(wire)) == Packet(servo, dxl2.STATUS, data, error)
@@ -145,6 +145,9 @@ def test_vendor_sdk_writes_the_same_bytes(servo, address, data):
 
 @given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=20) | tricky.filter(bool))
 def test_vendor_sdk_reads_what_we_write(servo, error, data):
+    # The SDK removes stuffing in place and then looks at bytes it has moved: behind the first it may see another.
+    _, header, rest = (bytes([dxl2.STATUS, error]) + data).partition(b"\xff\xff\xfd")
+    assume(not header or b"\xfd\xfd" not in rest)
     answer, result, told = Protocol2PacketHandler().readRx(Wire(encode_status(servo, error, data)), servo, len(data))
     assert (bytes(answer), result, told) == (data, 0, error)
 

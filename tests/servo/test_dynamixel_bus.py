@@ -171,7 +171,7 @@ def test_stop_can_hold(rig):
 
 def torque_of(rig):
     with rig.link() as link:
-        return [link.read(servo, 64, 1).params[0] for servo in range(1, rig.count + 1)]
+        return [link.read(servo, 64, 1).data[0] for servo in range(1, rig.count + 1)]
 
 
 def test_mode_and_drive_mode_are_set_before_the_first_goal(rig):
@@ -182,7 +182,7 @@ def test_mode_and_drive_mode_are_set_before_the_first_goal(rig):
     rig.hold()
     rig.bus.close()
     with rig.link() as link:
-        assert [link.read(1, address, 1).params[0] for address in (11, 10, 68, 9)] == [3, 0, 2, 0]
+        assert [link.read(1, address, 1).data[0] for address in (11, 10, 68, 9)] == [3, 0, 2, 0]
 
 
 def test_mode_that_cannot_be_changed_under_torque_is_an_error(rig):
@@ -240,4 +240,4 @@ def test_bus_works_in_real_time_on_the_serial_port_alone(linear):
         bus.stop("release")
         bus.close()
         counts = bus.statistics()
-        assert (counts["writes"], counts["reads"], counts["errors"], counts["silent"]) == (20, 20, 0, [])
+        assert (counts["writes"], counts["retries"], counts["errors"], counts["silent"]) == (20, 0, 0, [])

@@ -5,46 +5,118 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import ASSUMED_SPEED_DEG_S, Table
 
-MAP = load_firmware_map("xl330-m288")
-TABLE = Table.of(MAP)
-
-
-@given(st.sampled_from(sorted(TABLE.fields)), st.data())
-def test_every_register_takes_its_whole_range(name, data):
-    field = TABLE[name]
-    raw = data.draw(st.integers(field.low, field.high))
-    assert len(field.to_bytes(raw)) == field.size
-    assert field.from_bytes(field.to_bytes(raw)) == raw
+X = Table.of(load_firmware_map("xl330-m288"))
+AX = Table.of(load_firmware_map("ax-12a"))
+MX = Table.of(load_firmware_map("mx-64-1.0"))
+STS = Table.of(load_firmware_map("sts3215"))
+SCS = Table.of(load_firmware_map("scs0009"))
+MAESTRO = Table.of(load_firmware_map("maestro-24"))
+SERVOS = {table.model: table for table in (X, AX, MX, STS, SCS)}
 
 
-def test_value_that_does_not_fit_is_refused():
+@given(st.sampled_from([(table, name) for table in SERVOS.values() for name in sorted(table.fields)]), st.data())
+def test_every_register_takes_its_whole_range(register, data):
+    field = register[0][register[1]]
+    value = data.draw(st.integers(field.low, field.high))
+    assert len(field.to_bytes(value)) == field.size
+    assert field.from_bytes(field.to_bytes(value)) == value
+
+
+@given(st.sampled_from([(table, name) for table in SERVOS.values() for name in sorted(table.fields)]), st.binary())
+def test_whatever_a_servo_sends_has_a_value(register, data):
+    field = register[0][register[1]]
+    assert isinstance(field.from_bytes(data.ljust(4, b"\xff")), int)
+
+
+@pytest.mark.parametrize(
+    ("table", "name", "value", "raw"),
+    [
+        (X, "goal_position", -2, "fe ff ff ff"),
+        (X, "goal_current", 0x123, "23 01"),
+        (X, "bus_watchdog", -1, "ff"),
+        (AX, "moving_speed", -5, "05 04"),
+        (MX, "current", 10, "0a 08"),
+        (MX, "current", -2048, "00 00"),
+        (STS, "goal_position", 0x0123, "23 01"),
+        (STS, "goal_position", -1, "01 80"),
+        (STS, "homing_offset", -2047, "ff 0f"),
+        (SCS, "goal_position", 0x0123, "01 23"),
+        (SCS, "goal_velocity", -2, "80 02"),
+    ],
+    ids=str,
+)
+def test_sign_rule_and_byte_order_are_the_models_own(table, name, value, raw):
+    assert table[name].to_bytes(value) == bytes.fromhex(raw)
+    assert table[name].from_bytes(bytes.fromhex(raw)) == value
+
+
+@pytest.mark.parametrize(
+    ("table", "name", "value"),
+    [(X, "torque_enable", 256), (X, "torque_enable", -1), (STS, "homing_offset", 2048), (MX, "current", -2049)],
+    ids=str,
+)
+def test_value_that_does_not_fit_is_refused(table, name, value):
     with pytest.raises(OverflowError):
-        TABLE["torque_enable"].to_bytes(256)
-
-
-def test_low_byte_comes_first_and_negative_is_twos_complement():
-    assert TABLE["goal_position"].to_bytes(-2) == b"\xfe\xff\xff\xff"
-    assert TABLE["goal_current"].to_bytes(0x123) == b"\x23\x01"
+        table[name].to_bytes(value)
 
 
 def test_current_velocity_and_position_are_one_block():
-    assert TABLE.span(["present_position", "present_current", "present_velocity"]) == (126, 10)
+    assert X.span(["present_position", "present_current", "present_velocity"]) == (126, 10)
 
 
-def test_table_survives_json():
-    assert Table.from_plain(json.loads(json.dumps(MAP.model_dump(mode="json")))) == TABLE
+@pytest.mark.parametrize("model", [*SERVOS, "xl-320", "maestro-24", "ssc-32"])
+def test_table_survives_json(model):
+    firmware_map = load_firmware_map(model)
+    assert Table.from_plain(json.loads(json.dumps(firmware_map.model_dump(mode="json")))) == Table.of(firmware_map)
 
 
 def test_faults_are_named():
-    assert TABLE.fault_names(0) == ""
-    assert TABLE.fault_names(0b100100) == "overheating, overload"
-    assert TABLE.fault_names(0b10) == "hardware error bit 1"
+    assert X.fault_names(0) == ""
+    assert X.fault_names(0b100100) == "overheating, overload"
+    assert X.fault_names(0b10) == "hardware error bit 1"
 
 
-def test_shipped_map_states_what_the_maker_publishes():
-    assert MAP.model_number == 1200
-    assert TABLE["goal_position"].address == 116 and TABLE["present_position"].address == 132
-    assert TABLE.baud_codes[3] == 1_000_000
-    assert "ROBOTIS" in MAP.source
+def test_error_byte_of_protocol_1_names_the_servos_faults_and_not_the_packets():
+    assert AX.status_fault_names(0b0110_0100) == "overheating, overload"
+    assert AX.status_fault_names(0b0001_0000) == ""
+
+
+@pytest.mark.parametrize(
+    ("role", "names"),
+    [
+        ("goal_position", ["goal_position"] * 5),
+        ("present_speed", ["present_velocity", "present_speed", "present_speed"] + ["present_velocity"] * 2),
+        ("voltage", ["present_input_voltage"] + ["present_voltage"] * 4),
+        ("status_level", ["status_return_level"] * 3 + ["response_level"] * 2),
+        ("error_status", ["hardware_error_status", None, None, "status", "status"]),
+        ("present_current", ["present_current", None, "current", "present_current", "present_current"]),
+        ("bus_watchdog", ["bus_watchdog", None, None, None, None]),
+    ],
+)
+def test_role_leads_to_the_register_of_each_family(role, names):
+    found = [table.role(role) for table in SERVOS.values()]
+    assert [field.name if field else None for field in found] == names
+
+
+def test_lock_until_power_off_is_not_the_lock_that_tools_open_and_close():
+    assert AX["lock"].writable and AX.role("lock") is None
+    assert STS.role("lock") == STS["lock"]
+
+
+def test_board_has_channels_and_no_registers():
+    assert (MAESTRO.channels, MAESTRO.tick_us, MAESTRO.protocol, MAESTRO.size) == (24, 0.25, None, 0)
+    assert MAESTRO.center_ticks * MAESTRO.tick_us == 1500.0
+    assert MAESTRO.role("present_position") is None
+
+
+def test_unknown_speed_is_assumed_and_a_known_one_is_not():
+    unknown = Table.of(load_firmware_map("sts3032"))
+    assert unknown.top_speed_ticks_s == pytest.approx(ASSUMED_SPEED_DEG_S * 4096 / 360)
+    assert X.top_speed_ticks_s == pytest.approx(618 * 4096 / 360)
+
+
+def test_factory_baud_rate_is_read_from_the_map():
+    assert [table.default_baud for table in SERVOS.values()] == [57_600, 1_000_000, 57_600, 1_000_000, 1_000_000]
+    assert MAESTRO.default_baud is None

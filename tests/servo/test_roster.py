@@ -22,7 +22,19 @@ def test_wire_without_any_answer_is_blamed_before_its_servos():
     roster = Roster([5, 6])
     for _ in range(QUIET_POLLS - 1):
         assert roster.blame(False, gaps=[5], missed=[], now_s=0.0) == []
-    assert roster.blame(False, gaps=[5], missed=[], now_s=0.0) == [5]
+    assert roster.blame(False, gaps=[5], missed=[], now_s=0.0) == [5, 6]  # then the supply may be gone: all of them
+
+
+def test_when_one_is_back_the_others_are_asked_at_once():
+    roster = Roster([5, 6])
+    roster.suspect_all(0.0)
+    for _ in range(8):
+        for servo in (5, 6):
+            roster.probe_failed(servo, 0.0)
+    assert roster.due(0.5) is None
+    roster.answered(5)
+    roster.hurry(0.5)
+    assert roster.due(0.5) == 6
 
 
 @given(st.floats(0, 1000))
@@ -36,7 +48,7 @@ def test_probes_of_a_dead_servo_become_rare_and_never_stop(start_s):
             probes.append(t)
             roster.probe_failed(servo, t)
     gaps = [b - a for a, b in zip(probes, probes[1:], strict=False)]
-    assert 10 < len(probes) < 20
+    assert 15 < len(probes) < 30
     assert gaps[0] < 0.2 and LONGEST_PAUSE_S - 0.02 <= gaps[-1] <= LONGEST_PAUSE_S + 0.02
 
 

@@ -18,9 +18,13 @@ BAUD = 1_000_000
 class Host:
     """A host that talks at one baud, at a time it sets."""
 
-    def __init__(self, *servos: int, baud: int = BAUD):
-        self.chain = ServoChain([Servo(i, TABLE, baud, start_ticks=2000 + i, firmware=53) for i in servos])
+    def __init__(self, *servos: int, baud: int = BAUD, firmware: int = 53, chain_break: bool = True):
+        each = [Servo(i, TABLE, baud, start_ticks=2000 + i, firmware=firmware) for i in servos]
+        self.chain = ServoChain(each, chain_break)
         self.t = 0.0
+
+    def replies(self, servo: int, instruction: int, params: bytes = b""):
+        return self.chain.replies(encode_instruction(servo, instruction, params), BAUD, self.t)
 
     def ask(self, servo: int, instruction: int, params: bytes = b"", baud: int = BAUD) -> list[Packet]:
         buffer = bytearray(self.chain.receive(encode_instruction(servo, instruction, params), baud, self.t))
@@ -157,14 +161,18 @@ def test_reboot_restores_ram_and_keeps_eeprom(host):
     host.write(1, "led", 1)
     host.write(1, "torque_enable", 1)
     assert len(host.ask(1, dxl2.REBOOT)) == 1
+    assert host.ask(1, dxl2.PING) == []  # it is busy starting
+    host.t = 0.5
     assert [host.read(1, n) for n in ("led", "torque_enable", "return_delay_time")] == [0, 0, 7]
 
 
 def test_factory_reset_keeps_what_it_is_told_to(host):
     host.write(3, "return_delay_time", 7)
     host.ask(3, dxl2.FACTORY_RESET, b"\x02")
+    host.t = 0.5
     assert host.read(3, "return_delay_time") == 250
     host.ask(3, dxl2.FACTORY_RESET, b"\x01")
+    host.t = 1.0
     assert host.ask(3, dxl2.PING) == [] and len(host.ask(3, dxl2.PING, baud=57600)) == 1
 
 
@@ -176,6 +184,7 @@ def test_hardware_error_is_latched_until_reboot(host):
     assert host.read(2, "hardware_error_status") == 1 << 5
     assert host.write(2, "torque_enable", 1) == dxl2.ALERT | dxl2.ACCESS_ERROR
     host.ask(2, dxl2.REBOOT)
+    host.t = 0.5
     assert host.read(2, "hardware_error_status") == 0 and host.write(2, "torque_enable", 1) == 0
 
 
@@ -214,8 +223,82 @@ def test_no_instruction_whatever_its_parameters_breaks_the_chain(servo, instruct
         host.chain.receive(encode_instruction(servo, instruction, params), BAUD, 0.0)
 
 
-def test_digest_counts_every_byte(host):
-    host.ask(1, dxl2.PING)
-    one = host.chain.digest()
-    host.ask(1, dxl2.PING, baud=57600)
-    assert host.chain.bytes_seen == 20 and host.chain.digest() != one
+POSITIONS = words(132, 4)
+
+
+def test_chain_may_skip_a_silent_id():
+    host = Host(1, 2, 3, chain_break=False)
+    host.chain.servo(2).dead = True
+    answers = host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + b"\x01\x02\x03")
+    assert [packet.servo for packet in answers] == [1, 3]
+
+
+@pytest.mark.parametrize("dead", [None, 3, 2, 1])
+def test_fast_sync_read_is_one_packet_that_stops_short_at_a_silent_id(host, dead):
+    if dead:
+        host.chain.servo(dead).dead = True
+    replies = host.replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, POSITIONS + b"\x01\x02\x03")
+    there = (1, 2, 3)[: dead - 1 if dead else 3]
+    assert [reply.servos for reply in replies] == ([there] if there else [])
+    if there:
+        parts = dxl2.split_fast_status(replies[0].data, 4)
+        assert parts == [(i, 0, (2000 + i).to_bytes(4, "little")) for i in there]
+        assert len(replies[0].data) == 8 + 8 * len(there)
+        assert replies[0].data[5] == 1 + 3 * 8  # announced whole
+
+
+def test_fast_bulk_read_has_its_own_length_for_each(host):
+    request = b"\x01" + words(132, 4) + b"\x02" + words(146, 1)
+    [reply] = host.replies(dxl2.BROADCAST, 0x9A, request)
+    assert reply.data[8:14] == bytes([0, 1]) + (2001).to_bytes(4, "little")
+    assert reply.data[16:19] == bytes([0, 2, 31])
+
+
+def test_fast_read_of_a_block_that_holds_a_header_is_not_stuffed():
+    host = Host(1)
+    host.write(1, "goal_position", 0)
+    host.write(1, "indirect_data_1", 0xFF)
+    host.write(1, "indirect_data_2", 0xFF)
+    host.write(1, "indirect_data_3", 0xFD)
+    [plain] = host.replies(1, dxl2.READ, words(224, 3))
+    [fast] = host.replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, words(224, 3) + b"\x01")
+    assert b"\xff\xff\xfd\xfd" in plain.data and b"\xff\xff\xfd\xfd" not in fast.data
+    assert dxl2.split_fast_status(fast.data, 3) == [(1, 0, b"\xff\xff\xfd")]
+
+
+def test_old_firmware_does_not_know_fast_reads():
+    assert Host(1, firmware=44).replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, POSITIONS + b"\x01") == []
+
+
+def test_second_id_obeys_and_says_nothing(host):
+    for servo in (2, 3):
+        assert host.write(servo, "secondary_id", 1) == 0
+    assert [p.servo for p in host.ask(1, dxl2.WRITE, words(65) + b"\x01")] == [1]
+    assert [host.read(i, "led") for i in (1, 2, 3)] == [1, 1, 1]
+    host.ask(dxl2.BROADCAST, dxl2.SYNC_WRITE, words(65, 1) + b"\x01\x00")
+    assert [host.read(i, "led") for i in (1, 2, 3)] == [0, 0, 0]
+
+
+def test_two_servos_with_one_id_talk_over_one_another(host):
+    assert host.write(2, "id", 1) == 0
+    both = host.replies(1, dxl2.READ, POSITIONS)
+    assert len(both) == 1 and maybe_packet(bytearray(both[0].data)) is None  # 2001 and 2002 at once: the crc is wrong
+
+
+def test_change_of_id_is_answered_under_the_old_one(host):
+    assert [p.servo for p in host.ask(3, dxl2.WRITE, words(7) + b"\x09")] == [3]
+    assert [p.servo for p in host.ask(9, dxl2.PING)] == [9]
+
+
+def test_each_reply_waits_its_return_delay(host):
+    host.write(2, "return_delay_time", 10)
+    replies = host.replies(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + b"\x01\x02")
+    assert [reply.pause_s for reply in replies] == pytest.approx([500e-6, 20e-6])
+
+
+def test_broadcast_ping_is_answered_in_slots(host):
+    assert all(reply.pause_s >= 0.003 for reply in host.replies(dxl2.BROADCAST, dxl2.PING))
+
+
+def test_baud_may_be_a_little_off(host):
+    assert len(host.ask(1, dxl2.PING, baud=1_020_000)) == 1 and host.ask(1, dxl2.PING, baud=921_600) == []

@@ -55,7 +55,7 @@ def test_process_ends_with_its_parent():
 
 
 def test_emulator_needs_no_heavy_library():
-    code = "import sys, sfms_robot.simulator.serve; print(*sys.modules)"
+    code = "import sys, sfms_robot.simulator.serve, sfms_robot.simulator.chain; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
     assert "sfms_robot.simulator.chain" in loaded
     assert not {"torch", "scipy", "numpy", "pydantic", "yaml"} & {*loaded}

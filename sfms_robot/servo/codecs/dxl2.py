@@ -116,6 +116,26 @@ def encode_fast_status(replies: Iterable[tuple[int, int, bytes]]) -> bytes:
     return out
 
 
+def split_fast_status(data: bytes | bytearray, length: int) -> list[tuple[int, int, bytes]]:
+    """(id, error, data) of each device in the answer to a fast sync read of `length` bytes.
+
+    `data` begins with the header. Where a device fell silent the packet stops short: those in front of the gap are
+    given, each proved by the crc it sent, and nothing of what is behind.
+    """
+    out: list[tuple[int, int, bytes]] = []
+    if not data.startswith(_HEADER + bytes([BROADCAST])) or data[7:8] != bytes([STATUS]):
+        return out
+    crc, at, size = crc16(data[:8]), 8, length + 2
+    while at + size + 2 <= len(data):
+        crc = crc16(data[at : at + size], crc)
+        if crc != data[at + size] | data[at + size + 1] << 8:
+            break
+        out.append((data[at + 1], data[at], bytes(data[at + 2 : at + size])))
+        crc = crc16(data[at + size : at + size + 2], crc)
+        at += size + 2
+    return out
+
+
 def _encode(servo: int, body: bytes) -> bytes:
     if len(body) + 9 > MAX_PACKET:
         raise PacketError(f"a packet of {len(body) + 9} bytes is longer than {MAX_PACKET}")
@@ -156,7 +176,7 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
             del buffer[0]
             continue
         del buffer[:total]
-        if _STUFFED in body:
+        if _STUFFED in body and not (servo == BROADCAST and body[0] == STATUS):  # a fast answer is not stuffed
             body = body.replace(_STUFFED, _LOOKALIKE)
         if body[0] == STATUS:
             return Packet(servo, STATUS, body[2:], body[1])

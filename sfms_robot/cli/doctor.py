@@ -1,0 +1,42 @@
+"""`sfms-robot doctor`: what is wrong with port, adapter and servos, and what to type against it."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+from enum import StrEnum
+
+import typer
+
+
+class Family(StrEnum):
+    dynamixel2 = "dynamixel2"
+    dynamixel1 = "dynamixel1"
+    feetech = "feetech"
+
+
+def doctor(
+    port: str | None = typer.Option(
+        None, help="Serial device, NAME=DEVICE per bus, or 'sim'. Default: the only one there is."
+    ),
+    head: str | None = typer.Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
+    baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: at all."),
+    family: Family = typer.Option(Family.dynamixel2, help="Without a head: how the servos speak."),
+    json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
+) -> None:
+    """Look before you run: port, adapter, every servo, wire budget. Reads only.
+
+    Exit code 0: fit to run. 3: the port cannot be opened. 4: a finding stops the head from running.
+    """
+    from sfms_robot.app.doctor import examine
+    from sfms_robot.app.servo_wire import real_clock
+    from sfms_robot.cli.servo_tables import bar, print_doctor
+
+    with bar("looking", hidden=json) as progress:
+        report = examine(port, head, family.value, baud, real_clock(), progress)
+    if json:
+        print(json_module.dumps(report))
+    else:
+        print_doctor(report)
+    if report["exit_code"]:
+        sys.exit(report["exit_code"])

@@ -1,0 +1,348 @@
+"""`sfms-robot servo`: find servos, look into them, change them."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sfms_robot.cli import servo_maps
+from sfms_robot.errors import BusError, ConfigError
+
+if TYPE_CHECKING:
+    from sfms_robot.app.servo_wire import Seen, Wire
+
+app = typer.Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
+app.command("maps")(servo_maps.maps)
+
+
+class Family(StrEnum):
+    dynamixel2 = "dynamixel2"
+    dynamixel1 = "dynamixel1"
+    feetech = "feetech"
+
+
+class Keep(StrEnum):
+    all = "all"
+    id = "keep-id"
+    id_and_baud = "keep-id-and-baud"
+
+
+Ids = Annotated[str, typer.Argument(metavar="ID", help="One id, or several: 1-9,12.")]
+PortOption = Annotated[
+    str | None, typer.Option("--port", help="Serial device, or 'sim'. Default: the only one there is.")
+]
+BaudOption = Annotated[int | None, typer.Option("--baud", min=1, help="Look at this rate only. Default: at all.")]
+FamilyOption = Annotated[Family, typer.Option("--family", help="How the servos speak.")]
+HeadOption = Annotated[str, typer.Option("--head", help="Which head's servos --port sim emulates.")]
+ModelOption = Annotated[
+    str | None, typer.Option("--model", help="Take the servos for this model. Default: by their model number.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, last line of stdout.")]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before EEPROM is written.")]
+
+
+@app.command()
+def scan(
+    ids: Annotated[str | None, typer.Option("--ids", help="Ask these one by one, as 1-9,12. Default: all.")] = None,
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Who is there, at which rate."""
+    from sfms_robot.app.servo_tools import parse_ids
+    from sfms_robot.app.servo_tools import scan as look
+
+    asked = parse_ids(ids) if ids is not None else None
+    with _wire(port, baud, family, head, model) as wire, _bar("scanning", hidden=json) as progress:
+        rows = [seen.row() for seen in look(wire, asked, progress)]
+        where = wire.port.name
+    _show(rows, {"port": where, "servos": rows}, json, f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}")
+
+
+@app.command()
+def ping(
+    ids: Ids,
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Whether servos answer, and who they are."""
+    rows: list[dict[str, Any]] = []
+    with _wire(port, baud, family, head, model) as wire:
+        for servo in _parsed(ids):
+            try:
+                rows.append({**wire.find(servo).row(), "answers": True})
+            except BusError:
+                rows.append({"id": servo, "model": None, "model_number": None, "firmware": None, "baud": None,
+                             "note": "", "answers": False})  # fmt: skip
+    _show(rows, {"servos": rows}, json)
+    if not all(row["answers"] for row in rows):
+        sys.exit(BusError.exit_code)
+
+
+@app.command()
+def read(
+    ids: Ids,
+    registers: Annotated[list[str], typer.Argument(metavar="REGISTER...", help="Names, or 'all'.")],
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Registers by name: raw and in their unit."""
+    from sfms_robot.app.servo_tools import read_registers
+
+    def look(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
+        return [{"id": seen.id, **value.row()} for value in read_registers(wire, seen, registers)]
+
+    _each(ids, _wire(port, baud, family, head, model), look, json, "registers")
+
+
+@app.command(context_settings={"ignore_unknown_options": True})
+def write(
+    ids: Ids,
+    register: Annotated[str, typer.Argument(help="Its name in the firmware map.")],
+    value: Annotated[str, typer.Argument(help="Raw number, or one with the register's unit: 90deg.")],
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    yes: YesOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Write a register and read it back. What lasts (EEPROM) is asked about first, and refused while torque is on."""
+    from sfms_robot.app.servo_tools import write_register
+
+    confirm = _confirm(yes, ids)
+
+    def change(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
+        before, after = write_register(wire, seen, register, value, confirm)
+        row = after.row()
+        return [{"id": seen.id, "register": row["register"], "before": before.raw if before else None,
+                 "raw": row["raw"], "value": row["value"], "unit": row["unit"]}]  # fmt: skip
+
+    _each(ids, _wire(port, baud, family, head, model), change, json, "written")
+
+
+@app.command("set-id")
+def set_id(
+    old: Annotated[int, typer.Argument(help="The id it has.")],
+    new: Annotated[int, typer.Argument(help="The id it gets.")],
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    in_chain: Annotated[bool, typer.Option("--in-chain", help="Other servos may be on the wire meanwhile.")] = False,
+    yes: YesOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Give a servo another id. Best with that one servo on the wire."""
+    from sfms_robot.app.servo_tools import set_id as change
+
+    _each(
+        str(old),
+        _wire(port, baud, family, head, model),
+        lambda wire, seen: [change(wire, seen, new, _confirm(yes), in_chain).row()],
+        json,
+        "servos",
+    )
+
+
+@app.command("set-baud")
+def set_baud(
+    ids: Ids,
+    rate: Annotated[int, typer.Argument(metavar="BAUD", help="The rate it gets, bits per second.")],
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    yes: YesOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Give servos another rate, and check that they answer at it."""
+    from sfms_robot.app.servo_tools import set_baud as change
+
+    confirm = _confirm(yes, ids)
+    _each(
+        ids,
+        _wire(port, baud, family, head, model),
+        lambda wire, seen: [change(wire, seen, rate, confirm).row()],
+        json,
+        "servos",
+    )
+
+
+@app.command()
+def reboot(
+    ids: Ids,
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    yes: YesOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Start servos over: torque goes off, latched hardware errors go away."""
+    from sfms_robot.app.servo_tools import reboot as restart
+
+    confirm = _confirm(yes, ids)
+    _each(
+        ids,
+        _wire(port, baud, family, head, model),
+        lambda wire, seen: [restart(wire, seen, confirm).row()],
+        json,
+        "servos",
+    )
+
+
+@app.command("factory-reset")
+def factory_reset(
+    servo: Annotated[int, typer.Argument(metavar="ID")],
+    keep: Annotated[Keep, typer.Option("--reset", help="What goes back to its factory value.")] = Keep.id_and_baud,
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    yes: YesOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Put a servo's settings back to what they were when it was new."""
+    from sfms_robot.app.servo_tools import factory_reset as reset
+
+    _each(
+        str(servo),
+        _wire(port, baud, family, head, model),
+        lambda wire, seen: [reset(wire, seen, keep.value, _confirm(yes)).row()],
+        json,
+        "servos",
+    )
+
+
+@app.command()
+def monitor(
+    ids: Annotated[str | None, typer.Argument(metavar="ID", help="1-9,12. Default: everybody.")] = None,
+    port: PortOption = None,
+    baud: BaudOption = None,
+    family: FamilyOption = Family.dynamixel2,
+    head: HeadOption = "face28",
+    model: ModelOption = None,
+    samples: Annotated[int | None, typer.Option(min=1, help="End after so many looks. Default: Ctrl-C ends.")] = None,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=50.0, help="Looks per second.")] = 5.0,
+    json: JsonOption = False,
+) -> None:
+    """Position, load, voltage, temperature and faults, live. Reads only."""
+    from sfms_robot.app.servo_state import samples as looks
+    from sfms_robot.app.servo_tools import scan as look
+
+    taken: list[list[dict[str, Any]]] = []
+    with _wire(port, baud, family, head, model) as wire:
+        asked = _parsed(ids) if ids is not None else None
+        with _bar("looking for servos", hidden=json) as progress:
+            servos = [wire.find(servo) for servo in asked] if asked is not None else look(wire, None, progress)
+        if not servos:
+            raise BusError(f"{wire.port.name}: nobody answers")
+        count = samples if samples is not None else 1 if json else None
+        if json:
+            taken = list(looks(wire, servos, 1.0 / rate, count))
+        else:
+            from sfms_robot.cli.servo_tables import live
+
+            live(
+                looks(wire, servos, 1.0 / rate, count),
+                f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends",
+            )
+    if json:
+        print(json_module.dumps({"samples": taken}))
+
+
+def _parsed(ids: str) -> list[int]:
+    from sfms_robot.app.servo_tools import parse_ids
+
+    return parse_ids(ids)
+
+
+@contextmanager
+def _wire(port: str | None, baud: int | None, family: Family, head: str, model: str | None) -> Iterator[Wire]:
+    from sfms_robot.app.servo_wire import open_wire, real_clock
+
+    with open_wire(port, family.value, baud, head, real_clock(), model) as wire:
+        yield wire
+
+
+def _each(
+    ids: str,
+    opened: Any,
+    work: Callable[[Wire, Seen], list[dict[str, Any]]],
+    json: bool,
+    key: str,
+) -> None:
+    """Do `work` for every id; what was done is shown even when a later one fails."""
+    rows: list[dict[str, Any]] = []
+    servos = _parsed(ids)
+    try:
+        with opened as wire:
+            for servo in servos:
+                rows += work(wire, wire.find(servo))
+    except Exception:
+        if rows and not json:
+            _show(rows, {}, json)
+        raise
+    _show(rows, {key: rows}, json)
+
+
+def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, title: str | None = None) -> None:
+    if json:
+        print(json_module.dumps(result))
+        return
+    from sfms_robot.cli.servo_tables import print_table
+
+    print_table([_for_people(row) for row in rows], title)
+
+
+def _for_people(row: dict[str, Any]) -> dict[str, Any]:
+    """A register in fewer columns; any other row as it is."""
+    if "area" not in row:
+        return row
+    takes = None if row["min"] is None else f"{row['min']}..{row['max']}"
+    kept = {key: row[key] for key in ("id", "register", "raw", "value", "unit")}
+    return {**kept, "takes": takes, "kept in": f"{row['area']} ({row['access']})"}
+
+
+def _bar(text: str, hidden: bool) -> Any:
+    from sfms_robot.cli.servo_tables import bar
+
+    return bar(text, hidden)
+
+
+def _confirm(yes: bool, ids: str = "") -> Callable[[str], bool]:
+    """Ask once: a yes holds for the same change to the other servos of the command."""
+    alike = f" and the same for all of {ids}" if len(_parsed(ids or "0")) > 1 else ""
+    said: list[bool] = [True] if yes else []
+
+    def ask(question: str) -> bool:
+        if not said:
+            if not sys.stdin.isatty():
+                raise ConfigError(f"{question}: nobody is there to ask, say --yes")
+            said.append(typer.confirm(f"{question}{alike}. Do it?", err=True))
+        return said[0]
+
+    return ask

@@ -1,0 +1,192 @@
+"""Pololu Maestro serial commands: values in, bytes out, and back. Opens no port.
+
+1. A command byte has its top bit set, data bytes do not; so a reader that lost its place finds it again at the next
+   command byte. Words of 14 bits travel low seven bits first. (The one exception, Mini SSC, takes 0..254.)
+2. Compact protocol: command, data. Pololu protocol, for several boards on one wire: AA, device number, command
+   without its top bit, data. With CRC enabled on the board, either is followed by one CRC-7 byte.
+3. Targets and positions are in quarter microseconds of pulse; target 0 switches the pulses off.
+4. A board that detects its baud rate hears nothing before the byte AA.
+5. Only two bytes or one ever come back, without any frame: to `GET_POSITION`, `GET_MOVING` and `GET_ERRORS`.
+
+Source: Pololu Maestro Servo Controller User's Guide, pololu.com/docs/0J40, sections 4.b and 5.c to 5.f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+SET_TARGET: Final = 0x84
+SET_SPEED: Final = 0x87
+SET_ACCELERATION: Final = 0x89
+GET_POSITION: Final = 0x90
+GET_MOVING: Final = 0x93
+SET_TARGETS: Final = 0x9F  # the 12, 18 and 24 channel boards only
+GET_ERRORS: Final = 0xA1
+GO_HOME: Final = 0xA2
+MINI_SSC: Final = 0xFF
+
+BAUD_INDICATION: Final = 0xAA
+DEFAULT_DEVICE: Final = 12
+OFF: Final = 0  # the target that switches pulses off
+MAX_WORD: Final = 0x3FFF
+FACTORY_PULSE_US: Final = (
+    992,
+    2000,
+)  # of every channel; wider ones are set over USB, and a board keeps to them silently
+
+# Bits of the error register.
+SIGNAL_ERROR: Final = 1 << 0
+CRC_ERROR: Final = 1 << 3
+PROTOCOL_ERROR: Final = 1 << 4
+TIMEOUT_ERROR: Final = 1 << 5
+WIRE_ERRORS: Final = 0x1F  # bytes were lost or damaged on the way: nothing is wrong with the board itself
+
+_DATA_LENGTH: Final = {
+    SET_TARGET: 3,
+    SET_SPEED: 3,
+    SET_ACCELERATION: 3,
+    GET_POSITION: 1,
+    GET_MOVING: 0,
+    GET_ERRORS: 0,
+    GO_HOME: 0,
+    MINI_SSC: 2,
+}
+
+
+class Command(NamedTuple):
+    """One command as a board takes it. `error` is a bit of the error register when it cannot be obeyed, else 0."""
+
+    code: int
+    data: bytes = b""
+    error: int = 0
+
+
+def crc7(data: bytes) -> int:
+    """CRC-7, polynomial 0x91, low bit first."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc ^ 0x91) >> 1 if crc & 1 else crc >> 1
+    return crc
+
+
+def word(value: int) -> bytes:
+    """14 bits as two data bytes. Raises ValueError for what does not fit."""
+    if not 0 <= value <= MAX_WORD:
+        raise ValueError(f"{value} does not fit the 14 bits of a Maestro command")
+    return bytes([value & 0x7F, value >> 7])
+
+
+def from_word(data: bytes) -> int:
+    """Inverse of `word`."""
+    return data[0] | data[1] << 7
+
+
+def set_target(channel: int, quarter_us: int) -> bytes:
+    return bytes([SET_TARGET, channel]) + word(quarter_us)
+
+
+def set_targets(first: int, quarter_us: Sequence[int]) -> bytes:
+    """Targets of consecutive channels from `first` on, in one command."""
+    return bytes([SET_TARGETS, len(quarter_us), first]) + b"".join(map(word, quarter_us))
+
+
+def set_speed(channel: int, speed: int) -> bytes:
+    """`speed` in quarter microseconds per 10 ms; 0 = no limit."""
+    return bytes([SET_SPEED, channel]) + word(speed)
+
+
+def set_acceleration(channel: int, acceleration: int) -> bytes:
+    """`acceleration` 0..255 in quarter microseconds per 10 ms per 80 ms; 0 = no limit."""
+    return bytes([SET_ACCELERATION, channel]) + word(acceleration)
+
+
+def get_position(channel: int) -> bytes:
+    """Answered by two bytes, low byte first: the pulse sent now, in quarter microseconds; 0 = none."""
+    return bytes([GET_POSITION, channel])
+
+
+def get_moving() -> bytes:
+    """Answered by one byte: 1 while a speed or acceleration limit holds some channel back from its target."""
+    return bytes([GET_MOVING])
+
+
+def get_errors() -> bytes:
+    """Answered by two bytes, low byte first: the error register, which this clears."""
+    return bytes([GET_ERRORS])
+
+
+def go_home() -> bytes:
+    return bytes([GO_HOME])
+
+
+def mini_ssc(channel: int, value: int) -> bytes:
+    """`value` 0..254 around the neutral 127."""
+    return bytes([MINI_SSC, channel, value])
+
+
+def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
+    """A compact command in the Pololu protocol, for one of several boards on a wire."""
+    return bytes([BAUD_INDICATION, device, command[0] & 0x7F]) + command[1:]
+
+
+def with_crc(command: bytes) -> bytes:
+    """A command for a board on which CRC is enabled."""
+    return command + bytes([crc7(command)])
+
+
+def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = False) -> Command | None:
+    """Take the next command for board `device` off the front of `buffer`, or None: more bytes are needed.
+
+    What a board would call an error comes as a Command with `error` set and the offending bytes removed. Commands to
+    other boards are dropped silently. What stays in the buffer after None is at most one unfinished command.
+    """
+    while buffer:
+        code, start = buffer[0], 1
+        if code < 0x80:
+            del buffer[0]
+            return Command(code, error=PROTOCOL_ERROR)
+        if code == BAUD_INDICATION:
+            if len(buffer) < 2:
+                return None
+            if buffer[1] >= 0x80:  # a second indication, or one sent alone
+                del buffer[0]
+                continue
+            if len(buffer) < 3:
+                return None
+            code, start = buffer[2] | 0x80, 3
+            if buffer[2] >= 0x80:
+                del buffer[:2]
+                return Command(BAUD_INDICATION, error=PROTOCOL_ERROR)
+        end = _end(buffer, code, start)
+        if end is None:
+            return None
+        if end < 0:
+            del buffer[:start]
+            return Command(code, error=PROTOCOL_ERROR)
+        end += crc
+        cut = next((i for i in range(start, min(end, len(buffer))) if code != MINI_SSC and buffer[i] >= 0x80), None)
+        if cut is not None:  # another command interrupts this one
+            del buffer[:cut]
+            return Command(code, error=PROTOCOL_ERROR)
+        if len(buffer) < end:
+            return None
+        whole, other = bytes(buffer[:end]), start == 3 and buffer[1] != device
+        del buffer[:end]
+        if other:
+            continue
+        if crc and crc7(whole[:-1]) != whole[-1]:
+            return Command(code, error=CRC_ERROR)
+        return Command(code, whole[start : end - crc])
+    return None
+
+
+def _end(buffer: bytearray, code: int, start: int) -> int | None:
+    """Where the data of a command end; None when that is not known yet, -1 when nobody knows the command."""
+    if code != SET_TARGETS:
+        return start + _DATA_LENGTH[code] if code in _DATA_LENGTH else -1
+    if len(buffer) <= start:
+        return None
+    return start + 2 + 2 * (buffer[start] & 0x7F)

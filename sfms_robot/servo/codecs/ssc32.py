@@ -1,0 +1,136 @@
+r"""Lynxmotion SSC-32 and SSC-32U text commands: values in, bytes out, and back. Opens no port.
+
+    #5 P1600 S750 #10 P750 T2500 \r     channels 5 and 10 move; S in us/s per channel, T in ms for the whole group
+    #5 L \r                             output low: no pulses, the servo goes limp
+    Q \r, QP 5 7 \r, VER \r             "." or "+" (still moving); one byte per channel in 10 us; a line of text
+
+Letters of either case, spaces anywhere, a carriage return ends the command and ESC throws away what came before it.
+
+Sources: Lynxmotion SSC-32U User Guide, "Servo Move or Group Move" and "Advanced Functions"; that `L` stops the pulses
+of a servo: community.robotshop.com/forum/t/ssc32-re-startup-condition/19731.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+CHANNELS: Final = 32
+MIN_PULSE_US: Final = 500
+MAX_PULSE_US: Final = 2500
+MAX_TIME_MS: Final = 65535
+MAX_LINE: Final = 1024  # bytes; a longer line is rubbish, and bounds what a reader holds
+DONE: Final = b"."
+MOVING: Final = b"+"
+
+_CR: Final = 0x0D
+_ESC: Final = 0x1B
+_ITEM: Final = re.compile(r"#(\d{1,2})(?:P(\d{1,5})(?:S(\d{1,5}))?|([HL]))")
+_GROUP: Final = re.compile(r"((?:#\d{1,2}(?:P\d{1,5}(?:S\d{1,5})?|[HL]))+)(?:T(\d{1,5}))?")
+_QUERY: Final = re.compile(r"QP\s*\d{1,2}(?:\s+\d{1,2})*")
+
+
+class Move(NamedTuple):
+    """A pulse width, and the speed with which to go there, us/s; 0 = as fast as it can."""
+
+    pulse_us: int
+    speed_us_s: int = 0
+
+
+@dataclass(frozen=True)
+class Group:
+    """Channels that move together within `time_ms` (0 = at once), and outputs set high or low."""
+
+    moves: Mapping[int, Move]
+    time_ms: int = 0
+    levels: Mapping[int, bool] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Query:
+    """`kind` is Q, QP (with `channels`) or VER."""
+
+    kind: str
+    channels: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A line that is no command."""
+
+    line: bytes
+
+
+def group_move(moves: Mapping[int, Move], time_ms: int = 0) -> bytes:
+    """One command for all of `moves` (channel -> move), in its order; they start and stop together in `time_ms`.
+
+    Written without spaces: at 9600 baud each costs a millisecond.
+    """
+    for channel, move in moves.items():
+        if not MIN_PULSE_US <= move.pulse_us <= MAX_PULSE_US:
+            raise ValueError(
+                f"channel {channel}: {move.pulse_us} us is outside {MIN_PULSE_US}..{MAX_PULSE_US} us of an SSC-32"
+            )
+    text = "".join(
+        f"#{channel}P{move.pulse_us}" + (f"S{move.speed_us_s}" if move.speed_us_s else "")
+        for channel, move in moves.items()
+    )
+    return (text + (f"T{min(time_ms, MAX_TIME_MS)}" if time_ms else "") + "\r").encode()
+
+
+def outputs_low(channels: Sequence[int]) -> bytes:
+    """No more pulses on `channels`."""
+    return ("".join(f"#{channel}L" for channel in channels) + "\r").encode()
+
+
+def query_moving() -> bytes:
+    """Answered by `DONE` or `MOVING`."""
+    return b"Q\r"
+
+
+def query_pulse(channel: int) -> bytes:
+    """Answered by one byte: the pulse in 10 us."""
+    return f"QP{channel}\r".encode()
+
+
+def maybe_command(buffer: bytearray) -> Group | Query | Unknown | None:
+    """Take the first whole command off the front of `buffer`, or None: more bytes are needed.
+
+    An endless line is given back as Unknown in pieces of `MAX_LINE` bytes.
+    """
+    end = buffer.find(_CR)
+    escape = buffer.rfind(_ESC, 0, end if end >= 0 else len(buffer))
+    if escape >= 0:
+        del buffer[: escape + 1]
+        end = buffer.find(_CR)
+    if end < 0:
+        if len(buffer) < MAX_LINE:
+            return None
+        end = MAX_LINE - 1
+    line = bytes(buffer[:end])
+    del buffer[: end + 1]
+    return _parsed(line)
+
+
+def _parsed(line: bytes) -> Group | Query | Unknown:
+    spaced = line.decode("ascii", "replace").upper().strip()
+    text = re.sub(r"\s+", "", spaced)
+    if text in ("Q", "VER"):
+        return Query(text)
+    if _QUERY.fullmatch(spaced):
+        channels = tuple(int(number) for number in re.findall(r"\d+", spaced))
+        return Query("QP", channels) if max(channels) < CHANNELS else Unknown(line)
+    whole = _GROUP.fullmatch(text)
+    if whole is None:
+        return Unknown(line)
+    moves, levels = {}, {}
+    for channel, pulse, speed, level in _ITEM.findall(whole[1]):
+        if int(channel) >= CHANNELS:
+            return Unknown(line)
+        if level:
+            levels[int(channel)] = level == "H"
+        else:
+            moves[int(channel)] = Move(int(pulse), int(speed or 0))
+    return Group(moves, int(whole[2] or 0), levels)

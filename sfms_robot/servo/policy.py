@@ -1,0 +1,85 @@
+"""What a joint's servo is allowed, and what its troubles lead to: faults and loads judged without a wire.
+
+A servo reports faults as bits, told by the alert bit of every answer. Not all of them are trouble: a head that runs
+at 7.2 V has the voltage alert set for good. So a fault may be masked, or count only when what is measured lies
+outside a threshold of the head's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from sfms_robot.config import Faults, FirmwareMap, LoadRule, Safety
+
+PINCH_SHARE: Final = 0.6  # of the servo's own current limit
+PINCH_S: Final = 0.5
+
+
+@dataclass(frozen=True)
+class BusServo:
+    """One servo of a bus and the joint it moves; the limits are those of the joint."""
+
+    joint: str
+    id: int
+    map: FirmwareMap
+    min_rad: float
+    max_rad: float
+    safety: Safety = field(default_factory=Safety)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is known of one servo beside its fault bits; None where it was not read yet."""
+
+    voltage_V: float | None = None
+    temperature_C: float | None = None
+
+
+def counts(name: str, faults: Faults, seen: Measured) -> bool:
+    """Whether fault `name` is acted upon. A threshold whose quantity is not known yet does not excuse it."""
+    if name in faults.mask:
+        return False
+    threshold = faults.thresholds.get(name)
+    value = {"input voltage": seen.voltage_V, "overheating": seen.temperature_C}.get(name)
+    if threshold is None or value is None:
+        return True
+    low = threshold.min is not None and value < threshold.min
+    high = threshold.max is not None and value > threshold.max
+    return low or high
+
+
+def load_rules(servo: BusServo) -> list[tuple[str, LoadRule]]:
+    """The rules of a joint, named; none where its servo cannot tell its current."""
+    if "present_current" not in servo.map.registers:
+        return []
+    rules = [("pinched", servo.safety.pinch), ("under load too long", servo.safety.strain)]
+    limit = servo.map.registers.get("current_limit")
+    if servo.safety.pinch is None and limit is not None and limit.initial:
+        own = LoadRule(current_mA=PINCH_SHARE * limit.initial * limit.scale, for_s=PINCH_S, then="limp")
+        rules[0] = ("pinched", own)
+    return [(name, rule) for name, rule in rules if rule is not None]
+
+
+class LoadWatch:
+    """Since when each rule of each joint is broken. Currents may come at any pace."""
+
+    def __init__(self, servos: Sequence[BusServo]) -> None:
+        self._rules = [[(name, rule.current_mA, rule.for_s, rule) for name, rule in load_rules(s)] for s in servos]
+        self._since_s: list[dict[str, float]] = [{} for _ in servos]
+        self.lowest_mA = [min((current for _, current, _, _ in rules), default=float("inf")) for rules in self._rules]
+
+    def step(self, index: int, current_mA: float, now_s: float) -> tuple[str, LoadRule] | None:
+        """Take one current; the rule that is broken for long enough, once."""
+        since = self._since_s[index]
+        for name, limit_mA, for_s, rule in self._rules[index]:
+            if abs(current_mA) <= limit_mA:
+                since.pop(name, None)
+            elif now_s - since.setdefault(name, now_s) >= for_s:
+                since.clear()
+                return name, rule
+        return None
+
+    def pending(self, index: int) -> bool:
+        return bool(self._since_s[index])

@@ -1,0 +1,76 @@
+"""A port that knows when its bytes have left, and questions on it whose answers have no frame.
+
+On a wire of 9600 baud a command is on its way for a fifth of a second while `write` has long returned. Whoever sends
+more before that only fills a buffer; so the wire says until when it is busy.
+"""
+
+from __future__ import annotations
+
+from sfms_robot.servo.port import Port
+
+_CHUNK = 4096
+
+
+class SlowWire:
+    """One open port; the wire owns it.
+
+    Args:
+        patience_s: how long an answer may take beyond the time of its bytes.
+
+    Attributes:
+        busy_until_s: when the last byte sent will have left.
+        listening: a question is open.
+    """
+
+    def __init__(self, port: Port, baud: int, patience_s: float) -> None:
+        self.port = port
+        self.busy_until_s = port.now_s()
+        self.listening = False
+        self._byte_s = 10.0 / baud
+        self._patience_s = patience_s
+        self._answer = bytearray()
+        self._length = 0
+        self._until_s = 0.0
+
+    @property
+    def free(self) -> bool:
+        return self.port.now_s() >= self.busy_until_s
+
+    def send(self, data: bytes) -> float:
+        """When the first of these bytes leaves. Raises BusError when the port is gone, as all here do."""
+        start_s = max(self.port.now_s(), self.busy_until_s)
+        self.port.write(data)
+        self.busy_until_s = start_s + len(data) * self._byte_s
+        return start_s
+
+    def wait(self, until_s: float) -> None:
+        """Block. What comes in meanwhile answers nothing."""
+        while self.port.now_s() < until_s and self.port.read(_CHUNK, until_s):
+            pass
+
+    def question(self, request: bytes, length: int) -> None:
+        """Ask for `length` bytes; `heard` says what came."""
+        self.port.discard_input()
+        self.send(request)
+        self.listening = True
+        self._answer.clear()
+        self._length = length
+        self._until_s = self.busy_until_s + length * self._byte_s + self._patience_s
+
+    def heard(self, block: bool = False) -> bytes | None:
+        """The answer; b"" when it did not come, or has another length; None while it may still come."""
+        deadline_s = self._until_s if block else self.port.now_s()
+        while len(self._answer) < self._length and (data := self.port.read(_CHUNK, deadline_s)):
+            self._answer += data
+        if len(self._answer) < self._length and not block and self.port.now_s() < self._until_s:
+            return None
+        self.listening = False
+        return bytes(self._answer) if len(self._answer) == self._length else b""
+
+    def ask(self, request: bytes, length: int) -> bytes | None:
+        """Question and answer in one; None when there is none."""
+        self.question(request, length)
+        return self.heard(block=True) or None
+
+    def close(self) -> None:
+        self.port.close()

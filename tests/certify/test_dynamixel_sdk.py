@@ -1,0 +1,123 @@
+"""ROBOTIS' own Python SDK, with its own port: what its examples do."""
+
+import pytest
+from dynamixel_sdk import (
+    BROADCAST_ID,
+    COMM_RX_TIMEOUT,
+    COMM_SUCCESS,
+    GroupBulkRead,
+    GroupBulkWrite,
+    GroupSyncRead,
+    GroupSyncWrite,
+    PortHandler,
+    Protocol1PacketHandler,
+    Protocol2PacketHandler,
+)
+
+from sfms_robot.simulator.launch import EmulatedServo
+
+IDS = (1, 2, 3)
+NO_ERROR = (COMM_SUCCESS, 0)
+
+
+@pytest.fixture(params=["instant", "wire"])
+def bench(plugged_in, request):
+    """(port, packet handler, chain) with three servos."""
+    servos = [EmulatedServo(i, start_ticks=2000 + i) for i in IDS]
+    chain = plugged_in(servos, timing=request.param)
+    port = PortHandler(chain.device)
+    assert port.openPort() and port.setBaudRate(1_000_000)
+    yield port, Protocol2PacketHandler(), chain
+    port.closePort()
+
+
+def test_ping_and_broadcast_ping(bench, again):
+    port, sdk, _ = bench
+    assert again(lambda: sdk.ping(port, 2), lambda a: a[1] == COMM_SUCCESS) == (1200, COMM_SUCCESS, 0)
+    found = again(lambda: sdk.broadcastPing(port), lambda a: len(a[0]) == 3, tries=3)
+    assert found[0] == {i: [1200, 53] for i in IDS}
+
+
+def test_sync_write_and_all_sync_reads(bench, again):
+    port, sdk, _ = bench
+    for servo in IDS:
+        assert again(lambda i=servo: sdk.write1ByteTxRx(port, i, 64, 1), lambda a: a == NO_ERROR)
+    write, read = GroupSyncWrite(port, sdk, 116, 4), GroupSyncRead(port, sdk, 132, 4)
+    for servo in IDS:
+        assert write.addParam(servo, list((2100 + servo).to_bytes(4, "little")))
+        assert read.addParam(servo)
+    assert write.txPacket() == COMM_SUCCESS
+
+    def positions():
+        return [read.getData(i, 132, 4) for i in IDS]
+
+    wanted = [2101, 2102, 2103]
+    again(read.txRxPacket, lambda result: result == COMM_SUCCESS and positions() == wanted)
+    again(read.fastSyncRead, lambda result: result == COMM_SUCCESS and positions() == wanted)
+
+
+def test_bulk_write_and_all_bulk_reads(bench, again):
+    port, sdk, _ = bench
+    write, read = GroupBulkWrite(port, sdk), GroupBulkRead(port, sdk)
+    assert write.addParam(1, 65, 1, [1]) and write.addParam(2, 84, 2, [0xBC, 0x02])
+    assert read.addParam(1, 65, 1) and read.addParam(2, 84, 2) and read.addParam(3, 132, 4)
+    assert write.txPacket() == COMM_SUCCESS
+
+    def data():
+        return [read.getData(1, 65, 1), read.getData(2, 84, 2), read.getData(3, 132, 4)]
+
+    again(read.txRxPacket, lambda result: result == COMM_SUCCESS and data() == [1, 700, 2003])
+    again(read.fastBulkRead, lambda result: result == COMM_SUCCESS and data() == [1, 700, 2003])
+
+
+def test_registered_write_action_clear_reboot_and_factory_reset(bench, again):
+    port, sdk, _ = bench
+    again(lambda: sdk.regWriteTxRx(port, 1, 65, 1, [1]), lambda a: a == NO_ERROR)
+    assert again(lambda: sdk.read1ByteTxRx(port, 1, 65), lambda a: a[1] == COMM_SUCCESS) == (0, COMM_SUCCESS, 0)
+    sdk.action(port, BROADCAST_ID)  # to one id it would be answered, and the SDK does not read that answer
+    assert again(lambda: sdk.read1ByteTxRx(port, 1, 65), lambda a: a[1] == COMM_SUCCESS)[0] == 1
+    again(lambda: sdk.clearMultiTurn(port, 1), lambda a: a == NO_ERROR)
+    sdk.reboot(port, 1)
+    again(lambda: sdk.read1ByteTxRx(port, 1, 65), lambda a: a == (0, COMM_SUCCESS, 0))
+    again(lambda: sdk.write1ByteTxRx(port, 1, 9, 7), lambda a: a == NO_ERROR)
+    sdk.factoryReset(port, 1, 0x02)
+    again(lambda: sdk.read1ByteTxRx(port, 1, 9), lambda a: a == (250, COMM_SUCCESS, 0))
+
+
+def test_refusals_and_the_alert_come_through(bench, again):
+    port, sdk, chain = bench
+    again(lambda: sdk.write1ByteTxRx(port, 1, 64, 1), lambda a: a == NO_ERROR)
+    refused = again(lambda: sdk.write1ByteTxRx(port, 1, 9, 0), lambda a: a[0] == COMM_SUCCESS)
+    assert sdk.getRxPacketError(refused[1]) == "[RxPacketError] Writing or Reading is not available to target address!"
+    chain.fault(2, 1 << 5)
+    alert = again(lambda: sdk.ping(port, 2), lambda a: a[1] == COMM_SUCCESS)
+    assert alert[2] == 0x80
+
+
+@pytest.mark.parametrize("baud", [57_600, 2_000_000])
+def test_another_baud_is_silence_until_the_servo_has_it_too(plugged_in, again, baud):
+    chain = plugged_in([EmulatedServo(1)])
+    port, sdk = PortHandler(chain.device), Protocol2PacketHandler()
+    assert port.openPort() and port.setBaudRate(baud)
+    assert sdk.ping(port, 1)[1] == COMM_RX_TIMEOUT
+    assert port.setBaudRate(1_000_000)
+    again(lambda: sdk.write1ByteTxRx(port, 1, 8, {57_600: 1, 2_000_000: 4}[baud]), lambda a: a == NO_ERROR)
+    assert sdk.ping(port, 1)[1] == COMM_RX_TIMEOUT
+    assert port.setBaudRate(baud)
+    again(lambda: sdk.ping(port, 1), lambda a: a == (1200, COMM_SUCCESS, 0))
+    port.closePort()
+
+
+def test_two_protocols_on_one_cable(plugged_in, again):
+    """As in the SDK's example protocol_combined.py."""
+    chain = plugged_in([EmulatedServo(1), EmulatedServo(20, model="ax-12a", start_ticks=400, firmware=24)])
+    port = PortHandler(chain.device)
+    assert port.openPort() and port.setBaudRate(1_000_000)
+    old, new = Protocol1PacketHandler(), Protocol2PacketHandler()
+    again(lambda: new.ping(port, 1), lambda a: a == (1200, COMM_SUCCESS, 0))
+    again(lambda: old.ping(port, 20), lambda a: a == (12, COMM_SUCCESS, 0))
+    again(lambda: old.write1ByteTxRx(port, 20, 24, 1), lambda a: a == NO_ERROR)
+    again(lambda: old.write2ByteTxRx(port, 20, 30, 450), lambda a: a == NO_ERROR)
+    again(lambda: old.read2ByteTxRx(port, 20, 36), lambda a: a == (450, COMM_SUCCESS, 0))
+    again(lambda: new.read4ByteTxRx(port, 1, 132), lambda a: a == (2048, COMM_SUCCESS, 0))
+    port.closePort()

@@ -1,0 +1,301 @@
+"""What every bus promises, whatever its family: the same tests for all of them.
+
+On emulated servos in virtual time; with `--port FAMILY=DEVICE` those that need no helping hand run on real ones, too.
+"""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from families import FAMILIES, LIMIT_RAD
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rig import emulated
+
+from sfms_robot.errors import BusError, ServoError
+
+STATISTICS = {"writes", "reads", "errors", "retries", "reconnects", "silent", "faults"}
+WIRE_FAULTS = ("drop=0.1", "corrupt=0.1", "truncate=0.1", "duplicate=0.3", "noise=0.3", "delay=0.03")
+TOLD = {
+    "current_mA": "current",
+    "load_percent": "torque",
+    "velocity_rad_s": "velocity",
+    "voltage_V": "voltage",
+    "temperature_C": "temperature",
+}
+
+
+def near(angles_rad, rig):
+    """Equal but for rounding; a real servo also stops a little short of its goal."""
+    slack_rad = 3 * rig.family.conversion.rad_per_tick if rig.chain is not None else 0.03
+    return pytest.approx(angles_rad, abs=slack_rad)
+
+
+def test_joints_are_in_the_order_of_the_servos(rig):
+    assert list(rig.bus.joints) == [f"joint{i}" for i in rig.ids]
+    assert set(rig.bus.capabilities) == set(rig.bus.joints)
+
+
+def test_nothing_goes_before_connect(rig):
+    with pytest.raises(BusError, match="not connected"):
+        rig.bus.poll(rig.now_s)
+    with pytest.raises((BusError, ValueError)):
+        rig.bus.write(np.zeros(len(rig.ids)), rig.now_s)
+
+
+def test_goals_are_refused_before_enable(rig):
+    rig.bus.connect()
+    rig.bus.poll(rig.now_s)
+    mark = len(rig.line.sent)
+    with pytest.raises(ValueError, match="no joint is enabled"):
+        rig.bus.write(np.zeros(len(rig.ids)), rig.now_s)
+    assert len(rig.line.sent) == mark
+
+
+def test_bad_goal_is_refused_with_nothing_sent(rig):
+    goals = rig.hold()
+    mark = len(rig.line.sent)
+    for bad in (math.nan, math.inf, -math.inf, LIMIT_RAD + 0.01, -LIMIT_RAD - 0.01):
+        goals[-1] = bad
+        with pytest.raises(ValueError, match=rig.bus.joints[-1]):
+            rig.bus.write(goals, rig.now_s)
+    with pytest.raises(ValueError, match=f"{len(rig.ids)} joints"):
+        rig.bus.write(goals[:-1], rig.now_s)
+    assert len(rig.line.sent) == mark
+
+
+def test_torque_comes_on_without_a_jump_where_the_position_is_known(rig):
+    rig.bus.connect()
+    before = rig.polls(2)
+    held = rig.bus.enable(rig.bus.joints)
+    assert np.isfinite(held).all()
+    after = rig.polls(20, 0.05)
+    if rig.tells("position"):
+        assert [r.position_rad for r in before.values()] == near(held, rig)
+        assert [r.position_rad for r in after.values()] == near(held, rig)
+
+
+def test_goal_held_at_enable_may_be_sent(rig):
+    held = rig.hold()
+    rig.ticks(held, 3)
+
+
+def test_goal_is_reached(rig):
+    held = rig.hold()
+    goals = held - np.copysign(0.1, held)
+    readings = rig.ticks(goals, 60)
+    if rig.tells("position"):
+        assert [r.position_rad for r in readings.values()] == near(goals, rig)
+    if rig.chain is not None:
+        assert rig.shafts_rad() == near(goals, rig)
+
+
+def test_nothing_is_reported_that_the_family_does_not_tell(rig):
+    held = rig.hold()
+    readings = rig.ticks(held, 40)
+    for joint, reading in readings.items():
+        told = rig.bus.capabilities[joint]
+        assert (reading.position_rad is None) == ("position" not in told)
+        assert math.isinf(reading.age_s) == ("position" not in told)
+        assert {TOLD[key] for key in reading.extra} <= told
+
+
+def test_statistics_have_the_keys_of_the_report(rig):
+    held = rig.hold()
+    rig.ticks(held, 3)
+    counts = rig.bus.statistics()
+    assert set(counts) >= STATISTICS
+    assert counts["silent"] == [] and counts["writes"] >= 1
+
+
+def test_stop_may_be_called_at_any_time_and_again(rig):
+    rig.bus.stop("release")
+    held = rig.hold()
+    rig.bus.stop("release")
+    rig.bus.stop("hold")
+    rig.bus.stop("release")
+    with pytest.raises(ValueError, match="no joint is enabled"):
+        rig.bus.write(held, rig.now_s)
+
+
+def test_close_may_be_called_at_any_time_and_again(rig):
+    rig.bus.close()
+    rig.hold()
+    rig.bus.close()
+    rig.bus.close()
+    rig.bus.stop("release")
+    with pytest.raises(BusError, match="not connected"):
+        rig.bus.poll(rig.now_s)
+
+
+def test_bus_connects_again_after_close(rig):
+    first = rig.hold()
+    rig.bus.stop("release")
+    rig.bus.close()
+    assert rig.hold() == near(first, rig)
+    rig.ticks(first, 3)
+
+
+@pytest.mark.emulated
+def test_goals_move_nothing_that_is_not_enabled(rig):
+    rig.bus.connect()
+    held = rig.bus.enable(rig.bus.joints[:2])
+    before = rig.shafts_rad()
+    goals = np.zeros(4)
+    goals[:2] = held
+    rig.ticks(goals, 30)
+    assert rig.torques() == [True, True, False, False]
+    assert rig.shafts_rad()[2:] == pytest.approx(before[2:])
+
+
+@pytest.mark.emulated
+def test_release_takes_the_torque_away_and_hold_leaves_it(rig):
+    rig.hold()
+    rig.bus.stop("hold")
+    assert all(rig.torques())
+    rig.bus.stop("release")
+    assert not any(rig.torques())
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("place", [0, 2])
+def test_dead_servo_leaves_the_others_fresh_and_its_own_reading_grows_old(rig, place):
+    held = rig.hold()
+    rig.ticks(held, 10)
+    if not rig.tells("position"):
+        rig.chain.kill(rig.ids[place])
+        assert len(rig.ticks(held, 10)) == 4
+        return
+    rig.chain.kill(rig.ids[place])
+    rig.ticks(held, 10)
+    dead, ages = rig.bus.joints[place], []
+    for _ in range(20):
+        readings = rig.ticks(held, 1)
+        ages.append(readings[dead].age_s)
+        assert all(r.age_s <= 5 * 0.02 for joint, r in readings.items() if joint != dead)
+    assert np.diff(ages) == pytest.approx(0.02)
+    assert rig.bus.statistics()["silent"] == [rig.ids[place]]
+    rig.chain.revive(rig.ids[place])
+    assert rig.ticks(held, 150)[dead].age_s < 0.2
+    assert rig.bus.statistics()["silent"] == []
+
+
+@pytest.mark.emulated
+def test_stop_completes_with_any_servos_dead(rig):
+    for count in (1, 3, 4):
+        for dead in itertools.combinations(range(4), count):
+            rig.hold()
+            for place in dead:
+                rig.chain.kill(rig.ids[place])
+            rig.bus.stop("release")
+            rig.bus.stop("release")
+            torques = rig.torques()
+            reached = [torques[place] for place in range(4) if place not in dead]
+            assert not any(reached), f"dead: {dead}"
+            rig.bus.close()
+            for servo in rig.ids:
+                rig.chain.revive(servo)
+            rig.clock.wait_until(rig.now_s + 0.5)
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("family", [name for name, family in FAMILIES.items() if family.other])
+def test_wrong_model_is_named_where_the_family_can_tell(family):
+    other = FAMILIES[family].other
+    with emulated(family, model=other) as rig:
+        with pytest.raises(ServoError, match=rf"joint1 \(id 1\).*{FAMILIES[family].model}"):
+            rig.bus.connect()
+
+
+@pytest.mark.emulated
+def test_nobody_there_is_an_error_that_names_the_baud_rate(rig):
+    for servo in rig.ids:
+        rig.chain.kill(servo)
+    with pytest.raises(BusError, match=rf"bus 'face'.* at {rig.family.baud} baud: no"):
+        rig.bus.connect()
+
+
+@pytest.mark.emulated
+@settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(noise=st.lists(st.binary(min_size=1, max_size=200), max_size=12))
+def test_random_bytes_on_the_wire_neither_hang_nor_raise(rig, noise):
+    rig.bus.close()
+    held = rig.hold()
+    for chunk in noise:
+        rig.line.noise.append(chunk)
+        rig.ticks(held, 1)
+    rig.line.noise.clear()
+    readings = rig.ticks(held, 120)
+    if rig.tells("position"):
+        assert [r.position_rad for r in readings.values()] == near(held, rig)
+        assert all(r.age_s < 0.2 for r in readings.values())
+    assert rig.bus.statistics()["silent"] == []
+    rig.bus.stop("release")
+
+
+@pytest.mark.emulated
+def test_faults_on_the_wire_neither_raise_nor_make_old_readings_new(rig):
+    held = rig.hold()
+    rig.ticks(held, 5)
+    goals = held - np.copysign(0.1, held)
+    for k, fault in enumerate(WIRE_FAULTS):
+        rig.chain.inject(fault)
+        for part in range(5):
+            reached = held + (goals - held) * (5 * k + part) / (5 * len(WIRE_FAULTS))
+            readings = rig.ticks(reached, 4)
+            for reading, shaft_rad in zip(readings.values(), rig.shafts_rad(), strict=True):
+                if reading.age_s == 0.0:
+                    assert reading.position_rad == pytest.approx(shaft_rad, abs=0.02)
+        rig.chain.clear_faults()
+    readings = rig.ticks(goals, 150)
+    assert rig.bus.statistics()["silent"] == []
+    for reading, shaft_rad, goal_rad in zip(readings.values(), rig.shafts_rad(), goals, strict=True):
+        assert reading.fault == "left alone" or shaft_rad == near(goal_rad, rig)
+        assert not rig.tells("position") or reading.age_s < 0.2
+
+
+@pytest.mark.emulated
+def test_adapter_may_be_unplugged_and_come_back(rig):
+    held = rig.hold()
+    rig.ticks(held, 5)
+    rig.chain.hang_up()
+    readings = rig.ticks(held, 50)
+    if rig.tells("position"):
+        assert all(r.age_s > 0.9 for r in readings.values())
+    rig.chain.come_back()
+    readings = rig.ticks(held, 100)
+    if rig.tells("position"):
+        assert all(r.age_s < 0.2 and r.fault is None for r in readings.values())
+    goals = held - np.copysign(0.1, held)
+    rig.ticks(goals, 100)
+    assert rig.shafts_rad() == near(goals, rig)
+    assert all(rig.torques())
+
+
+@pytest.mark.emulated
+def test_no_goal_outside_the_limits_reaches_a_servo(rig):
+    rig.hold()
+    lowest, highest = rig.family.conversion.to_ticks(np.array([-LIMIT_RAD, LIMIT_RAD]))
+    random = np.random.default_rng(7)
+    for _ in range(50):
+        rig.ticks(random.uniform(-LIMIT_RAD, LIMIT_RAD, 4), 1)
+        told = [rig.chain.state(servo)["goal"] for servo in rig.ids]
+        assert all(lowest <= goal <= highest for goal in told)
+    for end in (-LIMIT_RAD, LIMIT_RAD):
+        rig.ticks(np.full(4, end), 2)
+        told = [rig.chain.state(servo)["goal"] for servo in rig.ids]
+        assert all(lowest <= goal <= highest for goal in told)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_same_goals_make_the_same_bytes(family):
+    def sent():
+        with emulated(family) as rig:
+            held = rig.hold()
+            for k in range(60):
+                rig.ticks(held - np.copysign(0.1, held) * math.sin(k / 10) ** 2, 1)
+            rig.bus.stop("release")
+            return rig.line.sent
+
+    assert sent() == sent()

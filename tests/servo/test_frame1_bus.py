@@ -1,0 +1,455 @@
+import math
+
+import numpy as np
+import pytest
+from frame1_rig import rig_of
+
+from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
+from sfms_robot.errors import BusError, ConfigError, ServoError
+from sfms_robot.ports import Bus
+from sfms_robot.servo.dynamixel1 import Dynamixel1Bus
+from sfms_robot.servo.registers import Table
+
+MODELS = ["ax-12a", "mx-28-1.0", "mx-64-1.0", "sts3215", "scs0009"]
+NARROW = ["ax-12a", "scs0009"]  # 1024 ticks over 300 degrees
+
+
+def starts(model, *offsets):
+    return [Table.of(load_firmware_map(model)).center_ticks + offset for offset in offsets]
+
+
+@pytest.fixture(params=MODELS)
+def model(request):
+    return request.param
+
+
+@pytest.fixture
+def rig(model):
+    """Four servos that stand here and there."""
+    rig = rig_of(model, starts(model, -40, 0, 60, 20))
+    yield rig
+    rig.bus.close()
+
+
+def tick_rad(rig):
+    return rig.conversion.rad
+
+
+def test_it_is_a_bus(rig):
+    bus: Bus = rig.bus
+    assert list(bus.joints) == ["joint1", "joint2", "joint3", "joint4"]
+    assert {"position", "velocity", "voltage", "temperature", "torque"} <= bus.capabilities["joint1"]
+
+
+def test_servos_are_identified_and_left_without_torque(rig):
+    rig.bus.connect()
+    readings = rig.bus.poll(0.0)
+    assert [round(r.position_rad / tick_rad(rig)) for r in readings.values()] == [-40, 0, 60, 20]
+    assert rig.torques() == [0, 0, 0, 0]
+    with pytest.raises(ValueError, match="no joint is enabled"):
+        rig.bus.write(np.zeros(4), 0.0)
+
+
+def test_torque_comes_on_without_a_jump(rig):
+    held = rig.hold()
+    rig.clock.t = 2.0  # plenty of time to move, had the goal been another
+    readings = rig.bus.poll(2.0)
+    assert rig.torques() == [1, 1, 1, 1]
+    assert held == pytest.approx([t * tick_rad(rig) for t in (-40, 0, 60, 20)])
+    assert [r.position_rad for r in readings.values()] == pytest.approx(held)
+
+
+def test_goal_is_reached_and_motion_is_seen_on_the_way(rig):
+    held = rig.hold()
+    moving = rig.ticks(held + 0.3, 5)
+    assert all(r.extra["velocity_rad_s"] > 0.1 for r in moving.values())
+    arrived = rig.ticks(held + 0.3, 60)
+    assert [r.position_rad for r in arrived.values()] == pytest.approx(held + 0.3, abs=tick_rad(rig))
+    assert all(r.fault is None and 20 < r.extra["temperature_C"] < 40 for r in arrived.values())
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1.2, -1.2])
+def test_bad_goal_is_refused_with_nothing_sent(rig, bad):
+    held = rig.hold()
+    before = bytes(rig.wire.sent)
+    goals = held.copy()
+    goals[2] = bad
+    with pytest.raises(ValueError, match="joint3"):
+        rig.bus.write(goals, 0.01)
+    assert rig.wire.sent == before
+
+
+def test_goals_of_the_wrong_number_are_refused(rig):
+    rig.hold()
+    with pytest.raises(ValueError, match="4 joints"):
+        rig.bus.write(np.zeros(3), 0.0)
+
+
+def test_joint_outside_its_limits_is_held_and_may_only_come_in(model):
+    per_rad = Table.of(load_firmware_map(model)).ticks_per_revolution / (2 * math.pi)
+    rig = rig_of(model, starts(model, round(1.4 * per_rad)))
+    held = rig.hold()
+    assert held[0] == pytest.approx(1.4, abs=tick_rad(rig))  # limit 1
+    assert rig.ticks(held, 20)["joint1"].position_rad == pytest.approx(held[0], abs=tick_rad(rig))
+    assert rig.ticks([1.2], 50)["joint1"].position_rad == pytest.approx(1.2, abs=tick_rad(rig))
+    with pytest.raises(ValueError, match="joint1"):
+        rig.bus.write(np.array([1.3]), rig.clock.t)
+    rig.ticks([0.5], 1)
+    with pytest.raises(ValueError, match="joint1"):
+        rig.bus.write(np.array([1.1]), rig.clock.t)
+
+
+def test_wrong_model_is_named():
+    rig = rig_of("ax-12a", [512], named="ax-18a")
+    with pytest.raises(ServoError, match=r"joint1 \(id 1\) is model number 12, the head says ax-18a \(18\)"):
+        rig.bus.connect()
+
+
+def test_absent_servo_is_named_with_those_that_answer(model):
+    rig = rig_of(model, starts(model, 0, 0), expected=[1, 7, 2])
+    with pytest.raises(BusError, match=r"1000000 baud: no answer from id 7 \(joint7\); ids that answer: 1, 2"):
+        rig.bus.connect()
+
+
+def test_other_baud_is_silence(model):
+    rig = rig_of(model, starts(model, 0), servo_baud=57600)
+    with pytest.raises(BusError, match="ids that answer: none"):
+        rig.bus.connect()
+    rig_of(model, starts(model, 0), baud=57600).bus.connect()
+
+
+def test_families_and_byte_orders_cannot_share_a_bus():
+    with pytest.raises(
+        ConfigError, match="scs0009 and sts3215 have present_position at different places or in different forms"
+    ):
+        rig_of(["sts3215", "scs0009"], [2048, 512])
+    with pytest.raises(ConfigError, match="sts3215 does not speak dynamixel protocol 1"):
+        rig_of(["ax-12a", "sts3215"], [512, 2048])
+
+
+@pytest.mark.parametrize("dead", [[1], [2], [4], [2, 3], [1, 2]])
+def test_silent_servos_cost_the_others_nothing(rig, dead):
+    held = rig.hold()
+    rig.ticks(held, 3)
+    for servo in dead:
+        rig.device.kill(servo)
+    settled = rig.ticks(held, 10)
+    assert {joint for joint, r in settled.items() if r.age_s > 0} == {f"joint{i}" for i in dead}
+    for _ in range(30):
+        readings = rig.ticks(held, 1)
+        assert all(readings[f"joint{i}"].age_s == 0.0 for i in range(1, 5) if i not in dead)
+    assert rig.bus.statistics()["silent"] == dead
+
+
+def test_silent_servo_is_probed_seldom_and_taken_back(rig):
+    held = rig.hold()
+    rig.device.kill(2)
+    rig.ticks(held, 300)
+    assert rig.bus.statistics()["retries"] < 12
+    rig.device.revive(2)
+    assert rig.ticks(held, 200)["joint2"].age_s == 0.0
+    after = rig.bus.statistics()
+    assert after["silent"] == [] and after["reconnects"] == 1
+    assert rig.torques() == [1, 1, 1, 1]
+
+
+def test_wire_that_is_wholly_quiet_blames_nobody_at_once(rig):
+    held = rig.hold()
+    for servo in (1, 2, 3, 4):
+        rig.device.kill(servo)
+    rig.ticks(held, 2)
+    assert rig.bus.statistics()["silent"] == []
+    for servo in (1, 2, 3, 4):
+        rig.device.revive(servo)
+    assert all(r.age_s == 0.0 for r in rig.ticks(held, 1).values())
+
+
+def test_fault_bit_of_any_answer_becomes_a_named_fault_of_that_joint(rig):
+    held = rig.hold()
+    rig.ticks(held, 1)
+    rig.servo(3).fail(1 << 2, rig.clock.t)
+    readings = rig.ticks(held, 2)
+    assert {joint: r.fault for joint, r in readings.items() if r.fault} == {"joint3": "overheating"}
+    assert rig.bus.statistics()["faults"] == ["joint3: overheating"]
+
+
+def test_servo_that_went_limp_gets_no_goals_until_it_is_enabled_again(rig):
+    held = rig.hold()
+    rig.servo(3).fail(1 << 5, rig.clock.t)  # overload: torque is gone
+    assert rig.ticks(held, 20)["joint3"].fault == "overload"
+    rig.ticks(held + 0.2, 50)
+    assert rig.torques() == [1, 1, 0, 1]  # a goal would have switched it on
+    again = rig.bus.enable(["joint3"])
+    assert again == pytest.approx([held[2]], abs=tick_rad(rig))
+    arrived = rig.ticks(held + 0.2, 100)
+    assert arrived["joint3"].position_rad == pytest.approx(held[2] + 0.2, abs=tick_rad(rig))
+    assert arrived["joint3"].fault is None
+
+
+def test_servo_that_restarted_is_brought_back_gently(rig):
+    held = rig.hold()
+    rig.ticks(held, 3)
+    rig.device.kill(2)
+    rig.ticks(held, 10)
+    rig.servo(2).power_cycle(rig.clock.t)
+    rig.servo(2).turn(rig.conversion.center - 50, rig.clock.t)  # it fell
+    rig.device.revive(2)
+    places = [rig.servo(2).plant.position]
+    rig.ticks(held, 200, lambda: places.append(rig.servo(2).plant.position))
+    assert places[0] == rig.conversion.center - 50
+    assert places[-1] == pytest.approx(rig.conversion.center, abs=1)
+    steps = np.abs(np.diff(places)) * tick_rad(rig)
+    assert steps.max() < 0.025  # 1 rad/s, and what the motor adds; a jump would be far more
+    assert rig.rejoined == {"joint2"}
+
+
+def test_torque_lost_without_a_silence_is_noticed(rig):
+    held = rig.hold()
+    rig.ticks(held, 3)
+    rig.servo(4).power_cycle(rig.clock.t)
+    rig.servo(4).write(rig.servo(4).table["torque_enable"].address, b"\x00", rig.clock.t)
+    for _ in range(20):  # no goals, which would switch it on
+        rig.clock.t += 0.01
+        rig.bus.poll(rig.clock.t)
+    assert rig.bus.statistics()["faults"] == ["joint4: torque lost"]
+    assert rig.ticks(held, 60)["joint4"].fault is None
+    assert rig.torques() == [1, 1, 1, 1]
+
+
+def test_one_lost_answer_is_not_an_absence(rig):
+    held = rig.hold()
+    rig.ticks(held, 3)
+    rig.device.kill(3)
+    rig.ticks(held, 1)
+    rig.device.revive(3)
+    rig.ticks(held + 0.1, 60)
+    assert rig.rejoined == set()
+    assert rig.bus.statistics()["silent"] == []
+
+
+def test_late_answers_are_never_taken_for_fresh_ones(rig):
+    held = rig.hold()
+    rig.ticks(held, 2)
+    for round_ in range(12):
+        rig.wire.late = 2 + round_ % 3
+        goals = held + 0.02 * (round_ + 1)
+        readings = rig.ticks(goals, 1)
+        for i, reading in enumerate(readings.values()):
+            if reading.age_s == 0.0:
+                there = rig.servo(i + 1).plant.position
+                assert reading.position_rad == pytest.approx(
+                    (there - rig.conversion.center) * tick_rad(rig), abs=tick_rad(rig)
+                )
+    assert all(r.age_s == 0.0 for r in rig.ticks(goals, 100).values())
+
+
+def test_adapter_that_hears_itself_does_no_harm(rig):
+    rig.wire.hears_itself = True
+    held = rig.hold()
+    assert all(r.age_s == 0.0 for r in rig.ticks(held, 5).values())
+    assert rig.bus.statistics()["errors"] == 0
+
+
+def test_stop_releases_all_that_can_be_reached(rig):
+    held = rig.hold()
+    rig.device.kill(2)
+    rig.bus.stop("release")
+    rig.bus.stop("release")
+    with pytest.raises(ValueError, match="no joint is enabled"):
+        rig.bus.write(held, 0.0)
+    rig.bus.close()
+    rig.bus.stop("release")
+    rig.bus.close()
+    assert rig.torques() == [0, 1, 0, 0]  # the dead one's cable was out: it could not hear
+
+
+def test_joint_may_be_told_to_hold_at_the_end():
+    rig = rig_of("sts3215", [2048, 2048], safety=Safety(stop="hold"))
+    rig.hold()
+    rig.bus.stop("release")
+    assert rig.torques() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("policy", "torques", "moves"), [("hold", [1, 1], False), ("limp", [1, 0], False), ("reduce", [1, 1], True)]
+)
+def test_fault_is_met_by_the_policy_of_the_head(policy, torques, moves):
+    rig = rig_of("sts3215", [2048, 2048], safety=Safety(on_fault=policy))
+    rig.hold()
+    rig.ticks([0.0, 0.0], 2)
+    rig.servo(2).fail(1 << 1, rig.clock.t)  # the encoder, which does not switch it off
+    rig.ticks([0.0, 0.0], 2)
+    rig.ticks([0.2, 0.2], 80)
+    assert rig.torques() == torques
+    assert (abs(rig.servo(2).plant.position - 2048) > 100) is moves
+    assert rig.register(2, "torque_limit") == (500 if policy == "reduce" else 1000)
+    assert rig.bus.statistics()["faults"] == ["joint2: motor encoder"]
+
+
+def test_servo_that_gave_way_comes_on_again_where_the_head_says_so():
+    rig = rig_of("sts3215", [2048], safety=Safety(on_fault="reboot_and_ease_in"))
+    rig.hold()
+    rig.ticks([0.0], 2)
+    rig.servo(1).fail(1 << 5, rig.clock.t)
+    rig.ticks([0.0], 100)
+    assert rig.torques() == [0]
+    readings = rig.ticks([0.0], 250)
+    assert rig.torques() == [1] and readings["joint1"].fault is None
+
+
+def test_masked_fault_is_none():
+    rig = rig_of("sts3215", [2048], faults=Faults(mask=("input voltage",)))
+    held = rig.hold()
+    rig.servo(1).set_supply(9.0, 0.0)
+    assert rig.ticks(held, 5)["joint1"].fault is None
+    assert rig.torques() == [1] and rig.bus.statistics()["faults"] == []
+
+
+def test_pinched_joint_is_let_go():
+    rule = LoadRule(current_mA=400, for_s=0.1, then="limp")
+    rig = rig_of("sts3215", [2048], safety=Safety(pinch=rule))
+    held = rig.hold()
+    rig.servo(1).plant.stuck = True
+    rig.ticks(held + 0.5, 40)
+    assert rig.torques() == [0]
+    assert rig.bus.statistics()["faults"][0].startswith("joint1: pinched")
+
+
+def test_stop_can_hold(rig):
+    rig.hold()
+    rig.bus.stop("hold")
+    assert rig.torques() == [1, 1, 1, 1]
+
+
+def test_stop_survives_a_port_that_is_gone(rig):
+    rig.hold()
+    rig.wire.unplugged = True
+    rig.bus.stop("release")
+    rig.bus.close()
+
+
+def test_port_that_comes_back_is_taken_up_again(rig):
+    held = rig.hold()
+    rig.ticks(held, 3)
+    rig.wire.unplugged = True
+    readings = rig.ticks(held, 50)
+    assert all(r.age_s > 0.4 for r in readings.values())
+    rig.wire.unplugged = False
+    rig.ticks(held, 200)
+    assert all(r.age_s == 0.0 for r in rig.ticks(held, 1).values())
+    assert rig.torques() == [1, 1, 1, 1] and rig.bus.statistics()["reconnects"] >= 1
+
+
+def test_port_that_stays_away_is_a_failed_bus(rig):
+    rig.ticks(rig.hold(), 1)
+    rig.wire.unplugged = True
+    rig.bus.poll(rig.clock.t)
+    with pytest.raises(BusError, match="gone for more than 30 s"):
+        rig.bus.poll(rig.clock.t + 31.0)
+
+
+def test_answers_are_switched_on_before_anything_is_asked(model):
+    rig = rig_of(model, starts(model, 0, 0))
+    level = rig.servo(1).table.role("status_level").name
+    rig.set(1, level, 0)
+    rig.hold()
+    assert rig.register(1, level) == rig.servo(1).table[level].high
+
+
+def test_wheel_mode_is_ended_before_the_first_goal():
+    rig = rig_of("ax-12a", [512])
+    rig.set(1, "cw_angle_limit", 0)
+    rig.set(1, "ccw_angle_limit", 0)
+    rig.hold()
+    assert (rig.register(1, "cw_angle_limit"), rig.register(1, "ccw_angle_limit")) == (0, 1023)
+
+
+def test_mode_is_changed_through_the_lock():
+    rig = rig_of("sts3215", [2048])
+    for name, value in (("lock", 0), ("operating_mode", 1), ("lock", 1)):
+        rig.set(1, name, value)
+    rig.hold()
+    assert (rig.register(1, "operating_mode"), rig.register(1, "lock")) == (0, 1)
+    rig.servo(1).power_cycle(1.0)
+    assert rig.register(1, "operating_mode") == 0  # and it stays so
+
+
+def test_mode_that_cannot_be_changed_under_torque_is_an_error():
+    rig = rig_of("sts3215", [2048])
+    rig.set(1, "operating_mode", 1)
+    rig.set(1, "torque_enable", 1)
+    with pytest.raises(ServoError, match=r"joint1 \(id 1\) has torque on and operating_mode 1, must be 0"):
+        rig.bus.connect()
+
+
+@pytest.mark.parametrize(("model", "names"), [("scs0009", "20..1003"), ("ax-12a", "100..900")])
+def test_servo_outside_its_own_limits_is_not_made_to_jump(model, names):
+    rig = rig_of(model, [5])
+    if model == "ax-12a":
+        rig.set(1, "cw_angle_limit", 100)
+        rig.set(1, "ccw_angle_limit", 900)
+    with pytest.raises(ServoError, match=f"stands at 5, outside its own limits {names}"):
+        rig.hold()
+    assert rig.torques() == [0] and rig.servo(1).plant.position == 5
+
+
+def test_servo_in_shutdown_is_named_at_torque_on():
+    rig = rig_of("ax-12a", [512, 512])
+    rig.bus.connect()
+    rig.servo(2).fail(1 << 2, 0.0)
+    with pytest.raises(ServoError, match=r"joint2 \(id 2\).*torque_enable was set to 1 and reads 0.*overheating"):
+        rig.bus.enable(rig.bus.joints)
+
+
+def test_mx_servos_are_read_together_and_a_mixed_bus_one_by_one():
+    together = rig_of("mx-28-1.0", [2048] * 6)
+    held = together.hold()
+    before = together.wire.requests
+    together.ticks(held, 10)
+    assert together.wire.requests - before == 30  # goals, one bulk read, one closer look
+    single = rig_of("ax-12a", [512] * 6)
+    held = single.hold()
+    before = single.wire.requests
+    single.ticks(held, 10)
+    assert single.wire.requests - before == 80
+
+
+def test_reading_one_by_one_keeps_to_its_budget_and_reaches_everybody():
+    rig = rig_of("scs0009", [512] * 28)
+    held = rig.hold()
+    readings = rig.ticks(held, 8)
+    ages = sorted(r.age_s for r in readings.values())
+    assert ages[7] == 0.0 and ages[8] > 0.0  # eight of 28 in 6 ms at 1 Mbps
+    assert ages[-1] == pytest.approx(0.03)  # and all of them within four ticks
+
+
+def test_sts_is_calibrated_where_it_stands_and_others_are_not():
+    rig = rig_of("sts3215", [3000])
+    rig.bus.connect()
+    rig.bus.calibrate_here("joint1")
+    assert rig.register(1, "present_position") == 2048
+    rig.servo(1).power_cycle(1.0)
+    assert rig.register(1, "present_position") == 2048
+    rig.hold()
+    with pytest.raises(ServoError, match="has torque on"):
+        rig.bus.calibrate_here("joint1")
+    other = rig_of("scs0009", [600])
+    other.bus.connect()
+    with pytest.raises(ServoError, match="scs0009, which cannot be calibrated"):
+        other.bus.calibrate_here("joint1")
+
+
+def test_one_sync_request_goes_out_per_tick_for_all_goals(rig):
+    held = rig.hold()
+    before = len(rig.wire.sent)
+    rig.bus.write(held, 0.01)
+    assert len(rig.wire.sent) - before == 8 + 4 * 3
+
+
+def test_bus_of_unknown_model_number_is_not_checked():
+    assert load_firmware_map("scs15").model_number is None
+    rig_of("scs15", [512]).bus.connect()
+
+
+def test_dynamixel_bus_is_of_its_family():
+    assert Dynamixel1Bus.family == "dynamixel"

@@ -1,0 +1,176 @@
+import csv
+import random
+from pathlib import Path
+
+import pytest
+from dynamixel_sdk import Protocol1PacketHandler
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.errors import PacketError
+from sfms_robot.servo.codecs import dxl1, feetech, frame1
+from sfms_robot.servo.codecs.frame1 import Frame, encode, salvage
+from sfms_robot.servo.codecs.frame1 import maybe_frame as take
+
+ASSET = Path(__file__).parent.parent / "assets" / "frame1_packets.csv"
+ROWS = list(csv.DictReader(line for line in ASSET.read_text().splitlines() if not line.startswith("#")))
+FRAMES = [pytest.param(bytes.fromhex(row["frame"]), id=row["name"]) for row in ROWS]
+
+ids = st.integers(0, frame1.BROADCAST)
+codes = st.integers(0, 255)
+# Nothing is stuffed, so parameters that look like a header are what a reader has to get over.
+tricky = st.lists(st.sampled_from([b"\xff", b"\xff\xff", b"\x01", b"\x02", b"\x00"]), max_size=40).map(b"".join)
+params = st.binary(max_size=60) | tricky
+
+
+@pytest.mark.parametrize("wire", FRAMES)
+def test_known_frame_is_read_and_written(wire):
+    frame = take(buffer := bytearray(wire))
+    assert frame is not None and not buffer
+    assert encode(*frame) == wire
+
+
+@pytest.mark.parametrize("wire", FRAMES)
+def test_frame_arriving_one_byte_at_a_time(wire):
+    buffer = bytearray()
+    for byte in wire[:-1]:
+        buffer.append(byte)
+        assert take(buffer) is None
+    buffer.append(wire[-1])
+    assert take(buffer) == take(bytearray(wire))
+
+
+def frame_of(name: str) -> Frame:
+    frame = take(bytearray.fromhex(next(row["frame"] for row in ROWS if row["name"] == name)))
+    assert frame is not None
+    return frame
+
+
+def test_known_requests_mean_what_their_names_say():
+    goals = frame_of("AX sync write goal+speed ids 0 1 2 3")
+    address, parts = dxl1.sync_write_parts(goals.params)
+    assert (address, dict(parts)[1].hex()) == (0x1E, "20026003")
+    sync = frame_of("sync read pos+speed (56,4) ids 1 2")
+    assert (sync.code, feetech.sync_read_parts(sync.params)) == (feetech.SYNC_READ, (56, 4, b"\x01\x02"))
+    assert feetech.sync_read_params(56, 4, [1, 2]) == sync.params
+    assert frame_of("clear turns id1").code == feetech.RESET_TURNS
+
+
+@given(ids, codes, params)
+def test_round_trip(servo, code, data):
+    assert take(bytearray(encode(servo, code, data))) == Frame(servo, code, data)
+
+
+@given(st.dictionaries(st.integers(0, 253), st.binary(min_size=3, max_size=3), min_size=1, max_size=40))
+def test_sync_write_round_trip(values):
+    address, parts = dxl1.sync_write_parts(dxl1.sync_write_params(30, values))
+    assert (address, dict(parts)) == (30, values)
+
+
+@given(st.lists(st.tuples(st.integers(0, 253), st.integers(0, 255), st.integers(1, 255)), max_size=40))
+def test_bulk_read_round_trip(requests):
+    assert list(dxl1.bulk_read_parts(dxl1.bulk_read_params(requests))) == requests
+
+
+def test_frame_too_long_for_its_length_byte_is_refused():
+    assert len(encode(1, 3, bytes(frame1.MAX_PARAMS))) == frame1.MAX_FRAME
+    with pytest.raises(PacketError, match="254 parameters is longer than 253"):
+        encode(1, 3, bytes(254))
+
+
+@given(st.binary(max_size=30), params, params)
+def test_frames_are_found_behind_rubbish(rubbish, first, second):
+    buffer = bytearray(encode(3, 0, first) + rubbish.replace(b"\xff", b"\xfe") + encode(4, 0, second))
+    assert take(buffer) == Frame(3, 0, first)
+    assert take(buffer) == Frame(4, 0, second)
+
+
+@given(params, st.integers(1, 200))
+def test_frame_cut_off_does_not_swallow_the_next(data, cut):
+    whole, part = encode(4, 0, b"\x01\x02"), encode(3, 0, data)
+    buffer = bytearray(part[: max(0, len(part) - cut)] + whole)
+    found = []
+    while (frame := take(buffer)) is not None:
+        found.append(frame)
+    assert Frame(4, 0, b"\x01\x02") in found + salvage(buffer)
+    assert not buffer
+
+
+@given(st.binary(max_size=600))
+def test_any_bytes_leave_at_most_one_unfinished_frame(rubbish):
+    buffer = bytearray(rubbish)
+    while take(buffer) is not None:
+        continue
+    assert len(buffer) < frame1.MAX_FRAME
+
+
+def test_a_million_random_bytes_hide_no_frame_for_long():
+    rubbish, whole = random.Random(0), encode(9, 0, b"\x01\x02")
+    buffer, found = bytearray(), 0
+    for _ in range(1000):
+        buffer += rubbish.randbytes(1000 - len(whole)) + whole
+        while (frame := take(buffer)) is not None:
+            found += frame == Frame(9, 0, b"\x01\x02")
+        assert len(buffer) < frame1.MAX_FRAME
+    assert found > 990
+
+
+@given(params, st.integers(0, 7), st.data())
+def test_flipped_bit_is_no_frame_of_that_servo_with_other_content(data, bit, draw):
+    wire = bytearray(encode(7, 0, data))
+    wire[draw.draw(st.integers(0, len(wire) - 1))] ^= 1 << bit
+    for frame in salvage(wire):
+        assert len(frame.params) < len(data)  # at most a shorter one inside, which its length gives away
+
+
+def test_error_bits_about_the_request_are_told_from_those_about_the_servo():
+    assert dxl1.refusal_text(dxl1.RANGE | dxl1.OVERLOAD) == "range error"
+    assert dxl1.refusal_text(dxl1.OVERLOAD | dxl1.VOLTAGE | dxl1.OVERHEATING) == ""
+
+
+class Capture:
+    """What the SDK's packet handler needs of a port; keeps what is written."""
+
+    is_using = False
+
+    def __init__(self, answer: bytes = b""):
+        self.written, self.answer = b"", answer
+
+    def clearPort(self):
+        self.written = b""
+
+    def writePort(self, packet):
+        self.written += bytes(packet)
+        return len(packet)
+
+    def readPort(self, length):
+        data, self.answer = self.answer[:length], self.answer[length:]
+        return list(data)
+
+    def setPacketTimeout(self, length):
+        self.is_using = True
+
+    def isPacketTimeout(self):
+        return not self.answer
+
+
+@given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=200))
+def test_writes_are_those_of_the_vendor_sdk(servo, address, data):
+    port = Capture()
+    Protocol1PacketHandler().writeTxOnly(port, servo, address, len(data), list(data))
+    assert port.written == encode(servo, frame1.WRITE, bytes([address]) + data)
+
+
+@given(st.dictionaries(st.integers(0, 252), st.binary(min_size=2, max_size=2), min_size=1, max_size=40))
+def test_sync_writes_are_those_of_the_vendor_sdk(values):
+    port = Capture()
+    flat = [byte for servo, data in values.items() for byte in (servo, *data)]
+    Protocol1PacketHandler().syncWriteTxOnly(port, 30, 2, flat, len(flat))
+    assert port.written == encode(frame1.BROADCAST, frame1.SYNC_WRITE, dxl1.sync_write_params(30, values))
+
+
+@given(st.integers(0, 252), st.integers(0, 127), st.binary(min_size=1, max_size=100))
+def test_the_vendor_sdk_reads_our_status_frames(servo, error, data):
+    port = Capture(encode(servo, error, data))
+    got, result, told = Protocol1PacketHandler().readRx(port, servo, len(data))
+    assert (bytes(got), result, told) == (data, 0, error)

@@ -1,0 +1,130 @@
+import pytest
+from frame1_rig import rig_of
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.errors import PacketError
+from sfms_robot.servo.codecs.frame1 import encode
+from sfms_robot.servo.frame1_link import Frame1Link
+from sfms_robot.servo.link import Answer, Found, RegisterLink
+
+
+def link_of(model, starts, **more):
+    rig = rig_of(model, starts, **more)
+    link = Frame1Link(rig.wire, 1_000_000, 0.003, rig.bus.family)
+    return link, rig
+
+
+@pytest.mark.parametrize(
+    ("model", "found"),
+    [("ax-12a", Found(12, 3)), ("mx-64-1.0", Found(310, 3)), ("sts3215", Found(777, 3)), ("scs0009", Found(1284, 3))],
+)
+def test_ping_tells_who_is_there_whatever_the_byte_order(model, found):
+    link, _ = link_of(model, [500, 600])
+    tool: RegisterLink = link
+    assert tool.ping(1) == found
+    assert tool.ping(9) is None
+    assert tool.broadcast_ping() == {1: found, 2: found}
+
+
+@pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
+def test_registers_are_read_and_written(model):
+    link, rig = link_of(model, [500])
+    position = rig.servo(1).table["present_position"]
+    assert link.read(1, position.address, 2) == Answer(0, b"\xf4\x01")
+    torque = rig.servo(1).table["torque_enable"].address
+    assert link.write(1, torque, b"\x01") == Answer(0, b"")
+    goal = rig.servo(1).table["goal_position"].address
+    assert link.reg_write(1, goal, b"\x00\x02") == Answer(0, b"")
+    link.action()
+    assert link.read(1, goal, 2) == Answer(0, b"\x00\x02")
+
+
+def test_refusal_is_an_answer():
+    link, _ = link_of("ax-12a", [512])
+    assert link.write(1, 36, b"\x00\x00") == Answer(0x08, b"")
+    assert link.read(1, 48, 20) == Answer(0x08, b"")
+
+
+def test_what_the_protocol_cannot_do_is_said():
+    link, _ = link_of("sts3215", [2048])
+    with pytest.raises(PacketError, match="servo 1 speaks feetech and has no reboot instruction: switch its supply"):
+        link.reboot(1)
+    with pytest.raises(PacketError, match="resets everything"):
+        link.factory_reset(1, 2)
+    assert link.factory_reset(1, 0xFF) == Answer(0, b"")
+
+
+class Says:
+    """A device that answers anything with the same bytes, then as another one would."""
+
+    def __init__(self, data, other=None):
+        self.data, self.other = data, other
+
+    def receive(self, data, baud, now_s):
+        return self.data + (self.other.receive(data, baud, now_s) if self.other else b"")
+
+
+@pytest.mark.parametrize("other", [encode(2, 0, b"\x01\x02"), encode(1, 0, b"\x01"), encode(1, 0, b"\x01\x02\x03")])
+def test_answer_of_another_servo_or_length_is_left_alone(other):
+    link, rig = link_of("ax-12a", [500])
+    rig.wire.device = Says(other)
+    assert link.read(1, 36, 2) is None
+
+
+class Late:
+    """A device whose answers come one request after the other, each a serial number."""
+
+    def __init__(self, lags):
+        self.lags, self.count, self.queue = list(lags), 0, []
+
+    def receive(self, data, baud, now_s):
+        self.count += 1
+        length = data[6] if data[4] == 2 else 0
+        body = bytes([self.count % 250] * length)
+        lag = self.lags.pop(0) if self.lags else 0
+        due = max([self.count + lag, *(when for when, _ in self.queue)])  # a servo answers in order
+        self.queue.append((due, encode(1, 0, body)))
+        out = b"".join(answer for when, answer in self.queue if when <= self.count)
+        self.queue = [item for item in self.queue if item[0] > self.count]
+        return out
+
+
+@given(st.lists(st.sampled_from([0, 0, 0, 1, 2, 5]), max_size=30))
+def test_no_answer_is_ever_that_of_an_earlier_request(lags):
+    link, rig = link_of("ax-12a", [512])
+    rig.wire.device = device = Late(lags)
+    for _ in range(40):
+        rig.clock.t += 0.01
+        answer = link.read(1, 36, 2)
+        if answer is not None:
+            assert answer.data == bytes([device.count % 250] * 2)
+    assert link.read(1, 36, 2) is not None
+
+
+def test_debt_is_forgotten_after_a_second():
+    link, rig = link_of("ax-12a", [512])
+    rig.device.kill(1)
+    assert link.read(1, 36, 2) is None
+    rig.device.revive(1)
+    rig.clock.t = 5.0
+    before = rig.wire.requests
+    assert link.read(1, 36, 2) is not None
+    assert rig.wire.requests - before == 1
+
+
+@pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
+def test_own_words_heard_again_are_no_answer(model):
+    link, rig = link_of(model, [500])
+    rig.wire.hears_itself = True
+    assert link.read(1, rig.servo(1).table["present_position"].address, 2) == Answer(0, b"\xf4\x01")
+    rig.device.kill(1)
+    assert link.ping(1) is None
+    assert link.read(1, 36, 2) is None
+
+
+@given(st.binary(max_size=40))
+def test_rubbish_before_an_answer_does_not_hide_it(rubbish):
+    link, rig = link_of("sts3215", [500])
+    rig.wire.device = Says(rubbish.replace(b"\xff", b"\x00"), rig.device)
+    assert link.read(1, 56, 2) == Answer(0, b"\xf4\x01")

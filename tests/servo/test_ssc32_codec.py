@@ -1,0 +1,91 @@
+import csv
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.servo.codecs import ssc32
+from sfms_robot.servo.codecs.ssc32 import Group, Move, Query, Unknown, maybe_command
+
+ASSET = Path(__file__).parents[1] / "assets" / "board_commands.csv"
+ROWS = csv.DictReader(line for line in ASSET.read_text().splitlines() if not line.startswith("#"))
+PUBLISHED = {row["name"]: row["bytes"].replace("<CR>", "\r").encode() for row in ROWS if row["protocol"] == "ssc32"}
+BUILT = {
+    "group move": ssc32.group_move({5: Move(1600), 10: Move(750)}, 2500),
+    "single with speed": ssc32.group_move({5: Move(1600, 750)}),
+    "query movement": ssc32.query_moving(),
+    "query pulse": ssc32.query_pulse(5),
+}
+MEANT = {
+    "group move": Group({5: Move(1600), 10: Move(750)}, 2500),
+    "single with speed": Group({5: Move(1600, 750)}),
+    "outputs": Group({}, levels={3: True, 4: False}),
+    "query movement": Query("Q"),
+    "query pulse": Query("QP", (5,)),
+}
+
+moves = st.dictionaries(
+    st.integers(0, 31), st.builds(Move, st.integers(500, 2500), st.integers(0, 65535)), min_size=1, max_size=32
+)
+
+
+@pytest.mark.parametrize("name", BUILT)
+def test_builders_make_the_published_command_without_its_spaces(name):
+    assert BUILT[name] == PUBLISHED[name].replace(b" ", b"")
+
+
+@pytest.mark.parametrize("name", MEANT)
+@pytest.mark.parametrize("change", [bytes, bytes.lower, lambda line: line.replace(b"#", b"  # ")])
+def test_published_command_is_understood_in_either_case_and_with_spaces(name, change):
+    assert maybe_command(bytearray(change(PUBLISHED[name]))) == MEANT[name]
+
+
+@given(moves, st.integers(0, 65535))
+def test_reader_gives_back_what_the_builder_made(moves, time_ms):
+    buffer = bytearray(ssc32.group_move(moves, time_ms) + b"Q")
+    assert maybe_command(buffer) == Group(moves, time_ms)
+    assert buffer == b"Q"
+
+
+def test_command_arriving_one_byte_at_a_time():
+    buffer = bytearray()
+    line = ssc32.group_move({1: Move(1500), 2: Move(900, 100)}, 40)
+    for byte in line[:-1]:
+        buffer.append(byte)
+        assert maybe_command(buffer) is None
+    buffer.append(line[-1])
+    assert maybe_command(buffer) == Group({1: Move(1500), 2: Move(900, 100)}, 40)
+
+
+def test_escape_throws_away_what_came_before_it():
+    assert maybe_command(bytearray(b"#5P2000\x1b#5P1500\r")) == Group({5: Move(1500)})
+
+
+def test_several_pulses_are_asked_for_at_once():
+    assert maybe_command(bytearray(b"QP 5 31\r")) == Query("QP", (5, 31))
+
+
+@pytest.mark.parametrize("line", [b"", b"#32P1500", b"QP 40", b"hello", b"#5", b"P1500", b"#5P1500T99999999"])
+def test_line_that_is_no_command_is_told_as_such(line):
+    assert maybe_command(bytearray(line + b"\r")) == Unknown(line)
+
+
+@pytest.mark.parametrize("pulse_us", [0, 499, 2501])
+def test_pulse_that_the_board_cannot_make_is_refused(pulse_us):
+    with pytest.raises(ValueError, match=f"channel 4: {pulse_us} us is outside 500..2500"):
+        ssc32.group_move({4: Move(pulse_us)})
+
+
+@given(st.binary(max_size=300).map(lambda data: data * 9))
+def test_rubbish_neither_hangs_nor_piles_up(rubbish):
+    buffer = bytearray(rubbish)
+    for _ in range(len(rubbish) + 1):
+        if maybe_command(buffer) is None:
+            break
+    assert len(buffer) < ssc32.MAX_LINE
+
+
+def test_24_channels_at_9600_baud_take_a_fifth_of_a_second():
+    line = ssc32.group_move({channel: Move(1500) for channel in range(24)}, 220)
+    assert 0.15 < len(line) * 10 / 9600 < 0.225

@@ -1,0 +1,77 @@
+"""Two servos with one id are noticed by what a ping brings; one servo, however it is set, is not."""
+
+from collections.abc import Callable
+
+import pytest
+
+from sfms_robot.servo.codecs import dxl2, frame1
+from sfms_robot.servo.twins import hear_ping
+
+ONE = dxl2.encode_status(3, 0, bytes([0xB0, 0x04, 53]))
+OTHER = dxl2.encode_status(3, 0, bytes([0xA6, 0x04, 52]))
+
+
+class Wire:
+    """A port whose other end is a function from the bytes sent to the pieces that come back."""
+
+    def __init__(self, answer: Callable[[bytes], list[bytes]]):
+        self.name, self._answer, self._pieces, self._now_s = "wire", answer, [], 0.0
+
+    def write(self, data: bytes) -> None:
+        self._pieces = list(self._answer(data))
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        if self._pieces:
+            return self._pieces.pop(0)
+        self._now_s = deadline_s
+        return b""
+
+    def discard_input(self) -> None:
+        self._pieces = []
+
+    def now_s(self) -> float:
+        return self._now_s
+
+    def set_baud(self, baud: int) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def heard(*pieces: bytes, echo: bool = False, protocol: int = 2):
+    return hear_ping(Wire(lambda sent: [sent, *pieces] if echo else list(pieces)), protocol, 3, 0.02)
+
+
+def test_one_servo_is_one_answer_also_in_pieces_and_behind_an_echo():
+    assert not heard(ONE).twins and heard(ONE).answers == 1
+    assert not heard(ONE[:5], ONE[5:]).twins
+    assert not heard(ONE, echo=True).twins
+
+
+def test_an_empty_wire_holds_no_twins():
+    assert heard().answers == 0 and not heard().twins
+
+
+def test_two_answers_one_after_the_other_are_twins():
+    assert heard(ONE, OTHER).answers == 2 and heard(ONE, OTHER).twins
+
+
+def test_two_answers_on_top_of_each_other_are_twins():
+    garbled = bytes(a & b for a, b in zip(ONE, OTHER, strict=True))
+    assert heard(garbled).answers == 0 and heard(garbled).twins
+
+
+@pytest.mark.parametrize("shift", range(1, len(ONE)))
+def test_an_answer_that_begins_inside_the_other_is_twins(shift):
+    overlap = bytes(a & b for a, b in zip(ONE[shift:] + b"\xff" * shift, OTHER, strict=True))
+    assert heard(ONE[:shift] + overlap + OTHER[len(OTHER) - shift :]).twins
+
+
+def test_the_older_frame_is_judged_the_same_way():
+    answer = frame1.encode(3, 0)
+    assert not heard(answer, protocol=1).twins
+    assert heard(answer, answer, protocol=1).answers == 2
+    assert heard(answer, b"\x00", protocol=1).twins
+
+
+def test_a_wire_that_never_falls_silent_is_left_alone():
+    assert heard(*[b"\x55" * 100] * 1000).stray == 6400
