@@ -172,9 +172,12 @@ class Reading:
         age_s: age of the position; inf when there is none.
         fault: named fault or None.
         extra: what else the family tells, unit in the key (`current_mA`, `velocity_rad_s`, `voltage_V`).
+        rejoined: true once, when the servo was away and holds this position now; its goals are left out until they
+            begin there, so ease in from it.
     """
 
     position_rad: float | None
     age_s: float
     fault: str | None = None
     extra: Mapping[str, float] = field(default_factory=dict)
+    rejoined: bool = False

@@ -153,13 +153,24 @@ class Timeline(Protocol):
         """Motion (N, 58) at each of (N,) instants, and the state with what was counted."""
 
 
+class Life(Protocol):
+    """What the head does of itself, on top of the face that was asked for. State is a value."""
+
+    def start(self) -> Any: ...
+
+    def step(self, motion: Floats, times_s: Doubles, now_s: float, state: Any) -> tuple[Floats, Any]:
+        """Motion (N, 58) at (N,) instants, row 0 at `now_s`; never changes its input."""
+
+
 class Retargeter(Protocol):
-    """Motion -> joint angles of this head."""
+    """Motion -> joint angles of this head. State is a value."""
 
     @property
     def joints(self) -> Sequence[str]: ...
 
-    def angles(self, motion: Floats) -> Doubles:
+    def start(self) -> Any: ...
+
+    def step(self, motion: Floats, state: Any) -> tuple[Doubles, Any]:
         """(J, 58) one motion row per joint (each joint has its own lead), or (58,) for all -> rad (J,)."""
 
 
@@ -171,6 +182,9 @@ class Limiter(Protocol):
     def step(self, reference_rad: Doubles, state: Any) -> tuple[Doubles, Any]:
         """Reference (3, J): angle, speed, acceleration one tick ahead -> angles (J,) that may be sent."""
 
+    def restart(self, joints: NDArray[np.bool_], angles_rad: Doubles, state: Any) -> Any:
+        """Some `joints` (J,) came back and stand still at `angles_rad` (J,); the others go on."""
+
 
 class Audit(Protocol):
     """Judges the command stream from outside the limiter. State is a value with `violations` and `clamped`."""
@@ -179,3 +193,6 @@ class Audit(Protocol):
 
     def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: Any) -> Any:
         """One command (J,), and what was wanted of the limiter."""
+
+    def restart(self, joints: NDArray[np.bool_], angles_rad: Doubles, state: Any) -> Any:
+        """As `Limiter.restart`: what such a joint did before is not held against it."""

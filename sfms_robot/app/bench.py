@@ -133,11 +133,12 @@ def _retarget() -> dict[str, Row]:
     motion = build_motion(head, rate_hz)
     rng = np.random.default_rng(0)
     timeline, limiter = motion.timeline.start(), motion.limiter.start(motion.rest_rad)
+    neck = motion.retargeter.start()
     before = here = motion.rest_rad
     now_s = 0.0
 
     def tick() -> None:
-        nonlocal timeline, limiter, before, here, now_s
+        nonlocal timeline, limiter, neck, before, here, now_s
         if round(now_s * rate_hz) % 16 == 0:
             times_s = now_s + FRAME_S * np.arange(1, 9)
             wave = 0.3 + 0.2 * np.sin(2 * np.pi * times_s[:, None] * rng.uniform(0.2, 1.0, MOTION_DIM))
@@ -146,7 +147,7 @@ def _retarget() -> dict[str, Row]:
             )
         times = np.concatenate([[now_s], now_s + motion.leads_s + 1 / rate_hz])
         frames, timeline = motion.timeline.sample(times, now_s, timeline)
-        ahead = motion.mapping.angles(frames[1:])
+        ahead, neck = motion.retargeter.step(frames[1:], neck)
         _, limiter = motion.limiter.step(difference(before, here, ahead, 1 / rate_hz), limiter)
         before, here, now_s = here, ahead, now_s + 1 / rate_hz
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -18,14 +19,23 @@ from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
 from sfms_robot.ports import Bus, Clock
-from sfms_robot.retarget.mapping import Mapping
+from sfms_robot.retarget.head import HeadRetargeter
 from sfms_robot.servo.composite import CompositeBus
-from sfms_robot.servo.dynamixel import READ_DEADLINE_S, BusServo, DynamixelBus
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort, stable_name
 from sfms_robot.simulator.launch import Chain, EmulatedServo
 
 SIM = "sim"
 SIM_READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
+# The class of each bus family; only those of the head are imported.
+FAMILIES = {
+    "dynamixel": "sfms_robot.servo.dynamixel:DynamixelBus",
+    "dynamixel1": "sfms_robot.servo.dynamixel1:Dynamixel1Bus",
+    "feetech": "sfms_robot.servo.feetech:FeetechBus",
+    "maestro": "sfms_robot.servo.maestro:MaestroBus",
+    "ssc32": "sfms_robot.servo.ssc32:Ssc32Bus",
+}
+BOARDS = ("maestro", "ssc32")
 HANGING = 0.3  # where an emulated joint stands at power-up: this share of the way from rest to its lower end
 
 
@@ -37,7 +47,7 @@ class Motion:
     """What lies between a plan and the bus."""
 
     timeline: PlanTimeline
-    mapping: Mapping
+    retargeter: HeadRetargeter
     limiter: JerkLimiter
     audit: Audit
     leads_s: Doubles
@@ -49,22 +59,31 @@ def shipped_heads() -> list[dict[str, Any]]:
     names = shipped_names(data_dir("configs") / "heads", "head.yaml")
     heads = [load_head(name) for name in names]
     return [
-        {"name": head.name, "description": head.description, "joints": len(head.joints), "buses": list(head.buses)}
+        {
+            "name": head.name,
+            "description": head.description,
+            "joints": len(head.joints),
+            "neck": head.kinematics.kind if head.kinematics else None,
+            "buses": {name: bus.family for name, bus in head.buses.items()},
+        }
         for head in heads
     ]
 
 
 def build_motion(head: Head, rate_hz: float) -> Motion:
-    """Timeline, mapping, limiter and audit at one tick rate."""
+    """Timeline, retargeter, limiter and audit at one tick rate."""
     limits = JointLimits.of(head)
-    joints = head.joints.values()
+    retargeter = HeadRetargeter(head, 1.0 / rate_hz)
+    leads_s = np.array([joint.lag_ms / 1e3 for joint in head.joints.values()])
+    if len(neck := retargeter.neck_columns):
+        leads_s[neck] = leads_s[neck].max()  # its joints show one pose together
     return Motion(
         PlanTimeline(1.0 / rate_hz),
-        Mapping(head),
+        retargeter,
         JerkLimiter(limits, 1.0 / rate_hz),
         Audit(limits, _calibration(head.joints), 1.0 / rate_hz),
-        np.array([joint.lag_ms / 1e3 for joint in joints]),
-        np.array([joint.rest_rad for joint in joints]),
+        leads_s,
+        np.array([joint.rest_rad for joint in head.joints.values()]),
     )
 
 
@@ -101,23 +120,64 @@ def devices(head: Head, port: str) -> dict[str, str]:
     return parts
 
 
-def build_bus(head: Head, opened: Opened, clock: Clock) -> Bus:
-    """The head's bus, not yet connected."""
+def build_bus(head: Head, opened: Opened, clock: Clock, confirmed: bool = False) -> Bus:
+    """The head's bus, not yet connected. `confirmed`: hobby servos may jump when their pulses come on."""
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
-        maps = _maps(joints)
-        servos = [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad) for key, j in joints.items()]
-        baud = head.buses[name].baud
-        deadline_s = SIM_READ_DEADLINE_S if isinstance(where, Chain) else READ_DEADLINE_S
-        port = _port(where, baud, clock)
-        buses[name] = DynamixelBus(name, servos, _calibration(joints), port, baud, deadline_s)
-    return CompositeBus(buses, list(head.joints))
+        buses[name] = _build_one(head, name, joints, where, clock, confirmed)
+    real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
+    rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
+    return CompositeBus(buses, list(head.joints), rates)
+
+
+def _build_one(
+    head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool
+) -> Bus:
+    config = head.buses[name]
+    maps = _maps(joints)
+    _check_safety(head, joints, maps)
+    servos = [
+        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
+    ]
+    more: dict[str, Any] = {}
+    if config.family == "dynamixel":
+        more = {"config": config, "faults": head.faults}
+    elif config.family in BOARDS:
+        rest_rad = np.array([joint.rest_rad for joint in joints.values()])
+        more = {"confirmed": confirmed or isinstance(where, Chain), "rest_rad": rest_rad}
+    module, kind = FAMILIES[config.family].split(":")
+    build = getattr(import_module(module), kind)
+    deadline_s = config.read_deadline_ms / 1e3
+    if isinstance(where, Chain):
+        deadline_s = max(deadline_s, SIM_READ_DEADLINE_S)
+    bus: Bus = build(
+        name, servos, _calibration(joints), _port(where, config.baud, clock), config.baud, deadline_s, **more
+    )
+    return bus
+
+
+def _check_safety(head: Head, joints: dict[str, Joint], maps: dict[str, FirmwareMap]) -> None:
+    """Raises ConfigError for a register that a joint's servo does not have, or that is not to be written."""
+    for name, joint in joints.items():
+        table = maps[joint.model].registers
+        limit = joint.safety.current_limit_mA if joint.safety is not None else None
+        if limit is not None and "goal_current" not in table:
+            key = f"joints.{name}.safety.current_limit_mA"
+            raise ConfigError.at(head.name, key, limit, f"cannot be kept: {joint.model} has no current sensor")
+        for register, value in head.safety_of(name).registers.items():
+            key = f"joints.{name}.safety.registers.{register}"
+            if register not in table or table[register].access != "RW":
+                choices = [each for each, row in table.items() if row.access == "RW"]
+                raise ConfigError.at(head.name, key, value, f"is no register of {joint.model} to be written", choices)
+            if not table[register].low <= value <= table[register].high:
+                allowed = f"{table[register].low}..{table[register].high}"
+                raise ConfigError.at(head.name, key, value, f"does not fit {joint.model}", [allowed])
 
 
 def _port(where: Chain | str, baud: int, clock: Clock) -> Callable[[], Port]:
     if isinstance(where, str):
-        return partial(SerialPort, where, baud, clock)
+        return partial(SerialPort, stable_name(where), baud, clock)
     if where.virtual:
         return partial(VirtualTimePort, where.device, where.control, baud, clock)
     return partial(SerialPort, where.device, baud, clock)

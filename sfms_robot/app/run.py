@@ -6,6 +6,7 @@ then torque. Whatever happens after torque-on, the loop brings the head to rest;
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -18,10 +19,12 @@ from typing import Any
 from sfms_robot.app.heads import SIM, Motion, Opened, build_bus, build_motion, devices, emulated
 from sfms_robot.app.report import run_report
 from sfms_robot.config import Head, find, load_head
+from sfms_robot.config.caution import cautious
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.listeners.remote import RemoteFeed
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed
+from sfms_robot.retarget.life import Life
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
@@ -30,6 +33,8 @@ from sfms_robot.runtime.recorder import FullPolicy, Recorder, write_report
 from sfms_robot.runtime.safety import interrupt_flag, realtime_priority
 from sfms_robot.simulator.launch import Chain, launch
 from sfms_robot.sources.recording import open_source
+
+log = logging.getLogger(__name__)
 
 FAST_LATENCY_S = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
@@ -57,7 +62,7 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
     """
     if options.fast and options.port != SIM:
         raise ConfigError(f"--port {options.port!r}: --fast needs emulated servos, time is virtual (sim)")
-    head = load_head(options.head)
+    head = ready(load_head(options.head), real=options.port != SIM, calibrated=False)
     where = {} if options.port == SIM else devices(head, options.port)
     rate_hz = max(bus.rate_hz for bus in head.buses.values())
     motion = build_motion(head, rate_hz)
@@ -80,8 +85,8 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
             return {"version": 1, "head": head.name, "port": options.port, "exit": "done", **_present(bus, clock)}
         observers = _observers(options, head, source.duration_s, progress, stack)
         parts = Parts(
-            source, feed, motion.timeline, motion.mapping, motion.limiter, bus, observers,
-            motion.leads_s, motion.rest_rad,
+            source, feed, motion.timeline, motion.retargeter, motion.limiter, bus, observers,
+            motion.leads_s, motion.rest_rad, Life(head.life, options.seed),
         )  # fmt: skip
         report = _drive(options, parts, motion, clock, rate_hz, weights.name, head.name)
         if options.fast:
@@ -91,10 +96,18 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
     return report
 
 
+def ready(head: Head, *, real: bool, calibrated: bool) -> Head:
+    """The head as it may move on this port: on real servos one to be calibrated first holds back until it is."""
+    if not (real and head.calibrate_first and not calibrated):
+        return head
+    log.warning("head %s is not calibrated: 20 %% of its travel, 0.3 of its speed", head.name)
+    return cautious(head)
+
+
 def _drive(
     options: RunOptions, parts: Parts, motion: Motion, clock: Clock, rate_hz: float, listener: str, head: str
 ) -> dict[str, Any]:
-    log = RunLog(motion.mapping.joints, 1.0 / rate_hz, motion.audit)
+    log = RunLog(motion.retargeter.joints, 1.0 / rate_hz, motion.audit)
     duration_s = parts.source.duration_s if parts.source.duration_s is not None else math.inf
     with interrupt_flag() as interrupted, realtime_priority(wanted=not options.fast) as priority:
         began_s = time.monotonic()
@@ -140,7 +153,7 @@ def _observers(
     if options.record is not None:
         about = {
             "head": head.name,
-            "listener": options.listener,
+            "listener": Path(options.listener).name,
             "seed": str(options.seed),
             "audio": Path(options.audio).name,
         }

@@ -1,17 +1,17 @@
-"""`sfms-robot head`: the heads at hand."""
+"""`sfms-robot head`: the heads at hand, whether one is sound, and what its neck makes of a pose."""
 
 from __future__ import annotations
 
+import csv
 import json as json_module
+import sys
+from pathlib import Path
 
 import typer
 
-app = typer.Typer(help="Heads: list what is shipped.", no_args_is_help=True)
+from sfms_robot.errors import ConfigError
 
-
-@app.callback()
-def _group() -> None:
-    """Keeps `list` a subcommand while it is the only one."""
+app = typer.Typer(help="Heads: list what is shipped, check one, show its values, solve poses.", no_args_is_help=True)
 
 
 @app.command("list")
@@ -22,6 +22,78 @@ def list_heads(json: bool = typer.Option(False, "--json", help="Print as one JSO
     heads = shipped_heads()
     if json:
         print(json_module.dumps({"heads": heads}))
+        return
+    from sfms_robot.cli.head_tables import print_heads
+
+    print_heads(heads)
+
+
+@app.command("check")
+def check(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    plot: Path | None = typer.Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
+    """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
+    from sfms_robot.app.head_check import check as check_head
+
+    checked = check_head(name, data)
+    if plot is not None and not checked.problems:
+        from sfms_robot.app.head_plot import plot as draw
+
+        draw(checked, plot)
+    if json:
+        print(json_module.dumps(checked.as_dict()))
     else:
-        for head in heads:
-            print(f"{head['name']}: {head['joints']} joints, {', '.join(head['buses'])} - {head['description']}")
+        from sfms_robot.cli.head_tables import print_check
+
+        print_check(checked)
+    if checked.problems:
+        raise typer.Exit(ConfigError.exit_code)
+
+
+@app.command("show")
+def show(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    joint: str | None = typer.Option(None, "--joint", metavar="JOINT", help="Only this joint."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
+    """Every value of every joint, and where it comes from: its own line, its twin, the defaults, or built in."""
+    from sfms_robot.config.origins import origins
+
+    joints = origins(name)
+    if joint is not None:
+        if joint not in joints:
+            raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", joints)
+        joints = {joint: joints[joint]}
+    if json:
+        told = {j: {key: {"value": v, "from": o} for key, (v, o) in values.items()} for j, values in joints.items()}
+        print(json_module.dumps({"name": name, "joints": told}))
+        return
+    from sfms_robot.cli.head_tables import print_origins
+
+    print_origins(name, joints)
+
+
+@app.command("solve")
+def solve(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    poses: Path = typer.Option(
+        ...,
+        "--poses",
+        metavar="FILE.csv",
+        help="Columns x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad and, if wanted, body_yaw_rad.",
+    ),
+    residual: bool = typer.Option(False, "--residual", help="Also print what is missing: residual_rad,residual_m."),
+) -> None:
+    """The neck's joints for each pose, as CSV in rad, and whether the pose is reached (1) or only approached (0)."""
+    from sfms_robot.app.head_solve import solve_poses
+
+    table = solve_poses(name, poses)
+    solved = table.solved
+    rest = [solved.residual_rad, solved.residual_m] if residual else []
+    rows = csv.writer(sys.stdout, lineterminator="\n")
+    rows.writerow([*table.joints, "reached", *("residual_rad", "residual_m")[: len(rest)]])
+    for angles, reached, *missing in zip(solved.angles_rad, solved.reached, *rest, strict=True):
+        rows.writerow([*(f"{angle:.12f}" for angle in angles), int(reached), *(f"{value:.3e}" for value in missing)])

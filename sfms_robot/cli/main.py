@@ -8,7 +8,7 @@ import sys
 import typer
 
 from sfms_robot import __version__
-from sfms_robot.cli import bench, data, evaluate, head, replay, run, train
+from sfms_robot.cli import bench, data, doctor, emulate, evaluate, head, replay, run, servo, train
 from sfms_robot.errors import RobotError
 
 app = typer.Typer(
@@ -22,8 +22,11 @@ app = typer.Typer(
 )
 app.command("run")(run.run)
 app.command("replay")(replay.replay)
+app.command("emulate")(emulate.emulate)
+app.command("doctor")(doctor.doctor)
 app.command("bench")(bench.bench)
 app.add_typer(head.app, name="head")
+app.add_typer(servo.app, name="servo")
 app.add_typer(data.app, name="data")
 app.add_typer(train.app, name="train")
 app.add_typer(evaluate.app, name="evaluate")

@@ -7,13 +7,16 @@ seconds. Nothing past `load` handles a plain dict.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
+
+UNKNOWN_KEY: Final = "unknown_key"  # type of that problem, its key in the context
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -31,7 +34,8 @@ class Model(BaseModel):
     def _known_keys(cls, value: Any) -> Any:
         for key in value if isinstance(value, dict) else ():
             if key not in cls.model_fields:
-                raise ValueError(f"{key!r} is not a known key ({', '.join(cls.model_fields)})")
+                told = {"key": key, "choices": ", ".join(cls.model_fields), "shown": repr(key)}
+                raise PydanticCustomError(UNKNOWN_KEY, "{shown} is not a known key ({choices})", told)
         return value
 
 
@@ -57,6 +61,11 @@ _Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping
 
 def load(model: type[M], file: Path) -> M:
     """Read one YAML file into `model`, or raise a ConfigError of one line."""
+    return parse(model, read(file), file)
+
+
+def read(file: Path) -> Any:
+    """The plain data of one YAML file. Raises a ConfigError of one line."""
     try:
         text = file.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -64,13 +73,12 @@ def load(model: type[M], file: Path) -> M:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read: {error}") from error
     try:
-        raw = yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+        return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}" if mark else ""
         problem = " ".join(str(getattr(error, "problem", None) or error).split())
         raise ConfigError(f"{file}{where}: {problem}") from error
-    return parse(model, raw, file)
 
 
 def parse(model: type[M], raw: object, file: Path | str) -> M:
@@ -83,13 +91,17 @@ def parse(model: type[M], raw: object, file: Path | str) -> M:
 
 def _first(error: ValidationError, file: Path | str) -> str:
     problems = error.errors()
-    first = problems[0]
-    key = ".".join(str(part) for part in first["loc"])
-    text = first["msg"].removeprefix("Value error, ")
-    value = first["input"]
-    shown = f" = {value!r}" if isinstance(value, (str, int, float, bool)) or value is None else ""
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{file}: {key}{shown}: {text}{more}" if key else f"{file}: {text}{more}"
+    return f"{file}: {one_line(problems[0])}{more}"
+
+
+def one_line(problem: ErrorDetails, where: str = "") -> str:
+    """Key, value and what is wrong with it; `where` stands before the key."""
+    key = ".".join(filter(None, (where, *(str(part) for part in problem["loc"]))))
+    text = problem["msg"].removeprefix("Value error, ")
+    value = problem["input"]
+    shown = f" = {value!r}" if isinstance(value, (str, int, float, bool)) or value is None else ""
+    return f"{key}{shown}: {text}" if key else text
 
 
 def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:

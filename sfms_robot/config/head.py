@@ -3,20 +3,99 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, find, load
-from sfms_robot.frames import CHANNEL_INDEX
+from sfms_robot.config.drives import expanded, problems
+from sfms_robot.config.kinematics import Kinematics
+from sfms_robot.config.kinematics import problems as neck_problems
+from sfms_robot.config.life import Life
+from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
+
+FaultPolicy = Literal["hold", "limp", "reduce", "reboot_and_ease_in"]
+MEASURED_FAULTS = ("input voltage", "overheating")  # those a threshold may be given for
 
 
 class Bus(Model):
-    """One named bus of a head."""
+    """One named bus of a head.
 
-    family: Literal["dynamixel"]
+    `read_deadline_ms` is the silence that makes a servo silent. `fast_read`: all servos answer in one packet; "auto"
+    tries it at start. `watchdog_ms` 0 leaves the servos' own watchdog off. `stagger_ms` lies between two servos whose
+    torque comes on. A bus on which nobody answers for `reconnect_s` has failed.
+    """
+
+    family: Literal["dynamixel", "dynamixel1", "feetech", "maestro", "ssc32"]
     baud: Annotated[int, Field(gt=0)]
     rate_hz: Positive = 100.0
+    read_deadline_ms: Positive = 3.0
+    fast_read: Literal["auto", "on", "off"] = "auto"
+    watchdog_ms: Annotated[int, Field(ge=0, le=2540)] = 200
+    stagger_ms: NonNegative = 5.0
+    reconnect_s: Positive = 30.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _yaml_switch(cls, value: Any) -> Any:
+        """YAML reads a bare `on` and `off` as true and false."""
+        if isinstance(value, dict) and isinstance(fast := value.get("fast_read"), bool):
+            return {**value, "fast_read": "on" if fast else "off"}
+        return value
+
+
+class LoadRule(Model):
+    """A present current above `current_mA` for `for_s` without a break, and what then happens to the joint."""
+
+    current_mA: Positive
+    for_s: Positive
+    then: Literal["hold", "limp", "reduce"] = "limp"
+
+
+class Safety(Model):
+    """How gentle a joint is, and what happens when its servo reports a fault.
+
+    Attributes:
+        current_limit_mA: the servo never pushes harder; needs a servo with a current sensor.
+        on_fault: hold where it is, limp (torque off), reduce (half the force), or reboot and ease in again.
+        pinch: something is in the way. By default 60 % of the servo's own current limit for half a second: limp.
+        strain: a pose that takes force for long heats the servo and makes it sing. Off by default.
+        stop: at the end of a run, once at rest: torque off, or kept.
+        registers: raw values written before torque comes on, such as gains.
+    """
+
+    current_limit_mA: Positive | None = None
+    on_fault: FaultPolicy = "limp"
+    pinch: LoadRule | None = None
+    strain: LoadRule | None = None
+    stop: Literal["release", "hold"] = "release"
+    registers: dict[Name, int] = Field(default_factory=dict)
+
+    def merged(self, other: Safety | None) -> Safety:
+        """This, and over it what `other` gives explicitly."""
+        return self if other is None else self.model_copy(update={k: getattr(other, k) for k in other.model_fields_set})
+
+
+class Threshold(Model):
+    """A fault counts only when what it is about lies outside min..max (V for voltage, degC for heat)."""
+
+    min: Finite | None = None
+    max: Finite | None = None
+
+
+class Faults(Model):
+    """Which of the servos' faults are acted upon, by the names in the firmware map."""
+
+    mask: tuple[str, ...] = ()
+    thresholds: dict[str, Threshold] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _measurable(self) -> Faults:
+        for name in self.thresholds:
+            if name not in MEASURED_FAULTS:
+                raise ValueError(f"thresholds.{name} is about nothing that is measured ({', '.join(MEASURED_FAULTS)})")
+        return self
 
 
 class LimitClass(Model):
@@ -27,51 +106,14 @@ class LimitClass(Model):
     jerk_deg_s3: Positive
 
 
-class Expression(Model):
-    """A node of a joint's drive: one channel, or a sum, maximum or mean of nodes; then x gain + offset, clamped.
-
-    A bare channel name stands for `{channel: NAME}`.
-    """
-
-    channel: str | None = None
-    sum: tuple[Expression, ...] | None = None
-    max: tuple[Expression, ...] | None = None
-    mean: tuple[Expression, ...] | None = None
-    gain: Finite = 1.0
-    offset: Finite = 0.0
-    clamp: tuple[Finite, Finite] | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _bare_name(cls, value: Any) -> Any:
-        return {"channel": value} if isinstance(value, str) else value
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> Expression:
-        kinds = [k for k in ("channel", "sum", "max", "mean") if getattr(self, k) is not None]
-        if len(kinds) != 1:
-            raise ValueError(f"needs exactly one of channel, sum, max, mean; has {', '.join(kinds) or 'none'}")
-        if self.channel is not None and self.channel not in CHANNEL_INDEX:
-            raise ValueError(f"{self.channel!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
-        for kind in ("sum", "max", "mean"):
-            if getattr(self, kind) == ():
-                raise ValueError(f"{kind} is empty")
-        if self.clamp is not None and self.clamp[0] >= self.clamp[1]:
-            raise ValueError(f"clamp {list(self.clamp)} is reversed or empty")
-        return self
-
-    def channels(self) -> set[str]:
-        """Every channel below this node."""
-        if self.channel is not None:
-            return {self.channel}
-        return set().union(*(node.channels() for node in self.sum or self.max or self.mean or ()))
-
-
 class Joint(Model):
     """One joint: where it sits on a bus, how far and fast it may go, and what drives it.
 
     Ticks = zero_ticks + sign * ratio * angle / (angle per tick of the servo). `drive` is in units of the range
     (-1 = min, 0 = rest, +1 = max) when `unit` is "range", in radians when it is "rad".
+
+    With `mirror_of` the joint takes over whatever it does not give itself from its twin on the other side, with the
+    drive (and for `mirror_sense: opposite` the range) turned round; `sign` then differs when the sense is the same.
     """
 
     bus: Name
@@ -87,6 +129,9 @@ class Joint(Model):
     lag_ms: NonNegative = 0.0
     unit: Literal["range", "rad"] = "range"
     drive: Expression | None = None
+    mirror_of: Name | None = None
+    mirror_sense: Literal["same", "opposite"] = "same"
+    safety: Safety | None = None  # over that of the head
     note: str = ""
 
     @model_validator(mode="after")
@@ -95,6 +140,8 @@ class Joint(Model):
             raise ValueError(f"min_deg {self.min_deg:g} is not below max_deg {self.max_deg:g}: limits reversed")
         if not self.min_deg <= self.rest_deg <= self.max_deg:
             raise ValueError(f"rest_deg {self.rest_deg:g} is outside {self.min_deg:g}..{self.max_deg:g}")
+        if self.mirror_of is not None and self.drive is not None:
+            raise ValueError(f"has a drive and is mirror_of {self.mirror_of!r}: one of them")
         return self
 
     @property
@@ -110,34 +157,81 @@ class Joint(Model):
         return math.radians(self.rest_deg)
 
 
+class JointDefaults(Model):
+    """What every joint has that does not say otherwise."""
+
+    bus: Name | None = None
+    model: str | None = None
+    zero_ticks: int | None = None
+    ratio: Positive | None = None
+    min_deg: Finite | None = None
+    max_deg: Finite | None = None
+    limits: Name | None = None
+    lag_ms: NonNegative | None = None
+    unit: Literal["range", "rad"] | None = None
+
+
 class Head(Model):
-    """A head: `configs/heads/NAME/head.yaml`."""
+    """A head: `configs/heads/NAME/head.yaml`.
+
+    `calibrate_first`: zeros and ranges differ from build to build, so that on real servos the head moves little and
+    slowly until somebody has measured them.
+    """
 
     name: Name
     description: str
+    calibrate_first: bool = False
     buses: Annotated[dict[Name, Bus], Field(min_length=1)]
     limits: dict[Name, LimitClass]
+    safety: Safety = Safety()
+    faults: Faults = Faults()
+    joint_defaults: JointDefaults = JointDefaults()
     joints: Annotated[dict[Name, Joint], Field(min_length=1)]
+    expressions: dict[Name, Expression] = Field(default_factory=dict)
+    couplings: tuple[Coupling, ...] = ()
+    folds: tuple[Fold, ...] = ()
+    regions: dict[Name, Region] = Field(default_factory=dict)
+    kinematics: Kinematics | None = None
+    life: Life = Life()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expanded(cls, value: Any) -> Any:
+        return expanded(value)
 
     @model_validator(mode="after")
     def _consistent(self) -> Head:
-        seen: dict[tuple[str, int], str] = {}
-        for name, joint in self.joints.items():
-            if joint.bus not in self.buses:
-                raise ValueError(
-                    f"joints.{name}.bus = {joint.bus!r} is not a bus of this head ({', '.join(self.buses)})"
-                )
-            if joint.limits not in self.limits:
-                raise ValueError(
-                    f"joints.{name}.limits = {joint.limits!r} is not a limit class ({', '.join(self.limits)})"
-                )
-            other = seen.setdefault((joint.bus, joint.id), name)
-            if other != name:
-                raise ValueError(f"joints.{name}.id = {joint.id} is used twice on bus {joint.bus!r} (also by {other})")
+        found = wiring(self.joints, self.buses, self.limits)
+        found += problems(self.joints, self.expressions, self.couplings, self.folds, self.regions)
+        if self.kinematics is not None:
+            found += neck_problems(self.kinematics, self.joints, self.folds)
+        if found:
+            more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+            raise ValueError(found[0] + more)
         return self
+
+    def safety_of(self, joint: str) -> Safety:
+        return self.safety.merged(self.joints[joint].safety)
 
     def limit(self, joint: str) -> LimitClass:
         return self.limits[self.joints[joint].limits]
+
+
+def wiring(joints: Mapping[str, Joint | None], buses: Collection[str], limits: Collection[str]) -> list[str]:
+    """Every joint that is on no bus, of no limit class, or on another's id, one line each."""
+    found: list[str] = []
+    seen: dict[tuple[str, int], str] = {}
+    for name, joint in joints.items():
+        if joint is None:
+            continue
+        if joint.bus not in buses:
+            found.append(f"joints.{name}.bus = {joint.bus!r} is not a bus of this head ({', '.join(buses)})")
+        if joint.limits not in limits:
+            found.append(f"joints.{name}.limits = {joint.limits!r} is not a limit class ({', '.join(limits)})")
+        other = seen.setdefault((joint.bus, joint.id), name)
+        if other != name:
+            found.append(f"joints.{name}.id = {joint.id} is used twice on bus {joint.bus!r} (also by {other})")
+    return found
 
 
 def load_head(name: str) -> Head:

@@ -21,6 +21,7 @@ class ChannelGroup(Model):
     levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
     keyframes: Count
     transition_bias: Finite = 0.0
+    nucleus: Annotated[float, Field(gt=0, le=1)] | None = None
 
     @model_validator(mode="after")
     def _known(self) -> ChannelGroup:
@@ -114,6 +115,7 @@ class PredictorTraining(Model):
     history_noise: Share = 0.05
     gain_db: NonNegative = 6.0
     group_weights: dict[Name, Positive] = {}
+    calibration_rounds: Annotated[int, Field(ge=0)] = 2
 
 
 class Training(Model):

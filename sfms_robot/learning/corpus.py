@@ -71,11 +71,16 @@ def _heard(dyad: Dyad) -> Tensor:
 
 
 def fit_scales(model: SfmsModel, corpus: Corpus) -> None:
-    """Set the model's means and deviations. Deviations have floors, so that a still channel's noise is not blown up."""
-    floor = torch.full((MOTION_DIM,), 0.04)
-    floor[:3], floor[3:6] = 0.01, 0.01  # [rad], [m]
+    """Set the model's means, deviations and speeds.
+
+    Deviations are kept between what an eye just sees and what nobody misses: a still channel's noise is not blown up,
+    and small movements of a channel that also makes large ones (a turning head) still count.
+    """
+    least, most = torch.full((MOTION_DIM,), 0.04), torch.full((MOTION_DIM,), 0.12)
+    least[:3], most[:3] = 0.01, 0.03  # [rad]
+    least[3:6], most[3:6] = 0.01, 0.01  # [m]
     model.motion_mean.copy_(corpus.motion.mean(0))
-    model.motion_std.copy_(torch.maximum(corpus.motion.std(0), floor))
+    model.motion_std.copy_(corpus.motion.std(0).clamp(min=least, max=most))
     steps = (corpus.motion.diff(dim=0) / model.motion_std).abs()
     model.motion_speed.copy_(
         torch.stack([one.sort().values[int(0.9995 * len(one))] for one in steps.T]).clamp(min=0.05)

@@ -11,17 +11,20 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
-from sfms_robot.learning.corpus import Corpus, context, gather, place_all, windows
+from sfms_robot.learning.calibrate import calibrated
+from sfms_robot.learning.corpus import Corpus, context, gather, windows
 from sfms_robot.learning.datasets import clips
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.losses import next_tokens
 from sfms_robot.learning.tokenizer import WEIGHTS as TOKENIZER_WEIGHTS
+from sfms_robot.learning.tokens import tokenise
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
 from sfms_robot.listeners.sfms.stream import neutral_tokens
 
+CALIBRATION_DYADS = 8
 LN_PER_DB = math.log(10) / 10  # of power
 
 
@@ -36,14 +39,20 @@ def train_listener(
     torch.manual_seed(settings.seed)
     model = SfmsModel(settings.listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
-    corpus = gather(clips.load(data / "train"), settings.listener.window_frames)
-    held_out = gather(clips.load(data / "validation"), settings.listener.window_frames)
+    dyads = clips.load(data / "train")
+    corpus = gather(dyads, settings.listener.window_frames)
     model.train()
     try:
         loss = _fit(model, corpus, settings, each_step)
     finally:
         checkpoint.save_config(out, corrected(settings))
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
+    rounds = settings.predictor.calibration_rounds
+    some = dyads[:: max(1, len(dyads) // CALIBRATION_DYADS)][
+        :CALIBRATION_DYADS
+    ]  # of the training set: held out stays so
+    checkpoint.save_config(out, calibrated(corrected(settings), model, some, rounds))
+    held_out = gather(clips.load(data / "validation"), settings.listener.window_frames)
     return {"loss": loss, "held_out_loss": held_out_loss(model, held_out, settings)}
 
 
@@ -55,15 +64,6 @@ def corrected(settings: config.Training) -> config.Listener:
         for name, group in settings.listener.groups.items()
     }
     return settings.listener.model_copy(update={"groups": groups})
-
-
-@torch.no_grad()
-def tokenise(model: SfmsModel, corpus: Corpus) -> Tensor:
-    """Tokens (N, G) of every listener in the corpus."""
-    motion = model.standardise(corpus.motion)
-    mask = place_all(model.tokenizer, motion, corpus.lengths)
-    parts = zip(torch.split(motion, 4096), torch.split(mask, 4096), strict=True)
-    return torch.cat([model.tokenizer.encode(m[None], k[None])[0] for m, k in parts])
 
 
 def _fit(

@@ -6,7 +6,7 @@ allows one tick more per period.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,12 @@ class Audit:
     def start(self, angles_rad: Doubles) -> AuditState:
         """Standing still at `angles_rad` (J,), where the limiter started."""
         return AuditState(np.tile(angles_rad, (3, 1)), self._calibration.to_ticks(angles_rad))
+
+    def restart(self, joints: NDArray[np.bool_], angles_rad: Doubles, state: AuditState) -> AuditState:
+        """Some `joints` (J,) were away and stand still at `angles_rad` (J,); their way there was not commanded."""
+        recent = np.where(joints, angles_rad, state.recent_rad)
+        ticks = np.where(joints, self._calibration.to_ticks(angles_rad), state.ticks)
+        return replace(state, recent_rad=recent, ticks=ticks)
 
     def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: AuditState) -> AuditState:
         """Count one command (J,) against the limits, and against `wanted_rad` (J,), what the limiter was asked for.

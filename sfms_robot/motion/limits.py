@@ -19,7 +19,7 @@ the same limits. A reference that is not finite is refused: the joint brakes, an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import ruckig
@@ -102,6 +102,15 @@ class JerkLimiter:
         still = np.zeros_like(self._low)
         low, high = np.minimum(self._low, angles_rad), np.maximum(self._high, angles_rad)
         return LimiterState(np.stack([angles_rad, still, still]), low, high)
+
+    def restart(self, joints: Bools, angles_rad: Doubles, state: LimiterState) -> LimiterState:
+        """Some `joints` (J,) stand still at `angles_rad` (J,), in their range or not; the others go on."""
+        motion = np.where(
+            joints, np.stack([angles_rad, np.zeros_like(angles_rad), np.zeros_like(angles_rad)]), state.motion
+        )
+        low = np.where(joints, np.minimum(self._low, angles_rad), state.low)
+        high = np.where(joints, np.maximum(self._high, angles_rad), state.high)
+        return replace(state, motion=motion, low=low, high=high)
 
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Reference (3, J) one tick ahead -> angles (J,) that may be sent, and the state after the tick."""

@@ -1,127 +1,146 @@
-"""Motion -> joint angles of one head, as its file says: every joint is an expression over channels.
+"""Motion -> joint angles of one head, as its file says.
 
-The expressions of all joints are one forest. It is compiled once into levels, deepest first: all leaves are one
-gather from the motion, and every level above is one `reduceat` over its children, then gain, offset and clamp.
-So the cost does not depend on how the file is written, only a little on how deep the deepest expression is.
+    drives -> range -> knobs -> couplings
+
+in joint units: -1 = min, 0 = rest, +1 = max, or radians from rest. Everything is a function of the motion alone, so
+that the neutral face is the rest pose whatever came before, and of the knobs, which may be others at every call.
+
+A value u inside its range, |u| = 1 at the end of it, leaves the knobs as intensity x u x (1 + (style - 1)(1 - |u|)):
+style bends the response without moving its ends, so that small motions come out doubled (2) or vanish (0).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping as Table
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.config import Expression, Head
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
-
-Indices = NDArray[np.intp]
+from sfms_robot.config import Coupling, Head, drives
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNELS, MOTION_DIM, Doubles, Floats
+from sfms_robot.retarget.compile import Indices, Program
 
 
 @dataclass(frozen=True)
-class _Affine:
-    """gain x value + offset, clamped; all (n,)."""
+class Knobs:
+    """How much every joint shows, (J,) each, 0..2 and 1 for as it is; made by `Mapping.knobs`."""
 
-    gain: Doubles
-    offset: Doubles
-    low: Doubles
-    high: Doubles
+    intensity: Doubles
+    style: Doubles
+
+    @property
+    def neutral(self) -> bool:
+        return bool((self.intensity == 1).all() and (self.style == 1).all())
+
+
+@dataclass(frozen=True)
+class _Couplings:
+    """C sums of joints that may not fall below a bound: weights (C, J), at_least (C,).
+
+    `turns`: who gives way first, second, ...: for some of the couplings, the joint and its weight.
+    """
+
+    weights: Doubles
+    at_least: Doubles
+    turns: tuple[tuple[Indices, Indices, Doubles], ...]
 
     @classmethod
-    def of(cls, nodes: Sequence[Expression]) -> _Affine:
-        clamps = [node.clamp or (-np.inf, np.inf) for node in nodes]
-        return cls(
-            np.array([node.gain / len(node.mean or (1,)) for node in nodes]),
-            np.array([node.offset for node in nodes]),
-            np.array([low for low, _ in clamps]),
-            np.array([high for _, high in clamps]),
-        )
+    def of(cls, couplings: Sequence[Coupling], joints: Sequence[str]) -> _Couplings:
+        weights = np.array([[coupling.keep.get(name, 0.0) for name in joints] for coupling in couplings])
+        turns = []
+        for turn in range(max(len(coupling.moving) for coupling in couplings)):
+            rows = np.array([row for row, c in enumerate(couplings) if len(c.moving) > turn], dtype=np.intp)
+            columns = np.array([joints.index(couplings[row].moving[turn]) for row in rows], dtype=np.intp)
+            turns.append((rows, columns, weights[rows, columns]))
+        return cls(weights, np.array([coupling.at_least for coupling in couplings]), tuple(turns))
 
-    def __call__(self, values: Doubles) -> Doubles:
-        values = values * self.gain
-        values += self.offset
-        np.maximum(values, self.low, out=values)
-        return np.minimum(values, self.high, out=values)
-
-
-@dataclass(frozen=True)
-class _Level:
-    """Nodes whose children lie side by side one level below, from `starts` on."""
-
-    starts: Indices
-    largest: NDArray[np.bool_]  # the maximum of its children, else their sum
-    affine: _Affine
-
-    def __call__(self, below: Doubles) -> Doubles:
-        values: Doubles = np.add.reduceat(below, self.starts, axis=-1)
-        if self.largest.any():
-            values = np.where(self.largest, np.maximum.reduceat(below, self.starts, axis=-1), values)
-        return self.affine(values)
+    def apply(self, values: Doubles, low: Doubles, high: Doubles) -> None:
+        """Change values (..., J), which lie inside low..high (J,), as far as it takes and the ranges allow."""
+        missing = np.maximum(self.at_least - values @ self.weights.T, 0.0)
+        if not missing.any():
+            return
+        for rows, columns, weights in self.turns:
+            now = values[..., columns]
+            there = np.minimum(np.maximum(now + missing[..., rows] / weights, low[columns]), high[columns])
+            values[..., columns] = there
+            missing[..., rows] -= (there - now) * weights
 
 
 class Mapping:
-    """Implements `ports.Retargeter` for one head.
+    """Implements `ports.Retargeter` for one head. A joint without a drive stays at rest.
 
-    Angle = rest + u x (max - rest) for u > 0 and rest + u x (rest - min) below, where `unit` is "range"; rest + u
-    where it is "rad"; always clamped to the range of the joint. A joint without a drive stays at rest.
+    Attributes:
+        joints: names, in the order of the head's file.
+        blind_channels: channels that no drive follows.
+        dead_joints: joints without a drive.
     """
 
     def __init__(self, head: Head) -> None:
         self.joints: Sequence[str] = tuple(head.joints)
+        self._regions = head.regions
         joints = list(head.joints.values())
-        self._low = np.array([joint.min_rad for joint in joints])
-        self._rest = np.array([joint.rest_rad for joint in joints])
-        self._high = np.array([joint.max_rad for joint in joints])
+        self._low_rad = np.array([joint.min_rad for joint in joints])
+        self._rest_rad = np.array([joint.rest_rad for joint in joints])
+        self._high_rad = np.array([joint.max_rad for joint in joints])
+        up, down = self._high_rad - self._rest_rad, self._rest_rad - self._low_rad
         in_rad = np.array([joint.unit == "rad" for joint in joints])
-        self._up = np.where(in_rad, 1.0, self._high - self._rest)
-        self._down = np.where(in_rad, 1.0, self._rest - self._low)
+        self._up, self._down = np.where(in_rad, 1.0, up), np.where(in_rad, 1.0, down)
+        self._high, self._low = np.where(in_rad, up, up > 0), -np.where(in_rad, down, down > 0)
 
-        still = Expression(channel=CHANNELS[0], gain=0.0)
-        forest = [(row, joint.drive or still) for row, joint in enumerate(joints)]
-        depth = max(_depth(tree) for _, tree in forest)
-        self._levels: list[_Level] = []
-        for _ in range(depth):
-            level, forest = _level(forest)
-            self._levels.insert(0, level)
-        self._rows = np.array([row for row, _ in forest], dtype=np.intp)
-        self._columns = np.array([CHANNEL_INDEX[leaf.channel or ""] for _, leaf in forest], dtype=np.intp)
-        self._leaves = _Affine.of([leaf for _, leaf in forest])
-        driven = set[str]().union(*(joint.drive.channels() for joint in joints if joint.drive))
-        self.blind_channels: Sequence[str] = tuple(name for name in CHANNELS if name not in driven)
+        trees = drives(head)
+        self._program = Program.of(list(trees.values()))
+        self._couplings = _Couplings.of(head.couplings, self.joints) if head.couplings else None
+        followed = set[str]().union(*(tree.channels() for tree in trees.values() if tree))
+        self.blind_channels: Sequence[str] = tuple(name for name in CHANNELS if name not in followed)
+        self.dead_joints: Sequence[str] = tuple(name for name, tree in trees.items() if tree is None)
+        self._knobs = self.knobs()
 
-    def angles(self, motion: Floats) -> Doubles:
+    def knobs(self, intensity: Table[str, float] | None = None, style: Table[str, float] | None = None) -> Knobs:
+        """Knobs per region over those of the head's file. Raises ConfigError for an unknown region or a bad value."""
+        values = {"intensity": np.ones(len(self.joints)), "style": np.ones(len(self.joints))}
+        for kind, given in (("intensity", intensity or {}), ("style", style or {})):
+            for name, value in given.items():
+                if name not in self._regions:
+                    choices = ", ".join(self._regions) or "none"
+                    raise ConfigError(f"{kind}: {name!r} is not a region of this head ({choices})")
+                if not 0 <= value <= 2:
+                    raise ConfigError(f"{kind} of {name} = {value:g} is not in 0..2")
+            for name, region in self._regions.items():
+                where = [self.joints.index(joint) for joint in region.joints]
+                values[kind][where] = given.get(name, getattr(region, kind))
+        return Knobs(**values)
+
+    def angles(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
         """(58,) for all joints, or (..., J, 58) with row j for joint j -> rad (J,) or (..., J), float64.
 
-        Raises ValueError, naming the channel, where the motion is not finite: clipping would hide it.
+        Without `knobs` those of the head's file hold. Raises ValueError, naming the channel, where the motion is not
+        finite: clipping would hide it.
         """
         if motion.shape[-1:] != (MOTION_DIM,) or (motion.ndim > 1 and motion.shape[-2] != len(self.joints)):
             raise ValueError(f"motion is {motion.shape}, not (58,) or (..., {len(self.joints)}, {MOTION_DIM})")
         if not np.isfinite(motion).all():
             where = np.argwhere(~np.isfinite(motion))[0]
             raise ValueError(f"motion channel {CHANNELS[where[-1]]} is {motion[tuple(where)]}")
-        rows = (self._rows, self._columns) if motion.ndim > 1 else (self._columns,)
-        values = self._leaves(motion[(..., *rows)].astype(np.float64))
-        for level in self._levels:
-            values = level(values)
-        angles = self._rest + values * np.where(values > 0, self._up, self._down)
-        clamped: Doubles = np.minimum(np.maximum(angles, self._low), self._high)
-        return clamped
+        values = self._inside(self._program(motion))
+        knobs = knobs or self._knobs
+        if not knobs.neutral:
+            values = self._inside(self._turned(values, knobs))
+        if self._couplings is not None:
+            self._couplings.apply(values, self._low, self._high)
+        angles: Doubles = self._rest_rad + values * np.where(values > 0, self._up, self._down)
+        np.maximum(angles, self._low_rad, out=angles)
+        np.minimum(angles, self._high_rad, out=angles)
+        return angles
 
+    def _inside(self, values: Doubles) -> Doubles:
+        np.maximum(values, self._low, out=values)
+        np.minimum(values, self._high, out=values)
+        return values
 
-def _children(node: Expression) -> tuple[Expression, ...]:
-    return node.sum or node.max or node.mean or ()
-
-
-def _depth(node: Expression) -> int:
-    return 1 + max((_depth(child) for child in _children(node)), default=-1)
-
-
-def _level(forest: list[tuple[int, Expression]]) -> tuple[_Level, list[tuple[int, Expression]]]:
-    """One level, and the forest of its children. A leaf above the deepest level becomes a sum of itself alone."""
-    nodes = [(row, node if _children(node) else Expression(sum=(node,))) for row, node in forest]
-    groups = [[(row, child) for child in _children(node)] for row, node in nodes]
-    starts = np.cumsum([0, *(len(group) for group in groups[:-1])])
-    largest = np.array([node.max is not None for _, node in nodes])
-    level = _Level(starts, largest, _Affine.of([node for _, node in nodes]))
-    return level, [child for group in groups for child in group]
+    def _turned(self, values: Doubles, knobs: Knobs) -> Doubles:
+        ends = np.where(values > 0, self._high, -self._low)
+        share = np.abs(values) / np.where(ends > 0, ends, 1.0)
+        turned: Doubles = values * knobs.intensity * (1.0 + (knobs.style - 1.0) * (1.0 - share))
+        return turned

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Audit
@@ -53,6 +54,10 @@ class RunLog:
     def start(self, held_rad: Doubles) -> None:
         """Torque came on at `held_rad` (J,)."""
         self.audited = self.audit.start(held_rad)
+
+    def restart(self, joints: NDArray[np.bool_], held_rad: Doubles) -> None:
+        """Some `joints` (J,) were away and hold `held_rad` (J,) now."""
+        self.audited = self.audit.restart(joints, held_rad, self.audited)
 
     def heard(self, frame: SpeakerFrame) -> None:
         self.frames += 1

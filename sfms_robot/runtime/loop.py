@@ -9,14 +9,26 @@ that whatever happens, the last whole state is there to come to rest from. The r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from sfms_robot.frames import Doubles
-from sfms_robot.ports import Bus, Clock, Limiter, Observer, PlanFeed, Retargeter, Source, StopPolicy, Tick, Timeline
+from sfms_robot.frames import Doubles, Reading
+from sfms_robot.ports import (
+    Bus,
+    Clock,
+    Life,
+    Limiter,
+    Observer,
+    PlanFeed,
+    Retargeter,
+    Source,
+    StopPolicy,
+    Tick,
+    Timeline,
+)
 from sfms_robot.runtime.clock import Beat, beats
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.safety import EASE_S, come_to_rest, smooth
@@ -35,17 +47,21 @@ class Parts:
     observers: Sequence[Observer]
     leads_s: Doubles
     rest_rad: Doubles
+    life: Life | None = None
 
 
 @dataclass(frozen=True)
 class State:
-    """What one tick hands to the next: the pose torque came on in, and two reference samples (J,) each."""
+    """What one tick hands to the next: the pose torque came on in and when, and two reference samples (J,) each."""
 
     timeline: Any
     limiter: Any
     held_rad: Doubles
+    since_s: Doubles
     before_rad: Doubles
     here_rad: Doubles
+    life: Any = None
+    retargeter: Any = None
 
 
 def drive(
@@ -65,7 +81,9 @@ def drive(
     try:
         held_rad = parts.bus.enable(parts.retargeter.joints)
         log.start(held_rad)
-        state = State(parts.timeline.start(), parts.limiter.start(held_rad), held_rad, held_rad, held_rad)
+        limiter, life = parts.limiter.start(held_rad), parts.life.start() if parts.life else None
+        state = State(parts.timeline.start(), limiter, held_rad, 0 * held_rad, held_rad, held_rad, life)
+        state = replace(state, retargeter=parts.retargeter.start())
         start_s = clock.now_s()
         try:
             for beat in beats(clock, rate_hz, start_s):
@@ -102,8 +120,12 @@ def _tick(parts: Parts, log: RunLog, clock: Clock, beat: Beat, state: State, sta
 
     times_s = np.concatenate([[now_s], now_s + parts.leads_s + period_s])
     motion, timeline = parts.timeline.sample(times_s, now_s, timeline)
-    asked_rad = parts.retargeter.angles(motion[1:])
-    ahead_rad = state.held_rad + smooth((now_s + period_s) / EASE_S) * (asked_rad - state.held_rad)
+    life = state.life
+    if parts.life:
+        motion, life = parts.life.step(motion, times_s, now_s, life)
+    asked_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter)
+    eased = smooth((now_s + period_s - state.since_s) / EASE_S)
+    ahead_rad = state.held_rad + eased * (asked_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)
 
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)
@@ -114,7 +136,25 @@ def _tick(parts: Parts, log: RunLog, clock: Clock, beat: Beat, state: State, sta
     seen = Tick(now_s, motion[0], goals_rad, readings)
     for observer in parts.observers:
         observer.tick(seen)
-    return replace(state, timeline=timeline, limiter=limiter, before_rad=state.here_rad, here_rad=ahead_rad)
+    state = replace(state, timeline=timeline, life=life, retargeter=retargeter, limiter=limiter)
+    state = replace(state, before_rad=state.here_rad, here_rad=ahead_rad)
+    return _rejoined(parts, log, readings, state, now_s)
+
+
+def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: State, now_s: float) -> State:
+    """Joints that were away ease in again from where they stand, as all did when torque came on."""
+    joints = parts.retargeter.joints
+    back = np.array([joint in readings and readings[joint].rejoined for joint in joints])
+    if not back.any():
+        return state
+    stands = np.array(
+        [readings[joint].position_rad if there else 0.0 for joint, there in zip(joints, back, strict=True)]
+    )
+    log.restart(back, stands)
+    held, since = np.where(back, stands, state.held_rad), np.where(back, now_s, state.since_s)
+    before, here = np.where(back, stands, state.before_rad), np.where(back, stands, state.here_rad)
+    limiter = parts.limiter.restart(back, stands, state.limiter)
+    return replace(state, limiter=limiter, held_rad=held, since_s=since, before_rad=before, here_rad=here)
 
 
 def difference(before: Doubles, here: Doubles, ahead: Doubles, period_s: float) -> Doubles:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,12 +24,13 @@ SETTLE_S = 2.0  # a slow joint may need longer than EASE_S; after this the torqu
 ARRIVED_RAD = 1e-4
 SWITCH_S = 0.0005  # Python's own 5 ms is half a tick
 
+T = TypeVar("T", float, Doubles)
 logger = logging.getLogger(__name__)
 
 
-def smooth(u: float) -> float:
+def smooth(u: T) -> T:
     """0 -> 0, 1 -> 1 with speed and acceleration zero at both ends (quintic)."""
-    u = min(1.0, max(0.0, u))
+    u = np.clip(u, 0.0, 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 

@@ -27,7 +27,7 @@ def test_the_report_has_what_it_promises(report):
     assert set(report["motion"]) == {"nods", "blinks", "smiles"}
     assert report["limits"]["violations"] == 0
     bus = report["bus"]
-    assert bus["writes"] == bus["reads"] == report["ticks"]
+    assert bus["writes"] == report["ticks"] <= bus["reads"]
     assert (bus["errors"], bus["silent"], bus["faults"]) == (0, [], [])
 
 

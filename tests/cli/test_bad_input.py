@@ -71,7 +71,7 @@ def test_an_unknown_head_and_an_unknown_listener(fails):
 
 
 def test_a_joint_given_twice(fails, tmp_path):
-    (tmp_path / "head.yaml").write_text(HEAD.read_text().replace("  jaw:\n    bus", "  neck_yaw:\n    bus"))
+    (tmp_path / "head.yaml").write_text(HEAD.read_text().replace("  jaw: {id", "  neck_yaw: {id"))
     code, told = fails("run", "--head", tmp_path)
     assert code == 2 and "head.yaml:" in told and "'neck_yaw' is given twice" in told
 

@@ -7,12 +7,12 @@ from sfms_robot.config import load_head
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
-from sfms_robot.retarget.mapping import Mapping
+from sfms_robot.retarget.head import HeadRetargeter
 from sfms_robot.runtime.loop import difference
 
 TICK_S, HORIZON, HOP, LATENCY_TICKS = 0.01, 8, 4, 2
 HEAD = load_head("face28")
-MAPPING, LIMITER, TIMELINE = Mapping(HEAD), JerkLimiter(JointLimits.of(HEAD), TICK_S), PlanTimeline(TICK_S)
+MAPPING, LIMITER, TIMELINE = HeadRetargeter(HEAD), JerkLimiter(JointLimits.of(HEAD), TICK_S), PlanTimeline(TICK_S)
 LEADS_S = np.array([joint.lag_ms / 1000 for joint in HEAD.joints.values()])
 JOINTS = list(HEAD.joints)
 

@@ -7,12 +7,14 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
-from sfms_robot.retarget.mapping import Mapping
+from sfms_robot.retarget.head import HeadRetargeter
 
 HEAD = load_head("face28")
-MAPPING = Mapping(HEAD)
+MAPPING = HeadRetargeter(HEAD)
 JOINTS = list(HEAD.joints)
 REST = np.array([joint.rest_rad for joint in HEAD.joints.values()])
+LOW = np.array([joint.min_rad or -1.0 for joint in HEAD.joints.values()])
+HIGH = np.array([joint.max_rad or 1.0 for joint in HEAD.joints.values()])
 TURNS_ROUND = {"neck_yaw", "neck_roll", "tongue_side", "eye_pan_left", "eye_pan_right"}  # + is to one side
 
 
@@ -55,6 +57,13 @@ def test_a_mirrored_face_gives_mirrored_joints(seed):
     assert MAPPING.angles(mirrored) == pytest.approx(signs * wanted, abs=1e-6)
 
 
+def test_every_region_can_be_turned_to_rest():
+    motion = np.ones(MOTION_DIM, np.float32)
+    still = MAPPING.mapping.knobs(intensity=dict.fromkeys(HEAD.regions, 0.0))
+    moved = np.array(JOINTS)[MAPPING.angles(motion, still) != REST]
+    assert moved.size == 0
+
+
 def test_channels_that_this_head_cannot_show_are_listed():
     assert MAPPING.blind_channels == (
         "x", "y", "z", "cheekPuff", "jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight",
@@ -78,6 +87,34 @@ def test_a_lid_closes_with_a_blink_whatever_else_the_eye_does(joint):
     top = HEAD.joints[joint].max_deg
     for other in ({}, {f"eyeLookUp{side}": 1.0}, {f"eyeWide{side}": 1.0}):
         assert angle_deg(joint, **{f"eyeBlink{side}": 0.86}, **other) == pytest.approx(top)
+
+
+@pytest.mark.parametrize(
+    "channels, closure",
+    [
+        ({"eyeBlinkLeft": 0.4}, 0.4),
+        ({"eyeLookDownLeft": 0.6}, 0.27),
+        ({"eyeSquintLeft": 0.5, "cheekSquintLeft": 0.5}, 0.29),
+        ({"eyeWideLeft": 0.5}, -0.175),
+        ({"eyeWideLeft": 0.5, "eyeBlinkLeft": 0.5}, 0.4125),  # widening gives way to a blink
+        ({"eyeLookUpLeft": 0.8}, -0.27),
+    ],
+)
+def test_the_upper_lid_adds_up_blink_squint_gaze_and_widening(channels, closure):
+    end_deg = HEAD.joints["lid_left"].max_deg if closure > 0 else -HEAD.joints["lid_left"].min_deg
+    assert angle_deg("lid_left", **channels) == pytest.approx(closure * end_deg, abs=1e-4)
+
+
+def test_the_lips_never_cross_whatever_the_mouth_does():
+    rng = np.random.default_rng(1)
+    motion = np.zeros((2000, MOTION_DIM), np.float32)
+    motion[:, 6:] = rng.choice([0.0, 0.3, 1.0], (2000, MOTION_DIM - 6))
+    angles = np.array([MAPPING.angles(row) for row in motion])
+    units = angles / np.where(angles > 0, HIGH, -LOW)
+    column = {name: units[:, JOINTS.index(name)] for name in JOINTS}
+    for part in ("left", "right", "centre"):
+        gap = column[f"lip_upper_{part}"] + column[f"lip_lower_{part}"] + column["jaw"]
+        assert gap.min() >= -0.3 - 1e-9, part
 
 
 def test_a_lid_follows_gaze_squint_and_surprise():

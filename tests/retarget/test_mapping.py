@@ -1,7 +1,10 @@
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
 
 from sfms_robot.config import Bus, Expression, Head, Joint, LimitClass
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
@@ -25,37 +28,46 @@ def head_of(*drives, **joint) -> Head:
 def value(node: Expression, motion) -> float:
     """The meaning of an expression, written the slow way."""
     if node.channel:
-        inner = float(motion[CHANNEL_INDEX[node.channel]])
+        u = float(motion[CHANNEL_INDEX[node.channel]])
     else:
-        parts = [value(child, motion) for child in node.sum or node.max or node.mean]
-        inner = max(parts) if node.max else sum(parts) / (len(parts) if node.mean else 1)
-    inner = inner * node.gain + node.offset
-    return inner if node.clamp is None else min(max(inner, node.clamp[0]), node.clamp[1])
+        parts = [value(child, motion) for child in node.parts]
+        u = {"sum": sum, "max": max, "min": min, "mean": np.mean, "product": np.prod}[node.group](parts)
+    u = math.copysign(max(abs(u) - node.dead_band, 0.0), u)
+    if node.curve:
+        x, y = np.array(node.curve).T
+        u = float(PchipInterpolator(x, y)(min(max(u, x[0]), x[-1])))
+    down, up = node.gains
+    u = u * (up if u > 0 else down) + node.offset
+    return u if node.clamp is None else min(max(u, node.clamp[0]), node.clamp[1])
 
 
 small = st.floats(-2, 2)
-leaves = st.builds(
-    lambda channel, gain, offset: Expression(channel=channel, gain=gain, offset=offset),
-    st.sampled_from(CHANNELS),
-    small,
-    small,
+curves = st.lists(
+    st.tuples(st.integers(-20, 20), st.integers(-20, 20)), min_size=2, max_size=5, unique_by=lambda point: point[0]
+).map(lambda points: tuple(sorted((x / 10, y / 10) for x, y in points)))
+shapes = st.fixed_dictionaries(
+    {"gain": small, "offset": small},
+    optional={
+        "gain_up": small,
+        "gain_down": small,
+        "dead_band": st.floats(0, 0.5),
+        "clamp": st.just((-0.5, 0.5)),
+        "curve": curves,
+    },
 )
+leaves = st.builds(lambda channel, shape: Expression(channel=channel, **shape), st.sampled_from(CHANNELS), shapes)
 
 
 def grown(children):
     return st.builds(
-        lambda kind, parts, gain, offset, clamp: Expression(
-            **{kind: tuple(parts)}, gain=gain, offset=offset, clamp=(-0.5, 0.5) if clamp else None
-        ),
-        st.sampled_from(["sum", "max", "mean"]),
+        lambda kind, parts, shape: Expression(**{kind: tuple(parts)}, **shape),
+        st.sampled_from(["sum", "max", "min", "mean", "product"]),
         st.lists(children, min_size=1, max_size=4),
-        small,
-        small,
-        st.booleans(),
+        shapes,
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.lists(st.none() | st.recursive(leaves, grown, max_leaves=10), min_size=1, max_size=6),
     st.sampled_from(["range", "rad"]),
@@ -69,7 +81,7 @@ def test_angles_are_what_the_expressions_mean(drives, unit, seed):
         u = value(joint.drive, row) if joint.drive else 0.0
         span = joint.max_rad - joint.rest_rad if u > 0 else joint.rest_rad - joint.min_rad
         wanted = joint.rest_rad + u * (span if unit == "range" else 1.0)
-        assert angle == pytest.approx(min(max(wanted, joint.min_rad), joint.max_rad), abs=1e-9)
+        assert angle == pytest.approx(min(max(wanted, joint.min_rad), joint.max_rad), abs=1e-6)
 
 
 def test_each_joint_reads_its_own_row():

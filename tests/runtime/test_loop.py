@@ -100,7 +100,7 @@ def run(
     bus = build_bus(HEAD, {"main": chain}, clock)
     log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
     parts = Parts(
-        Recording(None, None, seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.mapping, motion.limiter,
+        Recording(None, None, seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.retargeter, motion.limiter,
         bus, [watcher], motion.leads_s, motion.rest_rad,
     )  # fmt: skip
 

@@ -9,16 +9,19 @@ given it is the paper's parallel prediction, given one by one the frames can agr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.listeners.layers import Attention, Block, FeedForward, sinusoidal
+from sfms_robot.listeners.layers import Attention, Block, FeedForward, Keys, sinusoidal
 from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
+from sfms_robot.signals.mel import ROWS_PER_FRAME
 
 AGE_SCALE_FRAMES = 16.0
+SILENCE_FRAMES = (0, 4, 9, 19, 38)  # upper ends of the bins of silence so far: 0, 0.16, 0.36, 0.76, 1.5 s
+LEAST_SPREAD = 0.8  # of the standardised level: below that a window is all speech or all silence
 UNDECIDED = -1  # a future token nobody has drawn yet
 
 
@@ -39,6 +42,14 @@ class Context:
     mel: Tensor
     heard: Tensor
     tokens: Tensor
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A context as the decoder uses it: each layer's keys, and where the speaker is in a phrase (B, 1, D)."""
+
+    keys: list[Keys]
+    phase: Tensor
 
 
 class GatedCross(nn.Module):
@@ -77,7 +88,7 @@ class SpeakerEncoder(nn.Module):
         b, p, _ = context.face.shape
         x = torch.where(context.face_known[..., None], self.face_in(context.face), self.no_face)
         voice = F.gelu(self.voice_in(context.mel.transpose(1, 2)))
-        y = F.max_pool1d(voice, 4).transpose(1, 2)  # four mel rows -> one frame
+        y = F.max_pool1d(voice, ROWS_PER_FRAME).transpose(1, 2)  # four mel rows -> one frame
         y = y + self.loudness_in(_loudness(context.mel, context.heard))
         y = torch.where(context.heard[..., None], y, self.no_voice)
         places = sinusoidal(p, x.shape[-1]).to(x)
@@ -99,6 +110,23 @@ def _loudness(mel: Tensor, heard: Tensor) -> Tensor:
     quietest = level.masked_fill(~heard, torch.inf).amin(1, keepdim=True)
     both = torch.stack([level - loudest, level - quietest], dim=-1)
     return torch.where(heard[..., None], both, 0.0)
+
+
+def _speech_phase(mel: Tensor, heard: Tensor) -> Tensor:
+    """How long the speaker has been silent and how much of the window is speech, in bins (B, 2 * bins).
+
+    Nods gather just behind phrase ends, but there are few of them to learn it from: so the decoder is told directly.
+    """
+    b, p = heard.shape
+    level = mel.view(b, p, -1).mean(-1)
+    low, high = level.amin(1, keepdim=True), level.amax(1, keepdim=True)
+    varied = high - low > LEAST_SPREAD
+    active = torch.where(varied, level > low + 0.4 * (high - low), level > 0) & heard
+    frame = torch.arange(p, device=mel.device)
+    silent = p - 1 - torch.where(active, frame, -1).amax(1)  # frames since speech
+    bins = torch.tensor(SILENCE_FRAMES, device=mel.device)
+    silence = F.one_hot(torch.bucketize(silent, bins), len(SILENCE_FRAMES) + 1).float()
+    return torch.cat([silence, silence * active.float().mean(1, keepdim=True)], dim=-1)
 
 
 class Predictor(nn.Module):
@@ -128,11 +156,14 @@ class Predictor(nn.Module):
         self.slots = nn.Parameter(torch.randn(future, width) * 0.02)
         self.role = nn.Parameter(torch.randn(3, width) * 0.02)
         self.decoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
+        self.phase_in = nn.Linear(2 * (len(SILENCE_FRAMES) + 1), width)
         self.norm = nn.LayerNorm(width)
         self.classify = nn.ModuleList(nn.Linear(width, n) for n in self.classes)
 
-    def remember(self, context: Context) -> Tensor:
-        """Memory for `decode`: (B, 3P, D), speaker's face and voice, then the listener's past."""
+    def remember(self, context: Context) -> Memory:
+        """What `decode` needs of speaker's face, speaker's voice and listener's past (3P frames)."""
+        heard = context.heard.repeat_interleave(ROWS_PER_FRAME, dim=1)[..., None]
+        context = replace(context, mel=torch.where(heard, context.mel, 0.0))
         speaker = self.speaker(context)
         p = context.tokens.shape[1]
         x = self.token_in(self._describe(context.tokens)[0])
@@ -140,18 +171,20 @@ class Predictor(nn.Module):
         for block in self.listener:
             x = block(x)
         role = self.role.repeat_interleave(p, dim=0)
-        return torch.cat([speaker, x], dim=1) + role
+        memory = torch.cat([speaker, x], dim=1) + role  # (B, 3P, D)
+        keys = [block.memory_keys(memory) for block in self.decoder if isinstance(block, Block)]
+        return Memory(keys, self.phase_in(_speech_phase(context.mel, context.heard))[:, None])
 
-    def decode(self, memory: Tensor, past: Tensor, future: Tensor) -> list[Tensor]:
+    def decode(self, memory: Memory, past: Tensor, future: Tensor) -> list[Tensor]:
         """past (B, P, G) and future (B, H, G), UNDECIDED where not drawn yet -> per group logits (B, H, V_g + 1)."""
         features, decided = self._describe(torch.cat([past, future], dim=1))
         h = future.shape[1]
         x = torch.where(decided[:, -h:, None], self.future_token_in(features[:, -h:]), self.undecided)
         # The state at the seam, for every slot: where each group was last and how long ago.
         x = x + self.future_token_in(features[:, -h - 1 : -h]) + self.slots
-        for block in self.decoder:
-            x = block(x, memory=memory)
-        x = self.norm(x)
+        for block, keys in zip(self.decoder, memory.keys, strict=True):
+            x = block(x, memory=keys)
+        x = self.norm(x + memory.phase)
         return [head(x) for head in self.classify]
 
     def _describe(self, tokens: Tensor) -> tuple[Tensor, Tensor]:

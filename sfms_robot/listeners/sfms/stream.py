@@ -163,7 +163,9 @@ def draw(
     future = torch.full((h, ahead.shape[1]), UNDECIDED)
     future[:known] = ahead
     memory = model.predictor.remember(context)
-    bias = torch.tensor([group.transition_bias for group in settings.groups.values()])
+    groups = list(settings.groups.values())
+    bias = torch.tensor([group.transition_bias for group in groups])
+    nucleus = torch.tensor([group.nucleus or settings.sampling.nucleus for group in groups])
     last, at = _last_keyframes(torch.cat([context.tokens[0], ahead]))
     at = at - settings.past_frames  # future frame 0 is frame 0
     together = settings.sampling.frames_per_pass
@@ -172,7 +174,7 @@ def draw(
         for frame in range(first, min(first + together, h)):
             rows = pad_sequence([v[0, frame] for v in logits], batch_first=True, padding_value=-torch.inf)  # (G, V)
             rows = rows.masked_fill(~reach.allowed(last, frame - at), -torch.inf)
-            drawn = sample(rows, bias, settings.sampling, generator)
+            drawn = sample(rows / settings.sampling.temperature, bias, nucleus, generator)
             future[frame] = drawn
             last, at = torch.where(drawn > 0, drawn, last), torch.where(drawn > 0, frame, at)
     return future
@@ -184,13 +186,12 @@ def _last_keyframes(tokens: Tensor) -> tuple[Tensor, Tensor]:
     return tokens.gather(0, at.clamp(min=0)[None])[0].clamp(min=0), at
 
 
-def sample(logits: Tensor, bias: Tensor, sampling: config.Sampling, generator: torch.Generator) -> Tensor:
-    """One class of each (..., G, V) logits: temperature, bias (G,) on class 0, then the likeliest classes only."""
-    scaled = logits / sampling.temperature
-    scaled = torch.cat([scaled[..., :1] + bias[:, None], scaled[..., 1:]], dim=-1)
-    order = torch.softmax(scaled, dim=-1).sort(descending=True, stable=True)
+def sample(logits: Tensor, bias: Tensor, nucleus: Tensor, generator: torch.Generator) -> Tensor:
+    """One class of each (..., G, V) logits: bias (G,) on class 0, then the likeliest that hold `nucleus` (G,)."""
+    biased = torch.cat([logits[..., :1] + bias[:, None], logits[..., 1:]], dim=-1)
+    order = torch.softmax(biased, dim=-1).sort(descending=True, stable=True)
     mass = order.values.cumsum(-1)
-    kept = ((mass - order.values) < sampling.nucleus).sum(-1, keepdim=True)
+    kept = ((mass - order.values) < nucleus[:, None]).sum(-1, keepdim=True)
     whole = mass.gather(-1, kept - 1)
     drawn = torch.rand(whole.shape, generator=generator) * whole
     place = torch.minimum((mass <= drawn).sum(-1, keepdim=True), kept - 1)

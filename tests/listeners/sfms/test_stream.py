@@ -134,11 +134,10 @@ def test_frames_of_another_length_are_refused(tiny):
         tiny.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), tiny.start(1))
 
 
-def test_sampling_follows_the_probabilities_of_the_nucleus(tiny):
-    sampling = tiny.settings.sampling.model_copy(update={"nucleus": 0.65})
+def test_sampling_follows_the_probabilities_of_the_nucleus():
     logits = torch.log(torch.tensor([0.1, 0.4, 0.3, 0.2]))
     generator = torch.Generator().manual_seed(0)
-    drawn = sample(logits.expand(2000, 1, 4), torch.zeros(1), sampling, generator)
+    drawn = sample(logits.expand(2000, 1, 4), torch.zeros(1), torch.tensor([0.65]), generator)
     counts = torch.bincount(drawn[:, 0], minlength=4)
     assert counts[0] == counts[3] == 0
     assert counts[1] / 2000 == pytest.approx(4 / 7, abs=0.04)

@@ -1,0 +1,210 @@
+"""How a head's neck turns a pose into joints: one section of a head's file, `kind: serial` or `kind: stewart`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal, Protocol
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
+from sfms_robot.config.mapping import Fold
+
+AxisName = Literal["roll", "pitch", "yaw"]
+Triple = tuple[Finite, Finite, Finite]
+Row = tuple[Finite, Finite, Finite, Finite]
+
+
+class Split(Model):
+    """One axis shared by two joints in series: by a fixed share, or low frequencies to the lower one.
+
+    `lower_share` is the lower joint's part, 0..1. With `crossover_hz` a one-pole low-pass of the angle goes to the
+    lower joint and the rest to the upper one. What one joint cannot take for its limits goes to the other.
+    """
+
+    lower: Name
+    upper: Name
+    lower_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    crossover_hz: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_rule(self) -> Split:
+        if (self.lower_share is None) == (self.crossover_hz is None):
+            raise ValueError("needs exactly one of lower_share, crossover_hz")
+        if self.lower == self.upper:
+            raise ValueError(f"lower and upper are the same joint, {self.lower!r}")
+        return self
+
+
+class Differential(Model):
+    """Two servos that pitch together and roll against each other.
+
+    left = pitch_gain x pitch + roll_gain x roll, right = pitch_gain x pitch - roll_gain x roll.
+    """
+
+    left: Name
+    right: Name
+    pitch_gain: Finite = 1.0
+    roll_gain: Finite = 1.0
+
+    @model_validator(mode="after")
+    def _invertible(self) -> Differential:
+        for key in ("pitch_gain", "roll_gain"):
+            if getattr(self, key) == 0:
+                raise ValueError(f"{key} is 0: no servo angle would move that axis")
+        if self.left == self.right:
+            raise ValueError(f"left and right are the same joint, {self.left!r}")
+        return self
+
+
+def _one_or_two(value: object) -> str:
+    return "joint" if isinstance(value, str) else "split"
+
+
+AxisJoints = Annotated[Annotated[Name, Tag("joint")] | Annotated[Split, Tag("split")], Discriminator(_one_or_two)]
+
+
+class SerialNeck(Model):
+    """Axes one on top of the other, from the base to the head; the angle of an axis is that of its joint."""
+
+    kind: Literal["serial"]
+    order: Annotated[tuple[AxisName, ...], Field(min_length=1, max_length=3)]
+    axes: dict[AxisName, AxisJoints] = Field(default_factory=dict)
+    differential: Differential | None = None
+
+    @model_validator(mode="after")
+    def _each_axis_once(self) -> SerialNeck:
+        if len(set(self.order)) != len(self.order):
+            raise ValueError(f"order {list(self.order)} has an axis twice; two joints of one axis are a split")
+        geared: tuple[AxisName, ...] = ("pitch", "roll") if self.differential else ()
+        for axis in self.order:
+            if (axis in self.axes) == (axis in geared):
+                raise ValueError(f"axis {axis!r} of order needs a joint under axes, or the differential, not both")
+        for axis in (*self.axes, *geared):
+            if axis not in self.order:
+                raise ValueError(f"axis {axis!r} has a joint but is not in order ({', '.join(self.order)})")
+        _distinct(self.joints())
+        return self
+
+    def joints(self) -> tuple[str, ...]:
+        """Every joint that the neck moves, from the base up; a differential's two at its first axis."""
+        names: list[str] = []
+        for axis in self.order:
+            place = self.axes.get(axis)
+            if isinstance(place, str):
+                names.append(place)
+            elif place is not None:
+                names += [place.lower, place.upper]
+            elif self.differential is not None and axis == next(a for a in self.order if a not in self.axes):
+                names += [self.differential.left, self.differential.right]
+        return tuple(names)
+
+
+class Leg(Model):
+    """One crank and rod. `servo_from_body` is 3 x 4: body coordinates [m] -> the servo's, z its axis."""
+
+    joint: Name
+    side: Literal[1, -1]
+    servo_from_body: tuple[Row, Row, Row]
+    rod_end_m: Triple
+
+
+class PoseLimits(Model):
+    """How far the head may lean against the body, whatever the legs could do."""
+
+    roll_deg: Positive = 180.0
+    pitch_deg: Annotated[float, Field(gt=0, lt=90)] = 89.0
+    yaw_deg: Positive = 180.0
+
+
+class BodyYaw(Model):
+    """A joint that turns the whole platform: it takes the yaw beyond `beyond_deg`, or the low-passed yaw."""
+
+    joint: Name
+    beyond_deg: NonNegative = 40.0
+    low_pass_hz: Positive | None = None
+
+
+class StewartPlatform(Model):
+    """Six cranks and rods of equal size; the head's home is `home_height_m` above the body's origin."""
+
+    kind: Literal["stewart"]
+    crank_m: Positive
+    rod_m: Positive
+    home_height_m: Finite
+    legs: Annotated[tuple[Leg, ...], Field(min_length=6, max_length=6)]
+    limits: PoseLimits = PoseLimits()
+    body_yaw: BodyYaw | None = None
+
+    @model_validator(mode="after")
+    def _sound(self) -> StewartPlatform:
+        _distinct(self.joints())
+        for number, leg in enumerate(self.legs):
+            turn = [row[:3] for row in leg.servo_from_body]
+            for i in range(3):
+                for j in range(3):
+                    dot = sum(a * b for a, b in zip(turn[i], turn[j], strict=True))
+                    if abs(dot - (i == j)) > 1e-6:
+                        raise ValueError(f"legs.{number}.servo_from_body is not a rotation and a shift")
+        return self
+
+    def joints(self) -> tuple[str, ...]:
+        """Body yaw first where there is one, then the legs in order."""
+        body = (self.body_yaw.joint,) if self.body_yaw else ()
+        return (*body, *(leg.joint for leg in self.legs))
+
+
+Kinematics = Annotated[SerialNeck | StewartPlatform, Field(discriminator="kind")]
+
+
+def _distinct(joints: tuple[str, ...]) -> None:
+    for joint in joints:
+        if joints.count(joint) > 1:
+            raise ValueError(f"joint {joint!r} is used twice")
+
+
+class Ranged(Protocol):
+    """What a neck needs to know of a joint."""
+
+    @property
+    def min_rad(self) -> float: ...
+
+    @property
+    def max_rad(self) -> float: ...
+
+
+class Placed(Ranged, Protocol):
+    """What has to agree with the neck."""
+
+    @property
+    def rest_deg(self) -> float: ...
+
+    @property
+    def drive(self) -> object: ...
+
+
+def problems(
+    kinematics: Kinematics, joints: Mapping[str, Placed | None], folds: Sequence[Fold | None] = ()
+) -> list[str]:
+    """Everything in which the neck and the head's joints do not agree, one line each; parts wrong alone are None."""
+    found = []
+    for index, fold in enumerate(folds):
+        if fold is not None and fold.into in kinematics.joints():
+            found.append(f"folds.{index}.into = {fold.into!r}: the neck moves this joint (kinematics)")
+    for name in kinematics.joints():
+        if name not in joints:
+            found.append(f"kinematics: {name!r} is not a joint of this head ({', '.join(joints)})")
+        elif (joint := joints[name]) is not None:
+            if joint.drive is not None:
+                found.append(f"joints.{name}.drive: the neck moves this joint (kinematics), leave its drive out")
+            if isinstance(kinematics, SerialNeck):
+                found += _home(name, joint)
+    return found
+
+
+def _home(name: str, joint: Placed) -> list[str]:
+    if not joint.min_rad <= 0.0 <= joint.max_rad:
+        return [f"joints.{name}: its range leaves out 0, where the neck stands at home"]
+    if joint.rest_deg != 0:
+        return [f"joints.{name}.rest_deg = {joint.rest_deg:g}: the neck rests at 0; shift zero_ticks instead"]
+    return []

@@ -1,0 +1,85 @@
+"""Motion -> every joint of a head: the mapping moves the face, the neck's kinematics follow the pose.
+
+    face channels -> mapping -> joints
+    pose channels -> neck    -> the neck's joints, all for one instant, because its joints move the head together
+
+A head without kinematics has the mapping alone. What the neck remembers (low-passed angles) is a value that the loop
+hands from tick to tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sfms_robot.config import Head
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import POSE_CHANNELS, Doubles, Floats
+from sfms_robot.retarget.kinematics import build_neck
+from sfms_robot.retarget.mapping import Knobs, Mapping
+
+_POSE = len(POSE_CHANNELS)
+_HOME_RAD = np.radians(0.1)  # how far from its rest a joint may stand where the neck is at home
+
+
+class HeadRetargeter:
+    """Implements `ports.Retargeter` for one head at ticks of `dt_s`.
+
+    Attributes:
+        joints: names, in the order of the head's file.
+        neck_columns: which of them the neck moves, in the neck's own order.
+        blind_channels: channels that neither the mapping nor the neck shows.
+        dead_joints: joints that nothing moves.
+
+    Raises ConfigError where the neck's home is out of reach, or is not the rest of its joints.
+    """
+
+    def __init__(self, head: Head, dt_s: float = 0.01) -> None:
+        self.mapping = Mapping(head)
+        self.joints: Sequence[str] = self.mapping.joints
+        self.neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
+        self.blind_channels: Sequence[str] = self.mapping.blind_channels
+        self.dead_joints: Sequence[str] = self.mapping.dead_joints
+        self.neck_columns = np.zeros(0, dtype=np.intp)
+        self._dt_s, self._knobs = dt_s, self.mapping.knobs()
+        if self.neck is None:
+            return
+        self.neck_columns = np.array([self.joints.index(name) for name in self.neck.joints], dtype=np.intp)
+        self.blind_channels = tuple(name for name in self.blind_channels if name not in self.neck.axes)
+        self.dead_joints = tuple(name for name in self.dead_joints if name not in self.neck.joints)
+        home = self.neck.solve(np.zeros(_POSE)).angles_rad
+        for name, angle in zip(self.neck.joints, home, strict=True):
+            if abs(angle - head.joints[name].rest_rad) > _HOME_RAD:
+                problem = f"is not where the neck stands at home, {np.degrees(angle):.3f}"
+                raise ConfigError.at(head.name, f"joints.{name}.rest_deg", head.joints[name].rest_deg, problem)
+
+    def start(self) -> Doubles:
+        """Memory of a head at rest."""
+        return self.neck.start() if self.neck else np.zeros(0)
+
+    def step(self, motion: Floats, memory: Doubles, knobs: Knobs | None = None) -> tuple[Doubles, Doubles]:
+        """(58,) for all joints, or (J, 58) with row j for joint j -> rad (J,), and the memory after this tick.
+
+        The pose is that of the row of the neck's first joint; the intensity of that joint's region scales it. Raises
+        ValueError where the motion is not finite.
+        """
+        angles = self.mapping.angles(motion, knobs)
+        if self.neck is None:
+            return angles, memory
+        angles[self.neck_columns], memory = self.neck.step(self._pose(motion, knobs), self._dt_s, memory)
+        return angles, memory
+
+    def angles(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
+        """As `step`, for a face held for ever, or (..., J, 58) for many of them."""
+        angles = self.mapping.angles(motion, knobs)
+        if self.neck is not None:
+            angles[..., self.neck_columns] = self.neck.solve(self._pose(motion, knobs)).angles_rad
+        return angles
+
+    def _pose(self, motion: Floats, knobs: Knobs | None) -> Doubles:
+        first = self.neck_columns[0]
+        row = motion if motion.ndim == 1 else motion[..., first, :]
+        knobs = knobs or self._knobs
+        pose: Doubles = knobs.intensity[first] * row[..., :_POSE].astype(np.float64)
+        return pose

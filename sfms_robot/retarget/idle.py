@@ -1,0 +1,162 @@
+"""Blinks, small head motion and glances, where the listener gives none.
+
+Each kind watches its own channels of the listener. Head and glances fade in while those channels are still and fade
+out four times as fast when they move. Blinks are counted: a clock that runs only as far as the listener's rate, over
+about the last five blinks, stays behind the wanted one decides when the next is due. Everything starts as if the
+listener had been giving enough.
+
+Head motion is a sum of slow sines, glances and blinks are events that lie at or after the latest instant of a tick, so
+every instant can be evaluated on its own, whatever the lead of a joint. Chance comes from the seed and a counter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfms_robot.config import Idle
+from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
+from sfms_robot.retarget.eyes import Jump, directions, smooth, turn
+
+ENOUGH = 0.8  # a listener with this share of the wanted blinks gets none added
+CLOSING_S, CLOSED_S, OPENING_S = 0.08, 0.04, 0.18  # a spontaneous blink, whole and a little slow for lid servos
+_BLINKS = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
+_HEAD = slice(CHANNEL_INDEX["roll"], CHANNEL_INDEX["yaw"] + 1)
+_SWING = np.array([0.35, 0.6, 1.0])  # roll, pitch, yaw, as shares of head_deg
+_HZ = np.array([[0.05, 0.11, 0.17], [0.06, 0.13, 0.21], [0.04, 0.09, 0.19]])
+_SIZES = np.array([0.5, 0.3, 0.2])
+_BLINK_ON, _BLINK_OFF = 0.5, 0.25
+_CLEAR_S = 1.0  # no blink of our own this soon after one of the listener
+
+
+@dataclass(frozen=True)
+class BlinkState:
+    """What is remembered of blinks: the listener's rate per second, the clock and where it rings, our last one."""
+
+    rate: float
+    due_at: float
+    clock: float = 0.0
+    closed: bool = False
+    seen_s: float = -math.inf
+    began_s: float = -math.inf
+
+
+@dataclass(frozen=True)
+class IdleState:
+    """What is remembered between ticks.
+
+    Attributes:
+        now_s, head_rad, eyes_rad: the listener at the tick before, (3,) and (2,).
+        head, eyes: how far each has faded in, 0..1.
+        glance: the last one, relative to the listener's gaze; `glance_s` is when the next is due.
+        draws: how often chance was asked.
+    """
+
+    now_s: float
+    head_rad: Doubles
+    eyes_rad: Doubles
+    blink: BlinkState
+    glance: Jump
+    glance_s: float
+    head: float = 0.0
+    eyes: float = 0.0
+    draws: int = 0
+
+
+class IdleMotion:
+    """Adds to a motion what is missing in it. `full_rad` (2,): the eye's yaw and pitch for a channel of 1."""
+
+    def __init__(self, config: Idle, full_rad: Doubles, seed: int) -> None:
+        self._blinks_per_s = config.blinks_per_minute / 60.0
+        self._head_rad = math.radians(config.head_deg) * _SWING
+        self._glance_rad = math.radians(config.glance_deg)
+        self._still_rad_s = math.radians(config.still_deg_s)
+        self._fade_s = config.fade_s
+        self._full_rad = full_rad
+        self._seed = seed % 2**63  # numpy takes no negative seed
+        self._phases = np.random.default_rng([self._seed, 0]).uniform(0, 2 * math.pi, _HZ.shape)
+
+    def watch(self, motion: Floats, times_s: Doubles, now_s: float, state: IdleState | None) -> IdleState:
+        """The state after seeing what the listener asks, (N, 58) at (N,) instants, row 0 for `now_s`."""
+        head_rad = motion[0, _HEAD].astype(np.float64)
+        eyes_rad = directions(motion[0], self._full_rad).mean(axis=0)
+        if state is None:
+            nowhere = Jump.between(np.zeros(2), np.zeros(2), now_s)
+            blink = BlinkState(self._blinks_per_s, self._until_blink(1))
+            return IdleState(now_s, head_rad, eyes_rad, blink, nowhere, now_s, draws=1)
+        dt_s = max(now_s - state.now_s, 0.0)
+        state = replace(
+            state,
+            head=self._faded(state.head, float(np.abs(head_rad - state.head_rad).max()), dt_s),
+            eyes=self._faded(state.eyes, float(np.abs(eyes_rad - state.eyes_rad).max()), dt_s),
+            now_s=now_s,
+            head_rad=head_rad,
+            eyes_rad=eyes_rad,
+        )
+        return self._glanced(self._blinked(motion, times_s, dt_s, state), times_s)
+
+    def sway(self, motion: Floats, times_s: Doubles, state: IdleState) -> Floats:
+        """With small head motion."""
+        if not (state.head and self._head_rad.any()):
+            return motion
+        waves = np.sin(2 * math.pi * _HZ * times_s[:, None, None] + self._phases) @ _SIZES  # (N, 3)
+        out = motion.copy()
+        out[:, _HEAD] += (float(smooth(np.array(state.head))) * self._head_rad * waves).astype(np.float32)
+        return out
+
+    def look(self, motion: Floats, times_s: Doubles, state: IdleState) -> Floats:
+        """With glances and blinks."""
+        since_s = times_s - state.blink.began_s
+        open_eyed = since_s.min() >= CLOSING_S + CLOSED_S + OPENING_S
+        if open_eyed and not (state.eyes and self._glance_rad):
+            return motion
+        out = motion.copy()
+        if state.eyes and self._glance_rad:
+            aside_rad = float(smooth(np.array(state.eyes))) * state.glance.at(times_s)
+            turn(out, directions(motion, self._full_rad) + aside_rad[:, None], self._full_rad)
+        if open_eyed:
+            return out
+        opening = smooth((since_s - CLOSING_S - CLOSED_S) / OPENING_S)
+        lid = (smooth(since_s / CLOSING_S) - opening).astype(np.float32)
+        out[:, _BLINKS] = np.maximum(out[:, _BLINKS], lid[:, None])
+        return out
+
+    def _faded(self, before: float, moved_rad: float, dt_s: float) -> float:
+        still = moved_rad <= self._still_rad_s * dt_s
+        return min(max(before + (dt_s if still else -4.0 * dt_s) / self._fade_s, 0.0), 1.0)
+
+    def _blinked(self, motion: Floats, times_s: Doubles, dt_s: float, state: IdleState) -> IdleState:
+        wanted = self._blinks_per_s
+        if not wanted:
+            return state
+        blink, level = state.blink, float(motion[0, _BLINKS].max())
+        onset = level > _BLINK_ON and not blink.closed
+        closed = level > (_BLINK_OFF if blink.closed else _BLINK_ON)
+        rate = blink.rate * math.exp(-dt_s * wanted / 5) + (wanted / 5 if onset else 0.0)
+        lacking = min(max(1.0 - rate / (ENOUGH * wanted), 0.0), 1.0)
+        clock = 0.0 if onset else blink.clock + dt_s * wanted * lacking
+        seen_s = state.now_s if closed else blink.seen_s
+        blink = replace(blink, rate=rate, clock=clock, closed=closed, seen_s=seen_s)
+        clear = state.now_s - seen_s >= _CLEAR_S and float(motion[:, _BLINKS].max()) < _BLINK_OFF
+        if clock < blink.due_at or not clear:
+            return replace(state, blink=blink)
+        draws = state.draws + 1
+        blink = replace(blink, clock=0.0, due_at=self._until_blink(draws), began_s=float(times_s.max()))
+        return replace(state, blink=blink, draws=draws)
+
+    def _until_blink(self, draw: int) -> float:
+        """Mean intervals to the next blink: 1 in the mean, never under 0.4."""
+        return 0.4 + 0.6 * float(np.random.default_rng([self._seed, draw]).exponential())
+
+    def _glanced(self, state: IdleState, times_s: Doubles) -> IdleState:
+        now_s = float(times_s.max())
+        if not self._glance_rad or now_s < state.glance_s:
+            return state
+        draws = state.draws + 1
+        rng = np.random.default_rng([self._seed, draws])
+        aside = rng.uniform(-1, 1, 2) * [self._glance_rad, self._glance_rad / 2]
+        target_rad = np.zeros(2) if rng.uniform() < 0.5 else aside  # half the time, back to the other's face
+        jump = Jump.between(state.glance.end_rad, target_rad, now_s)
+        return replace(state, glance=jump, glance_s=now_s + 0.8 + float(rng.exponential(1.8)), draws=draws)

@@ -1,0 +1,385 @@
+"""The doctor on emulated chains in virtual time: what it finds, and that its cures cure."""
+
+import re
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+import typer
+
+from sfms_robot.app.budget import wire_budget
+from sfms_robot.app.diagnosis import (
+    Command,
+    Finding,
+    Wanted,
+    grouped,
+    ids_text,
+    judge_adapter,
+    judge_opening,
+    judge_port,
+    judge_rate,
+    judge_twins,
+)
+from sfms_robot.app.doctor import Line, examine, examine_line
+from sfms_robot.app.servo_tools import parse_ids, reboot, set_baud, write_register
+from sfms_robot.app.servo_wire import FAMILIES, Wire
+from sfms_robot.cli.main import app
+from sfms_robot.config import load_firmware_map, map_files
+from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.runtime.clock import RealClock, VirtualClock
+from sfms_robot.servo.discovery import Holder, SerialDevice
+from sfms_robot.servo.port import SerialPort, VirtualTimePort
+from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
+
+BAUD = 1_000_000
+COMMAND = Command("/dev/ttyUSB0", "dynamixel2")
+
+
+class Patient:
+    """A chain, and the head that expects ids 1 to `count` of one model on it."""
+
+    def __init__(self, chain: Chain, count: int, model: str, masked: Sequence[str]):
+        number = load_firmware_map(model).model_number
+        self.wanted = {i: Wanted(f"joint{i}", model, number, frozenset(masked)) for i in range(1, count + 1)}
+        self.chain, self.clock = chain, VirtualClock()
+
+    def port(self, baud: int = BAUD) -> VirtualTimePort:
+        return VirtualTimePort(self.chain.device, self.chain.control, baud, self.clock)
+
+    def examined(self, rate_hz: float = 100.0) -> dict:
+        line = Line("face", self.chain.device, "/dev/ttyUSB0", "dynamixel2", BAUD, rate_hz, self.wanted)
+        return examine_line(line, self.clock, lambda device, baud: self.port(baud))
+
+    @contextmanager
+    def wire(self) -> Iterator[Wire]:
+        port = self.port()
+        try:
+            yield Wire(port, "dynamixel2", self.clock, BAUD)
+        finally:
+            port.close()
+
+    def set(self, servo: int, register: str, value: int) -> None:
+        with self.wire() as wire:
+            write_register(wire, wire.find(servo), register, str(value), lambda question: True)
+
+
+@contextmanager
+def patient(*servos: EmulatedServo, count: int = 3, model: str = "xl330-m288", masked: Sequence[str] = ()):
+    with launch(servos or [EmulatedServo(i) for i in range(1, count + 1)], virtual=True) as chain:
+        yield Patient(chain, count, model, masked)
+
+
+def told(report: dict, severity: str) -> list[str]:
+    return [f"{each['about']}: {each['problem']}" for each in report["findings"] if each["severity"] == severity]
+
+
+def fix_of(report: dict, problem: str) -> str:
+    return next(each["fix"] for each in report["findings"] if problem in each["problem"])
+
+
+# --- chains -----------------------------------------------------------------------------------------------------
+
+
+def test_a_sound_chain_is_fit_to_run():
+    with patient() as sick:
+        report = sick.examined()
+    assert report["exit_code"] == 0 and told(report, "error") == [] and told(report, "warning") == []
+    assert [(row["id"], row["joint"], row["model"], row["firmware"]) for row in report["servos"]] == [
+        (i, f"joint{i}", "xl330-m288", 53) for i in (1, 2, 3)
+    ]
+    assert report["fast_sync_read"] is True and report["budget"]["plain"]["hz"] > 100
+
+
+def test_looking_changes_nothing():
+    with patient() as sick:
+        first = sick.examined()
+        assert sick.examined() == first
+
+
+def test_a_silent_servo_is_missing():
+    with patient() as sick:
+        sick.chain.kill(2)
+        report = sick.examined()
+    assert report["exit_code"] == 4 and told(report, "error") == ["id 2 (joint2): no answer, at any rate"]
+    assert "servo scan" in fix_of(report, "no answer") and "set-id OLD NEW" in fix_of(report, "no answer")
+
+
+def test_servos_at_another_rate_are_found_there_and_the_fix_brings_them_home():
+    servos = [EmulatedServo(1), EmulatedServo(2, baud=57_600), EmulatedServo(3, baud=57_600)]
+    with patient(*servos) as sick:
+        report = sick.examined()
+        assert told(report, "error") == ["ids 2-3: set to 57600 baud, the head says 1000000"]
+        assert fix_of(report, "57600") == "sfms-robot servo set-baud 2-3 1000000 --port /dev/ttyUSB0 --baud 57600"
+        with sick.wire() as wire:
+            for servo in parse_ids("2-3"):
+                set_baud(wire, wire.find(servo), BAUD, lambda question: True)
+        assert sick.examined()["exit_code"] == 0
+
+
+def test_another_model_and_a_stranger_are_told_apart():
+    servos = [EmulatedServo(1), EmulatedServo(2, model="xl330-m077"), EmulatedServo(3), EmulatedServo(40)]
+    with patient(*servos) as sick:
+        report = sick.examined()
+    assert told(report, "error") == [
+        "id 2 (joint2): xl330-m077 (1190) answers, the head says xl330-m288 (1200)"
+    ]  # fmt: skip
+    assert told(report, "warning") == ["id 40: xl330-m288 at 1000000 baud is not in the head's file"]
+
+
+def test_nobody_at_all_is_one_finding():
+    with patient() as sick:
+        for servo in (1, 2, 3):
+            sick.chain.kill(servo)
+        report = sick.examined()
+    assert report["exit_code"] == 4 and len(report["findings"]) == 1 and "power" in report["findings"][0]["fix"]
+
+
+def test_a_hardware_error_is_named_and_the_reboot_cures_it():
+    with patient() as sick:
+        sick.chain.fault(3, 0x24)
+        report = sick.examined()
+        assert told(report, "error") == ["id 3 (joint3): hardware error: overheating, overload"]
+        assert fix_of(report, "overload").startswith("sfms-robot servo reboot 3 --port")
+        with sick.wire() as wire:
+            reboot(wire, wire.find(3), lambda question: True)
+        assert sick.examined()["exit_code"] == 0
+
+
+def test_two_servos_with_one_id_are_noticed():
+    with patient() as sick:
+        sick.chain.inject("duplicate:2=1")
+        report = sick.examined()
+    assert report["exit_code"] == 4 and "two servos seem to answer" in told(report, "error")[0]
+    assert told(report, "error")[0].startswith("id 2") and len(told(report, "error")) == 1
+
+
+def test_a_supply_outside_the_servo_s_limits_is_measured():
+    with patient() as sick:
+        sick.chain.supply(7.9)
+        high = told(sick.examined(), "warning")
+    assert any("supply 7.9 V is outside its limits 3.5..7.0 V" in text for text in high)
+
+
+def test_an_adapter_that_hears_itself_is_no_trouble():
+    with patient() as sick:
+        sick.chain.inject("echo=1")
+        assert sick.examined()["exit_code"] == 0
+
+
+@pytest.mark.parametrize("trouble", ["drop=0.4", "corrupt=0.4", "truncate=0.4", "noise=0.4", "delay=0.03", "silent:2"])
+def test_whatever_the_wire_does_the_doctor_comes_to_an_end(trouble):
+    with patient() as sick:
+        sick.chain.inject(trouble)
+        assert sick.examined()["exit_code"] in (0, 4)
+
+
+def test_a_port_that_vanishes_meanwhile_is_a_finding():
+    class Loose(VirtualTimePort):
+        reads = 0
+
+        def read(self, n: int, deadline_s: float) -> bytes:
+            self.reads += 1
+            if self.reads > 5:
+                raise BusError(f"{self.name}: the device is gone")
+            return super().read(n, deadline_s)
+
+    with patient() as sick:
+        line = Line("face", sick.chain.device, "/dev/ttyUSB0", "dynamixel2", BAUD, 100.0, sick.wanted)
+        report = examine_line(
+            line, sick.clock, lambda device, baud: Loose(device, sick.chain.control, baud, sick.clock)
+        )
+    assert report["exit_code"] == 4 and "gone" in report["findings"][0]["problem"]
+
+
+def test_a_fault_that_the_head_lives_with_is_a_note():
+    with patient(masked=["input voltage"]) as sick:
+        sick.chain.fault(1, 0x01)
+        report = sick.examined()
+    assert report["exit_code"] == 0 and any("input voltage" in text for text in told(report, "note"))
+
+
+def test_a_servo_that_only_answers_pings_gets_its_voice_back_by_the_fix():
+    with patient() as sick:
+        sick.set(2, "status_return_level", 1)
+        with sick.wire() as wire:
+            field = wire.find(2).registers()["status_return_level"]
+            wire.link.write(2, field.address, field.to_bytes(0))
+        report = sick.examined()
+        assert report["exit_code"] == 4
+        assert "write 2 status_return_level 2" in fix_of(report, "does not answer when asked")
+        sick.set(2, "status_return_level", 2)
+        assert sick.examined()["exit_code"] == 0
+
+
+def test_a_fault_within_the_head_s_own_threshold_is_a_note_and_beyond_it_an_error():
+    with patient() as sick:
+        for servo, want in sick.wanted.items():
+            sick.wanted[servo] = replace(want, thresholds={"input voltage": (None, 7.5)})
+        sick.chain.supply(7.2)
+        sick.chain.fault(1, 0x01)
+        assert sick.examined()["exit_code"] == 0
+        sick.chain.supply(7.9)
+        assert any("hardware error: input voltage" in text for text in told(sick.examined(), "error"))
+
+
+def test_settings_that_a_run_puts_right_are_one_note_for_all_servos():
+    with patient() as sick:
+        notes = told(sick.examined(), "note")
+        assert notes == ["ids 1-3: return delay of 500 us before every answer (a run sets it to 0)"]
+        for servo in (1, 2, 3):
+            sick.set(servo, "return_delay_time", 0)
+        assert told(sick.examined(), "note") == []
+
+
+def test_a_wrong_mode_matters_only_under_torque():
+    with patient() as sick:
+        sick.set(1, "operating_mode", 1)
+        assert sick.examined()["exit_code"] == 0
+        sick.set(1, "torque_enable", 1)
+        report = sick.examined()
+    assert report["exit_code"] == 4 and "torque_enable 0" in fix_of(report, "operating mode")
+
+
+def test_a_watchdog_that_does_not_stop_the_motor_is_told():
+    with patient(*[EmulatedServo(i, firmware=50) for i in (1, 2, 3)]) as sick:
+        notes = told(sick.examined(), "note")
+    assert any("does not stop the motor" in note and "firmware 50" in note for note in notes)
+
+
+def test_without_a_head_everybody_is_listed_at_their_rate():
+    with patient(EmulatedServo(1), EmulatedServo(2), EmulatedServo(9, baud=57_600)) as sick:
+        line = Line(None, sick.chain.device, "/dev/ttyUSB0", "dynamixel2", None, 100.0, {})
+        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+    assert [(row["id"], row["baud"]) for row in report["servos"]] == [(1, BAUD), (2, BAUD), (9, 57_600)]
+    assert report["exit_code"] == 0 and report["baud"] == BAUD
+
+
+@pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
+def test_the_older_frame_is_examined_too(model):
+    family = "feetech" if model == "sts3215" else "dynamixel1"
+    with patient(EmulatedServo(1, model), EmulatedServo(2, model), count=3, model=model) as sick:
+        line = Line("neck", sick.chain.device, "/dev/ttyUSB0", family, BAUD, 50.0, sick.wanted)
+        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+    assert told(report, "error") == ["id 3 (joint3): no answer, at any rate"]
+    assert [row["model"] for row in report["servos"]] == [model, model] and report["budget"]["plain"]["hz"] > 50
+    assert report["budget"]["fast"] is None and report["fast_sync_read"] is None
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_model_that_has_a_map_can_be_examined(family):
+    maps = [load_firmware_map(file.stem) for file in map_files()]
+    models = [
+        each.model for each in maps if (each.family, each.protocol) == FAMILIES[family].maps and not each.variant_of
+    ]
+    servos = [EmulatedServo(i, model, start_ticks=500) for i, model in enumerate(models, start=1)]
+    with patient(*servos) as sick:
+        wanted = {i: Wanted(model, model, load_firmware_map(model).model_number) for i, model in enumerate(models, 1)}
+        line = Line("all", sick.chain.device, "/dev/ttyUSB0", family, BAUD, 10.0, wanted)
+        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+    assert told(report, "error") == []
+    assert [row["model"] for row in report["servos"]] == models
+    assert all(row["voltage_V"] and row["faults"] == "" for row in report["servos"])
+
+
+def test_a_board_of_hobby_servos_is_opened_and_reckoned_with():
+    with patient() as sick:
+        line = Line(
+            "face", sick.chain.device, "/dev/ttyACM0", "ssc32", 9_600, 50.0, dict(enumerate([sick.wanted] * 24))
+        )
+        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+    assert report["exit_code"] == 0 and report["budget"]["write_only"]["ms"] == pytest.approx(225, abs=2)
+    assert "reaches 4 Hz of 50" in told(report, "warning")[0] and "24 servos" in told(report, "note")[0]
+
+
+# --- ports ------------------------------------------------------------------------------------------------------
+
+
+def no_port(path: str) -> dict:
+    line = Line(None, path, path, "dynamixel2", BAUD, 100.0, {})
+    clock = RealClock()
+    return examine_line(line, clock, lambda device, baud: SerialPort(device, baud, clock))
+
+
+def test_a_port_that_is_none_ends_in_three(tmp_path):
+    assert no_port(str(tmp_path))["exit_code"] == 3 and "directory" in no_port(str(tmp_path))["findings"][0]["problem"]
+    assert no_port(str(tmp_path / "x"))["exit_code"] == 3
+
+
+def test_a_port_that_somebody_holds_ends_in_three():
+    with patient() as sick:
+        holder = SerialPort(sick.chain.device, BAUD, sick.clock)
+        try:
+            report = no_port(sick.chain.device)
+        finally:
+            holder.close()
+    assert report["exit_code"] == 3 and len(report["findings"]) >= 1
+
+
+def test_permissions_holders_and_latency_come_with_what_to_type():
+    denied = list(judge_port("/dev/ttyUSB0", "no permission to open it", "dialout", []))
+    assert denied[0].severity == "error" and denied[0].fix.startswith("sudo usermod -aG dialout $USER")
+    busy = list(judge_opening("/dev/ttyUSB0", "/dev/ttyUSB0: is held", [Holder(42, "python wizard.py")]))
+    assert busy[0].fix == "kill 42" and "wizard.py" in busy[0].problem
+    slow = SerialDevice("/dev/ttyUSB0", latency_ms=16, latency_file="/sys/bus/usb-serial/devices/ttyUSB0/latency_timer")
+    (finding,) = judge_adapter(slow, [])
+    assert finding.fix == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+    assert list(judge_adapter(SerialDevice("/dev/ttyUSB0", latency_ms=1), [])) == []
+
+
+# --- the budget and the wording ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wire", "blamed"),
+    [
+        ({"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}, "baud"),
+        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 16.0}, "adapter latency"),
+        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 1.0}, "return delay"),
+    ],
+)
+def test_a_bus_that_is_too_slow_is_told_what_takes_the_time(wire, blamed):
+    budget = wire_budget("dynamixel2", 25, **wire, read_bytes=4)
+    (finding,) = judge_rate(budget, 100.0, False, COMMAND)
+    assert finding.severity == "warning" and f"({blamed} takes most)" in finding.problem
+
+
+def test_fast_sync_read_makes_a_slow_bus_fast_enough_where_it_works():
+    budget = wire_budget("dynamixel2", 28, 1_000_000, 500.0, 1.0, read_bytes=4)
+    assert next(judge_rate(budget, 100.0, True, COMMAND)).severity == "note"
+    assert next(judge_rate(budget, 100.0, False, COMMAND)).severity == "warning"
+
+
+def test_findings_alike_are_one_and_the_worst_come_first():
+    notes = [Finding("note", f"id {i}", "slow", "do {id}", i) for i in (3, 1, 2)]
+    out = grouped([*notes, *judge_twins([7])])
+    assert [(each.severity, each.about) for each in out] == [("error", "id 7"), ("note", "ids 1-3")]
+    assert out[1].fix == "do 1-3"
+
+
+@pytest.mark.parametrize("ids", [[1], [1, 2, 3], [1, 3, 5], [9, 1, 2, 12, 11]])
+def test_ids_are_written_as_the_commands_take_them(ids):
+    assert parse_ids(ids_text(ids)) == sorted(ids)
+
+
+def test_every_command_that_is_proposed_is_one_that_the_program_has():
+    servos = [EmulatedServo(1, baud=57_600), EmulatedServo(2), EmulatedServo(4)]
+    with patient(*servos, count=3) as sick:
+        sick.chain.fault(2, 0x20)
+        report = sick.examined()
+    root = typer.main.get_command(app)
+    fixes = "\n".join(each["fix"] for each in report["findings"])
+    proposed = re.findall(r"sfms-robot (servo .+?)(?=, then|$)", fixes, re.MULTILINE)
+    assert len(proposed) >= 4
+    for text in proposed:
+        words = shlex.split(text.replace("OLD", "1").replace("NEW", "2"))
+        group = root.commands[words[0]]
+        group.commands[words[1]].make_context(words[1], words[2:], resilient_parsing=False)
+
+
+def test_a_doctor_is_not_asked_about_unknown_things():
+    with pytest.raises(ConfigError, match="dynamixel2"):
+        examine("sim", None, "dynamixel9", None, RealClock())
+    with pytest.raises(ConfigError, match="nobody"):
+        examine("sim", "nobody", "dynamixel2", None, RealClock())

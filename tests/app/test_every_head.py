@@ -1,0 +1,22 @@
+"""Every head that is shipped listens on emulated servos, in virtual time."""
+
+import pytest
+
+from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.config import load_head
+from sfms_robot.data import data_dir, shipped_names
+
+HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_it_listens_for_three_seconds_without_a_violation(name):
+    head = load_head(name)
+    report = run_head(RunOptions(head=name, duration_s=3.0, fast=True))
+    assert (report["exit"], report["head"], report["frames"]) == ("done", name, 75)
+    assert report["limits"]["violations"] == 0
+    assert (report["bus"]["errors"], report["bus"]["silent"], report["bus"]["faults"]) == (0, [], [])
+    assert set(report["wire"]) == set(head.buses) and all(wire["bytes"] for wire in report["wire"].values())
+    if head.kinematics is not None:
+        neck = [report["joints"][joint]["travel_rad"] for joint in head.kinematics.joints()]
+        assert sum(neck) > 0.05

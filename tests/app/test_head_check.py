@@ -1,0 +1,124 @@
+"""`head check`, `head list` and `head show`: what they find, and what they print."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.head_check import check
+from sfms_robot.app.heads import shipped_heads
+from sfms_robot.cli.main import main
+from sfms_robot.config import load_head
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
+from sfms_robot.signals.tracks import Track, write_track
+
+FACES = ("face24_maestro", "face28", "inmoov2_maestro", "inmoov2_ssc32")
+
+
+@pytest.fixture
+def tracks(tmp_path):
+    """A folder with one track of 4 s: a nod of 10 degrees once a second, and one shut jaw that opens half."""
+    times_s = np.arange(100) / 25
+    motion = np.zeros((100, MOTION_DIM), np.float32)
+    motion[:, CHANNEL_INDEX["pitch"]] = np.radians(10) * np.sin(2 * np.pi * times_s)
+    motion[:, CHANNEL_INDEX["jawOpen"]] = 0.25 * (1 - np.cos(2 * np.pi * times_s))
+    write_track(tmp_path / "nod.csv", Track(times_s, motion, frozenset(CHANNELS)))
+    return tmp_path
+
+
+def command(capsys, *words: str) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        main(["head", *words])
+    return ended.value.code, capsys.readouterr().out
+
+
+def test_use_and_demand_are_those_of_the_faces_shown(tracks):
+    rows = {row.joint: row for row in check("face28", tracks).joints}
+    pitch, jaw = rows["neck_pitch"], rows["jaw"]
+    assert (pitch.low_deg, pitch.high_deg) == pytest.approx((-10, 10), abs=0.1)
+    assert pitch.used == pytest.approx(20 / 65, abs=0.01)
+    limit = load_head("face28").limit("neck_pitch")
+    assert pitch.speed == pytest.approx(2 * np.pi * 10 / limit.speed_deg_s, rel=0.02)
+    assert 1 < pitch.jerk / ((2 * np.pi) ** 3 * 10 / limit.jerk_deg_s3) < 1.5  # frames make it a little rougher
+    assert jaw.high_deg == pytest.approx(14, abs=0.1) and jaw.clipped == 0
+    assert (pitch.channels, jaw.channels) == (("pitch",), ["jawOpen"])
+
+
+def test_clipping_counts_ends_of_the_range_but_not_where_the_joint_rests(tracks):
+    rows = {row.joint: row for row in check("inmoov2_maestro", tracks).joints}
+    assert rows["jaw"].low_deg == 0 and rows["jaw"].clipped == 0
+
+
+@pytest.mark.parametrize("name", FACES)
+def test_recorded_faces_use_half_of_what_shows_a_face_and_rarely_an_end(name):
+    rows = {row.joint: row for row in check(name).joints}
+    for joint in (joint for joint in rows if joint.startswith(("lid_left", "lid_upper_left", "jaw", "eye_pan"))):
+        assert rows[joint].used > 0.5, joint
+    assert all(row.clipped < 0.05 for row in rows.values())
+
+
+def test_a_platforms_reach_and_the_share_of_recorded_poses_in_it_are_told():
+    neck = check("reachy_mini").neck
+    assert neck.reach["pitch"] == (-40, 40) and neck.reach["z"] == (-50, 23)
+    assert 0.9 < neck.reached < 1
+
+
+def test_all_problems_come_at_once_with_those_of_the_neck(tmp_path, capsys):
+    text = (data_dir("configs") / "heads" / "op3_head" / "head.yaml").read_text()
+    broken = (
+        text.replace("id: 20", "id: 19").replace("yaw: head_pan", "yaw: head_pam").replace("limits: tilt", "limits: up")
+    )
+    (tmp_path / "head.yaml").write_text(broken + "\nfolds: [{channel: jawOpen, into: head_tilt, gain: 0.1}]\n")
+    code, out = command(capsys, "check", str(tmp_path))
+    assert code == 2
+    for told in ("'head_pam' is not a joint", "id = 19 is used twice", "limits = 'up'", "folds.0.into = 'head_tilt'"):
+        assert told in out
+    code, out = command(capsys, "check", str(tmp_path), "--json")
+    assert code == 2 and len(json.loads(out)["problems"]) == 4
+
+
+def test_a_neck_whose_home_is_out_of_reach_is_a_problem_of_the_head(tmp_path):
+    text = (data_dir("configs") / "heads" / "reachy_mini" / "head.yaml").read_text()
+    (tmp_path / "head.yaml").write_text(text.replace("home_height_m: 0.177", "home_height_m: 0.3"))
+    assert "home is out of reach" in " ".join(check(str(tmp_path)).problems)
+
+
+def test_a_folder_without_tracks_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no face tracks"):
+        check("op3_head", tmp_path)
+
+
+def test_the_table_names_every_joint_and_what_is_lost_and_the_picture_is_small(tracks, tmp_path, capsys):
+    png = tmp_path / "op3.png"
+    code, out = command(capsys, "check", "op3_head", "--data", str(tracks), "--plot", str(png))
+    assert code == 0 and "head_pan: yaw" in out and "head_tilt" in out and "cannot show: roll, x, y, z" in out
+    assert png.read_bytes().startswith(b"\x89PNG") and png.stat().st_size < 60_000
+
+
+def test_the_list_has_every_head_with_its_families(capsys):
+    code, out = command(capsys, "list", "--json")
+    heads = {head["name"]: head for head in json.loads(out)["heads"]}
+    assert code == 0 and set(FACES) < set(heads) and list(heads) == [head["name"] for head in shipped_heads()]
+    assert heads["open_duck_mini_v2_head"]["buses"] == {"neck": "feetech", "antennas": "maestro"}
+    families = {family for head in heads.values() for family in head["buses"].values()}
+    assert families == {"dynamixel", "dynamixel1", "feetech", "maestro", "ssc32"}
+    assert "reachy_mini  9 joints, stewart neck, dynamixel" in command(capsys, "list")[1]
+
+
+def test_show_tells_value_and_origin(capsys):
+    code, out = command(capsys, "show", "face28", "--joint", "eye_pan_right", "--json")
+    assert code == 0
+    assert json.loads(out)["joints"]["eye_pan_right"]["max_deg"] == {"value": 30.0, "from": "mirror of eye_pan_left"}
+    assert "mirror of eye_pan_left" in command(capsys, "show", "face28", "--joint", "eye_pan_right")[1]
+    assert command(capsys, "show", "face28", "--joint", "ear")[0] == 2
+
+
+@pytest.mark.parametrize("head", [entry["name"] for entry in shipped_heads()])
+def test_a_shipped_head_has_its_picture_and_provenance(head):
+    folder = data_dir("configs") / "heads" / head
+    assert 0 < (folder / "picture.png").stat().st_size < 60_000
+    text = (folder / "README.md").read_text()
+    assert "## Provenance" in text and "## What this head cannot show" in text
+    assert all(joint in text for joint in load_head(head).joints)

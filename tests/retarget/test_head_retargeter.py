@@ -1,0 +1,75 @@
+"""Mapping and neck as one: the neck follows the pose, the rest of the head the face."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.config import load_head
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
+from sfms_robot.retarget.head import HeadRetargeter
+
+HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+
+
+def motion(**channels: float) -> np.ndarray:
+    out = np.zeros(MOTION_DIM, np.float32)
+    for name, size in channels.items():
+        out[CHANNEL_INDEX[name]] = size
+    return out
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_a_step_and_a_face_held_for_ever_agree_where_the_neck_remembers_nothing(name):
+    retargeter = HeadRetargeter(load_head(name))
+    face = motion(roll=0.05, pitch=0.1, yaw=-0.2, jawOpen=0.5, browInnerUp=0.4)
+    stepped, _ = retargeter.step(face, retargeter.start())
+    assert np.array_equal(stepped, retargeter.angles(face))
+    rows = np.tile(face, (3, len(retargeter.joints), 1))
+    assert retargeter.angles(rows) == pytest.approx(np.tile(stepped, (3, 1)), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_every_channel_is_shown_or_told_as_lost(name):
+    retargeter = HeadRetargeter(load_head(name))
+    rest = retargeter.angles(motion())
+    for channel in CHANNELS:
+        sizes = (0.02, -0.02) if channel in CHANNELS[:6] else (1.0,)
+        moved = any(np.abs(retargeter.angles(motion(**{channel: size})) - rest).max() > 1e-6 for size in sizes)
+        alone = channel in ("eyeWideLeft", "eyeWideRight", "mouthClose")  # those only ever take something back
+        assert moved or alone or channel in retargeter.blind_channels, channel
+        assert not (moved and channel in retargeter.blind_channels), channel
+
+
+def test_the_whole_neck_shows_the_pose_of_one_instant():
+    retargeter = HeadRetargeter(load_head("reachy_mini"))
+    rows = np.stack([motion(pitch=0.01 * row) for row in range(len(retargeter.joints))])
+    one = retargeter.angles(rows[retargeter.neck_columns[0]])
+    assert np.array_equal(retargeter.angles(rows)[retargeter.neck_columns], one[retargeter.neck_columns])
+
+
+def test_intensity_of_the_necks_region_scales_the_pose():
+    retargeter = HeadRetargeter(load_head("face28"))
+    yaw = retargeter.joints.index("neck_yaw")
+    for intensity in (0.0, 0.5, 2.0):
+        knobs = retargeter.mapping.knobs({"neck": intensity})
+        assert retargeter.angles(motion(yaw=0.2), knobs)[yaw] == pytest.approx(0.2 * intensity)
+
+
+def test_what_the_neck_remembers_is_handed_through():
+    head = load_head("reachy_mini")
+    body = head.kinematics.body_yaw.model_copy(update={"low_pass_hz": 0.5})
+    slow = head.model_copy(update={"kinematics": head.kinematics.model_copy(update={"body_yaw": body})})
+    retargeter = HeadRetargeter(slow, 0.01)
+    memory, turned = retargeter.start(), []
+    for _ in range(100):
+        angles, memory = retargeter.step(motion(yaw=0.3), memory)
+        turned.append(angles[0])
+    assert turned[0] < 0.02 < turned[-1] < 0.3 and (np.diff(turned) > 0).all()
+
+
+def test_a_rest_that_is_not_the_necks_home_is_told():
+    head = load_head("reachy_mini")
+    leg = head.joints["stewart_2"].model_copy(update={"rest_deg": -20.0})
+    with pytest.raises(ConfigError, match=r"joints.stewart_2.rest_deg = -20.0 is not where .* at home, -35.898"):
+        HeadRetargeter(head.model_copy(update={"joints": {**head.joints, "stewart_2": leg}}))

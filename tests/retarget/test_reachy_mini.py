@@ -1,0 +1,40 @@
+"""The antennas of Reachy Mini stand for the face it has not."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.config import load_head
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
+from sfms_robot.retarget.mapping import Mapping
+
+HEAD = load_head("reachy_mini")
+MAPPING = Mapping(HEAD)
+REST_RAD = np.array([joint.rest_rad for joint in HEAD.joints.values()])
+
+
+def raised_deg(**channels: float) -> tuple[float, float]:
+    """How far the right and the left antenna go up from rest."""
+    motion = np.zeros(MOTION_DIM, np.float32)
+    for name, size in channels.items():
+        motion[CHANNEL_INDEX[name]] = size
+    turned = np.degrees(MAPPING.angles(motion) - REST_RAD)
+    assert turned[:7] == pytest.approx(np.zeros(7))  # body and legs follow the head pose, not the face
+    right, left = turned[7:]
+    return float(right), -float(left)
+
+
+def test_brows_raise_and_lower_both_antennas_by_parts_of_forty_degrees():
+    assert raised_deg(browInnerUp=1.0) == pytest.approx((32, 32), abs=1e-4)
+    assert raised_deg(browDownLeft=1.0, browDownRight=1.0) == pytest.approx((-24, -24), abs=1e-4)
+    assert raised_deg(mouthSmileLeft=1.0, mouthSmileRight=1.0) == pytest.approx((12, 12), abs=1e-4)
+    assert raised_deg(mouthFrownLeft=1.0, mouthFrownRight=1.0) == pytest.approx((-12, -12), abs=1e-4)
+
+
+def test_a_brow_raised_on_one_side_raises_that_sides_antenna_more():
+    assert raised_deg(browOuterUpLeft=1.0) == pytest.approx((4, 20), abs=1e-4)
+    assert raised_deg(browOuterUpRight=1.0) == pytest.approx((20, 4), abs=1e-4)
+
+
+def test_everything_up_at_once_ends_at_the_end_of_the_range():
+    up = {name: 1.0 for name in ("browInnerUp", "browOuterUpLeft", "browOuterUpRight", "mouthSmileLeft")}
+    assert raised_deg(**up) == pytest.approx((40, 40))

@@ -1,0 +1,106 @@
+"""The loop and joints that come back: they ease in from where they stand, and nobody else notices. In virtual time."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.heads import build_bus, build_motion, emulated
+from sfms_robot.config import load_head
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.simulator.launch import Chain, launch
+from sfms_robot.sources.recording import Recording
+
+RATE_HZ = 100.0
+HEAD = load_head("face28")
+JOINTS = list(HEAD.joints)
+
+
+class Bow:
+    """A listener that bows its head and keeps it there."""
+
+    hop = 4
+    horizon = 8
+
+    def start(self, seed: int) -> int:
+        return 0
+
+    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
+        if memory % self.hop:
+            return None, memory + 1
+        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
+        frames[:, CHANNEL_INDEX["pitch"]] = 0.2
+        return Plan(speaker.time_s, speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1), frames), memory + 1
+
+
+class Hand:
+    """An observer that does things to the chain at given ticks, and keeps what it sees."""
+
+    def __init__(self, does: dict[int, Callable[[], None]]) -> None:
+        self._does = does
+        self.ticks: list[Tick] = []
+
+    def tick(self, seen: Tick) -> None:
+        self.ticks.append(seen)
+        if (act := self._does.get(len(self.ticks))) is not None:
+            act()
+
+    def heard(self, frame: SpeakerFrame) -> None: ...
+
+    def planned(self, plan: Plan) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def run(chain: Chain, hand: Hand, seconds: float) -> tuple[str, RunLog]:
+    clock, motion = VirtualClock(), build_motion(HEAD, RATE_HZ)
+    bus = build_bus(HEAD, {"main": chain}, clock)
+    log = RunLog(JOINTS, 1 / RATE_HZ, motion.audit)
+    parts = Parts(
+        Recording(None, None, seconds), InlineFeed(Bow(), 0, 0.01), motion.timeline, motion.retargeter, motion.limiter,
+        bus, [hand], motion.leads_s, motion.rest_rad,
+    )  # fmt: skip
+    bus.connect()
+    try:
+        return drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=lambda: False), log
+    finally:
+        bus.close()
+
+
+def test_joint_that_came_back_eases_in_from_where_it_stands():
+    pitch = JOINTS.index("neck_pitch")
+    servo = HEAD.joints["neck_pitch"].id
+    with launch(emulated(HEAD)["main"], virtual=True) as chain:
+        hand = Hand({50: lambda: chain.kill(servo), 201: lambda: chain.revive(servo)})  # half way into its bow
+        outcome, log = run(chain, hand, 6.0)
+    assert outcome == "done" and log.audited.violations == 0
+    goals = np.array([tick.goals_rad for tick in hand.ticks])
+    back = [k for k, tick in enumerate(hand.ticks) if tick.readings["neck_pitch"].rejoined]
+    assert len(back) == 1 and back[0] > 201
+    bowed, stands = goals[200, pitch], hand.ticks[back[0]].readings["neck_pitch"].position_rad
+    assert abs(bowed - stands) > 0.05
+    assert goals[back[0] + 1, pitch] == pytest.approx(stands, abs=0.003)
+    assert goals[-1, pitch] == pytest.approx(bowed, abs=0.003)
+    others = np.delete(goals, pitch, axis=1)
+    assert np.abs(np.diff(others[190:], axis=0)).max() < 1e-3  # they stood still all the while
+    assert hand.ticks[-1].readings["neck_pitch"].position_rad == pytest.approx(bowed, abs=0.01)
+
+
+def test_head_comes_back_whole_after_its_adapter_was_unplugged():
+    with launch(emulated(HEAD)["main"], virtual=True) as chain:
+        hand = Hand({150: chain.hang_up, 250: chain.come_back})
+        outcome, log = run(chain, hand, 7.0)
+        torque = [chain.state(joint.id)["torque"] for joint in HEAD.joints.values()]
+    assert outcome == "done" and log.audited.violations == 0
+    ages = np.array([[each.age_s for each in tick.readings.values()] for tick in hand.ticks])
+    assert (ages[155:249] > 0).all()
+    assert (ages[450:] == 0.0).all()  # 2 s after it was plugged in again
+    last = hand.ticks[-1]
+    for name, reading in last.readings.items():
+        assert reading.position_rad == pytest.approx(last.goals_rad[JOINTS.index(name)], abs=0.01), name
+    assert not any(torque)

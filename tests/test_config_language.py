@@ -1,0 +1,178 @@
+"""A head's language at the edge: every example of the guide loads, every mistake is told, the schema is in step."""
+
+import copy
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sfms_robot.config import Expression, Head, Joint, LimitClass, Region, load, parse
+from sfms_robot.config.check import check_head
+from sfms_robot.config.life import Gaze, Idle
+from sfms_robot.config.mapping import Coupling, Fold
+from sfms_robot.config.schema import text
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+
+GUIDE = (Path(__file__).parents[1] / "docs" / "heads.md").read_text(encoding="utf-8")
+EXAMPLES = [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", GUIDE, re.S)]
+OWL = EXAMPLES[0]
+
+
+def added(example) -> dict:
+    """The first head of the guide with the parts of an example added."""
+    raw = copy.deepcopy(OWL)
+    for key, value in example.items():
+        raw[key] = {**raw.get(key, {}), **value} if isinstance(value, dict) else value
+    return raw
+
+
+def written(folder: Path, raw) -> Path:
+    file = folder / "head.yaml"
+    file.write_text(yaml.safe_dump(raw, sort_keys=False), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: "-".join(example))
+def test_every_example_of_the_guide_is_a_head_or_part_of_one(example, tmp_path):
+    written(tmp_path, added(example))
+    assert check_head(str(tmp_path)) == []
+    load(Head, tmp_path / "head.yaml")
+
+
+@pytest.mark.parametrize("model", [Head, LimitClass, Expression, Joint, Coupling, Fold, Region, Gaze, Idle])
+def test_the_guide_has_every_key(model):
+    for key in model.model_fields:
+        assert re.search(rf"\b{key}\b", GUIDE), f"{model.__name__}.{key} is not in docs/heads.md"
+
+
+def test_the_first_head_of_the_guide_is_about_twenty_lines():
+    assert len(re.findall(r"```yaml\n(.*?)```", GUIDE, re.S)[0].splitlines()) <= 22
+
+
+def test_the_schema_for_editors_is_in_step():
+    shipped = (data_dir("configs") / "heads" / "head.schema.json").read_text(encoding="utf-8")
+    assert shipped == text(), "python -m sfms_robot.config.schema > configs/heads/head.schema.json"
+
+
+WRONG = {
+    "curve": (
+        {"joints": {"beak": {"id": 3, "drive": {"channel": "jawOpen", "curve": [[0, 0], [0.5, 1], [0.5, 2]]}}}},
+        "joints.beak.drive: curve is not a function: x goes from 0.5 to 0.5, it has to rise",
+    ),
+    "one point": (
+        {"expressions": {"a": {"channel": "yaw", "curve": [[0, 0]]}}},
+        "expressions.a: curve has 1 point, needs at least 2",
+    ),
+    "circle": (
+        {"expressions": {"a": "b", "b": {"sum": ["yaw", "c"]}, "c": {"use": "a", "gain": 2}}},
+        "expressions.a uses itself: a -> b -> c -> a",
+    ),
+    "own circle": ({"expressions": {"a": {"max": ["a", "yaw"]}}}, "expressions.a uses itself: a -> a"),
+    "unknown name": (
+        {"expressions": {"smile": "mouthSmileLeft", "grin": {"mean": ["yaw", "smlie"]}}},
+        "expressions.grin.mean.1: 'smlie' is not a channel, nor an expression of this head (smile, grin; roll",
+    ),
+    "channel's name": ({"expressions": {"yaw": "roll"}}, "expressions.yaw has the name of a channel"),
+    "mirror of nothing": (
+        {"joints": {"x": {"id": 9, "min_deg": 0, "max_deg": 1, "mirror_of": "lid"}}},
+        "joints.x.mirror_of = 'lid' is not a joint of this head (",
+    ),
+    "mirror of a mirror": (
+        {"joints": {"x": {"id": 9, "min_deg": 0, "max_deg": 1, "mirror_of": "lid_right"}}},
+        "joints.x.mirror_of = 'lid_right' is itself a mirror; name the joint that has the drive",
+    ),
+    "mirror and drive": (
+        {"joints": {"x": {"id": 9, "mirror_of": "beak", "drive": "yaw"}}},
+        "joints.x: has a drive and is mirror_of 'beak': one of them",
+    ),
+    "fold": (
+        {"folds": [{"channel": "yaw", "into": "chin", "gain": 1}]},
+        "folds.0.into = 'chin' is not a joint of this head (neck_yaw,",
+    ),
+    "coupling of nothing": (
+        {"couplings": [{"keep": {"beak": 1, "chin": 1}, "at_least": 0, "moving": ["beak"]}]},
+        "couplings.0.keep: 'chin' is not a joint of this head (neck_yaw,",
+    ),
+    "coupling without weight": (
+        {"couplings": [{"keep": {"beak": 1, "lid_left": 0}, "at_least": 0, "moving": ["lid_left"]}]},
+        "couplings.0: moving: 'lid_left' has no weight under keep (beak, lid_left)",
+    ),
+    "coupling that excludes rest": (
+        {"couplings": [{"keep": {"beak": 1, "lid_left": 1}, "at_least": 0.1, "moving": ["beak"]}]},
+        "couplings.0.at_least = 0.1: Input should be less than or equal to 0",
+    ),
+    "couplings that fight": (
+        {"couplings": [{"keep": {"beak": 1, "lid_left": 1}, "at_least": 0, "moving": ["beak"]},
+                       {"keep": {"beak": -1, "lid_right": 1}, "at_least": 0, "moving": ["lid_right"]}]},
+        "couplings.0.moving: 'beak' is also in couplings.1, one would undo the other",
+    ),
+    "two regions": (
+        {"regions": {"a": {"joints": ["beak"]}, "b": {"joints": ["beak"]}}},
+        "regions.b.joints: 'beak' is already in region a",
+    ),
+    "knob": (
+        {"regions": {"a": {"joints": ["beak"], "style": 2.5}}},
+        "regions.a.style = 2.5: Input should be less than or equal to 2",
+    ),
+    "long product": ({"expressions": {"a": {"product": ["yaw"] * 5}}}, "product has 5 factors, at most 4"),
+    "defaults": ({"joint_defaults": {"buss": "main"}}, "joint_defaults: 'buss' is not a known key (bus, model"),
+    "life": ({"life": {"gaze": {"neck_gain": -1}}}, "life.gaze.neck_gain = -1: Input should be greater than or equal"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change, told", WRONG.values(), ids=WRONG.keys())
+def test_a_wrong_word_is_told_by_the_check_and_refused_by_the_loader(change, told, tmp_path):
+    file = written(tmp_path, added(change))
+    found = check_head(str(tmp_path))
+    assert any(line.startswith(f"{file}: ") and told in line for line in found), found
+    with pytest.raises(ConfigError) as caught:
+        load(Head, file)
+    assert "\n" not in str(caught.value)
+
+
+def test_expressions_that_multiply_without_end_are_refused():
+    doubling = {f"a{i}": {"sum": [f"a{i + 1}", f"a{i + 1}"]} for i in range(40)} | {"a40": "yaw"}
+    raw = added({"expressions": doubling, "joints": {"x": {"id": 9, "min_deg": 0, "max_deg": 1, "drive": "a0"}}})
+    with pytest.raises(ConfigError, match=r"joints.x.drive has \d+ nodes, .* at most 2000"):
+        parse(Head, raw, "head.yaml")
+
+
+def test_the_check_tells_everything_at_once(tmp_path):
+    raw = added({"expressions": {"a": "b", "b": "a"}, "regions": {"r": {"joints": ["wing"]}}, "feather": 1})
+    del raw["description"]
+    raw["limits"]["neck"]["speed_deg_s"] = 0
+    raw["joints"]["neck_yaw"] |= {"bus": "mian", "sped": 3}
+    raw["joints"]["beak"] |= {"max_deg": -5, "drive": {"sum": []}}
+    raw["joints"]["lid_left"]["drive"] = "eyeBlnk"
+    raw["joints"]["lid_right"]["id"] = 4
+    file = written(tmp_path, raw)
+    found = check_head(str(tmp_path))
+    for told in (
+        "'feather' is not a known key", "description: Field required", "limits.neck.speed_deg_s = 0",
+        "joints.neck_yaw: 'sped' is not a known key", "joints.beak.drive: sum is empty",
+        "joints.beak: min_deg 0 is not below max_deg -5", "joints.lid_left.drive: 'eyeBlnk' is not a channel",
+        "joints.lid_right.id = 4 is used twice", "a -> b -> a", "regions.r.joints: 'wing' is not a joint",
+    ):  # fmt: skip
+        assert sum(told in line for line in found) == 1, told
+    assert len(found) == 10 and all(line.startswith(f"{file}: ") for line in found)
+
+
+def test_a_wrong_neck_hides_nothing_else(tmp_path):
+    neck = {"kind": "serial", "order": ["yaw", "pitch"], "axes": {"yaw": "neck_yaw", "pitch": "neck_ptich"}}
+    raw = added({"kinematics": neck})
+    del raw["description"]
+    written(tmp_path, raw)
+    found = "\n".join(check_head(str(tmp_path)))
+    for told in ("'neck_ptich' is not a joint", "joints.neck_yaw.drive", "description: Field required"):
+        assert told in found
+    written(tmp_path, raw | {"kinematics": neck | {"ordr": 1, "order": ["yaw", "yaw"]}})
+    found = "\n".join(check_head(str(tmp_path)))
+    assert "'ordr' is not a known key" in found and "has an axis twice" in found
+
+
+@pytest.mark.parametrize("raw", [[], {}, "head", {"joints": []}, {"joints": {"a": 3}}, {"expressions": {1: "yaw"}}])
+def test_a_file_of_the_wrong_shape_is_told_and_never_raised(raw, tmp_path):
+    written(tmp_path, raw)
+    assert check_head(str(tmp_path))
