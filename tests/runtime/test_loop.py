@@ -100,8 +100,8 @@ def run(
     bus = build_bus(HEAD, {"main": chain}, clock)
     log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
     parts = Parts(
-        Recording(None, None, seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.retargeter, motion.limiter,
-        bus, [watcher], motion.leads_s, motion.rest_rad,
+        Recording(None, None, seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.retargeter,
+        motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
     )  # fmt: skip
 
     def interrupted() -> bool:
