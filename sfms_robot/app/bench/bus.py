@@ -57,6 +57,6 @@ def _vendor(device: str, baud: int, ids: list[int]) -> tuple[list[float], list[f
         write()
         reader.txRxPacket()
 
-    times = times(write, 500, time.process_time), times(tick, 500, time.process_time)
+    durations = times(write, 500, time.process_time), times(tick, 500, time.process_time)
     port.closePort()
-    return times
+    return durations
