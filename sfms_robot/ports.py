@@ -170,8 +170,11 @@ class Retargeter(Protocol):
 
     def start(self) -> Any: ...
 
-    def step(self, motion: Floats, state: Any) -> tuple[Doubles, Any]:
-        """(J, 58) one motion row per joint (each joint has its own lead), or (58,) for all -> rad (J,)."""
+    def step(self, motion: Floats, state: Any, knobs: Any = None) -> tuple[Doubles, Any]:
+        """(J, 58) one motion row per joint (each joint has its own lead), or (58,) for all -> rad (J,).
+
+        `knobs` None: those of the head's file.
+        """
 
 
 class Limiter(Protocol):

@@ -3,6 +3,14 @@
 import pytest
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_overlays_of_whoever_runs_the_tests(tmp_path_factory):
+    """Shipped heads are what is tested, not the build on this desk."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
+        yield
+
+
 def pytest_addoption(parser):
     parser.addoption(
         "--port",

@@ -128,11 +128,13 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
             device = port or only_port()
             yield Line(None, device, device, family, baud, DEFAULT_RATE_HZ, {})
             return
-    from sfms_robot.app.heads import devices, emulated  # slow to load, and only a head needs it
+    from sfms_robot.app.heads import devices, plugged_in  # slow to load, and only a head needs it
 
     described = load_head(head)
     if port == SIM:
-        where = {name: stack.enter_context(launch(servos)).device for name, servos in emulated(described).items()}
+        where = {
+            name: stack.enter_context(launch(servos)).device for name, servos in plugged_in(head, described).items()
+        }
     else:
         where = devices(described, port or only_port())
     for name, device in where.items():

@@ -13,7 +13,6 @@ from types import FrameType
 from typing import Final, Literal
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, load_head
-from sfms_robot.config.emulate import load_stored
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.simulator.faults import parse_ids
 from sfms_robot.simulator.launch import Chain, EmulatedServo, launch, wait
@@ -76,7 +75,12 @@ def until_stopped(chains: Mapping[str, Chain]) -> None:
 def _servos(options: EmulateOptions) -> dict[str, list[EmulatedServo]]:
     if (options.head is None) == (options.servo is None):
         raise ConfigError("emulate needs either --head NAME or --servo MODEL:IDS[,MODEL:IDS...]")
-    wires = _head(options.head) if options.head is not None else {"servos": parse_servos(options.servo or "")}
+    if options.head is not None:
+        from sfms_robot.app.heads import plugged_in  # brings numpy and all that drives a head: a list needs none
+
+        wires = plugged_in(options.head, load_head(options.head))
+    else:
+        wires = {"servos": parse_servos(options.servo or "")}
     out = {}
     for bus, servos in wires.items():
         if options.baud is not None:
@@ -85,21 +89,6 @@ def _servos(options: EmulateOptions) -> dict[str, list[EmulatedServo]]:
             servos = [replace(servo, supply_v=options.voltage) for servo in servos]
         out[bus] = servos
     return out
-
-
-def _head(name: str) -> dict[str, list[EmulatedServo]]:
-    """The servos of a head, with what is stored in them. Raises ConfigError."""
-    from sfms_robot.app.heads import emulated  # brings numpy and all that drives a head: a list of servos needs none
-
-    head, stored = load_head(name), load_stored(name)
-    for joint in stored.joints:
-        if joint not in head.joints:
-            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
-    joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
-    return {
-        bus: [replace(servo, registers=stored.of(joints[bus, servo.id]), supply_v=stored.supply_v) for servo in servos]
-        for bus, servos in emulated(head).items()
-    }
 
 
 def parse_servos(text: str) -> list[EmulatedServo]:

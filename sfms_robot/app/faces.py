@@ -30,27 +30,34 @@ def recorded_faces(folder: Path | None = None) -> list[Floats]:
 
     Raises ConfigError for a folder without tracks, and for a track that cannot be read.
     """
-    return [clip for clip in (_bundled() if folder is None else _tracks(folder)) if len(clip) >= SHORTEST]
+    return [clip for _, clip in named_faces(folder)]
 
 
-def _bundled() -> list[Floats]:
+def named_faces(folder: Path | None = None) -> list[tuple[str, Floats]]:
+    """As `recorded_faces`, each clip with the name of its track or its kind of motion."""
+    found = _bundled() if folder is None else _tracks(folder)
+    return [(name, clip) for name, clip in found if len(clip) >= SHORTEST]
+
+
+def _bundled() -> list[tuple[str, Floats]]:
     sim = data_dir("sim")
-    clips = [clip for track in sorted(sim.glob("speakers/*/face.csv.gz")) for clip in _seen(track)]
+    speakers = sorted(sim.glob("speakers/*/face.csv.gz"))
+    clips = [(track.parent.name, clip) for track in speakers for clip in _seen(track)]
     for motions in load(sim / "listeners" / "motions.npz").values():
         for kind, columns in _PARTS.items():
             for piece in getattr(motions, kind):
                 clip = np.zeros((len(piece), MOTION_DIM), dtype=np.float32)
                 clip[:, columns] = piece
                 clip[:, _POSE:] = np.clip(clip[:, _POSE:], 0.0, 1.0)
-                clips.append(clip)
+                clips.append((kind, clip))
     return clips
 
 
-def _tracks(folder: Path) -> list[Floats]:
+def _tracks(folder: Path) -> list[tuple[str, Floats]]:
     files = sorted([*folder.rglob("*.csv"), *folder.rglob("*.csv.gz")])
     if not files:
         raise ConfigError(f"--data {str(folder)!r}: no face tracks (*.csv, *.csv.gz) below it")
-    return [clip for file in files for clip in _seen(file)]
+    return [(str(file.relative_to(folder)), clip) for file in files for clip in _seen(file)]
 
 
 def _seen(file: Path) -> list[Floats]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
+from sfms_robot.app.gentle import check_safety
 from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map, load_head
+from sfms_robot.config.emulate import load_stored
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
@@ -71,7 +73,7 @@ def shipped_heads() -> list[dict[str, Any]]:
 
 
 def build_motion(head: Head, rate_hz: float) -> Motion:
-    """Timeline, retargeter, limiter and audit at one tick rate."""
+    """Timeline, retargeter, limiter and audit at the rate of the loop, which is that of the head's fastest bus."""
     limits = JointLimits.of(head)
     retargeter = HeadRetargeter(head, 1.0 / rate_hz)
     leads_s = np.array([joint.lag_ms / 1e3 for joint in head.joints.values()])
@@ -108,6 +110,27 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
     return by_bus
 
 
+def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
+    """As `emulated`, with what somebody has stored in the servos of head `name` and the supply that they run on.
+
+    Raises ConfigError for stored values of a joint that the head does not have.
+    """
+    stored = load_stored(name)
+    for joint in stored.joints:
+        if joint not in head.joints:
+            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
+    joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
+    return {
+        bus: [replace(servo, registers=stored.of(joints[bus, servo.id]), supply_v=stored.supply_v) for servo in servos]
+        for bus, servos in emulated(head).items()
+    }
+
+
+def on_boards(head: Head) -> list[str]:
+    """Joints whose servos report no position, so that they jump when they come on."""
+    return [name for name, joint in head.joints.items() if head.buses[joint.bus].family in BOARDS]
+
+
 def devices(head: Head, port: str) -> dict[str, str]:
     """`--port DEVICE` or `NAME=DEVICE[,NAME=DEVICE]` -> device per named bus. Raises ConfigError."""
     names = list(head.buses)
@@ -136,16 +159,15 @@ def _build_one(
 ) -> Bus:
     config = head.buses[name]
     maps = _maps(joints)
-    _check_safety(head, joints, maps)
+    check_safety(head, joints, maps)
     servos = [
         BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
     ]
-    more: dict[str, Any] = {}
-    if config.family == "dynamixel":
-        more = {"config": config, "faults": head.faults}
-    elif config.family in BOARDS:
+    if config.family in BOARDS:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])
-        more = {"confirmed": confirmed or isinstance(where, Chain), "rest_rad": rest_rad}
+        more: dict[str, Any] = {"confirmed": confirmed or isinstance(where, Chain), "rest_rad": rest_rad}
+    else:
+        more = {"config": config, "faults": head.faults}
     module, kind = FAMILIES[config.family].split(":")
     build = getattr(import_module(module), kind)
     deadline_s = config.read_deadline_ms / 1e3
@@ -155,24 +177,6 @@ def _build_one(
         name, servos, _calibration(joints), _port(where, config.baud, clock), config.baud, deadline_s, **more
     )
     return bus
-
-
-def _check_safety(head: Head, joints: dict[str, Joint], maps: dict[str, FirmwareMap]) -> None:
-    """Raises ConfigError for a register that a joint's servo does not have, or that is not to be written."""
-    for name, joint in joints.items():
-        table = maps[joint.model].registers
-        limit = joint.safety.current_limit_mA if joint.safety is not None else None
-        if limit is not None and "goal_current" not in table:
-            key = f"joints.{name}.safety.current_limit_mA"
-            raise ConfigError.at(head.name, key, limit, f"cannot be kept: {joint.model} has no current sensor")
-        for register, value in head.safety_of(name).registers.items():
-            key = f"joints.{name}.safety.registers.{register}"
-            if register not in table or table[register].access != "RW":
-                choices = [each for each, row in table.items() if row.access == "RW"]
-                raise ConfigError.at(head.name, key, value, f"is no register of {joint.model} to be written", choices)
-            if not table[register].low <= value <= table[register].high:
-                allowed = f"{table[register].low}..{table[register].high}"
-                raise ConfigError.at(head.name, key, value, f"does not fit {joint.model}", [allowed])
 
 
 def _port(where: Chain | str, baud: int, clock: Clock) -> Callable[[], Port]:

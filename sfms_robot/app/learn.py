@@ -28,11 +28,19 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str,
         return dict(composed.compose_folder(data, out, seed, minutes))
 
 
-def train_tokenizer(file: Path, data: Path, out: Path) -> dict[str, Any]:
-    """Phase 1. Returns its figures and the minutes it took."""
+def train_tokenizer(
+    file: Path, data: Path, out: Path, placement: str | None = None, steps: int | None = None
+) -> dict[str, Any]:
+    """Phase 1, with another placement or number of steps than the file's if given. Returns its figures and minutes."""
     from sfms_robot.learning import tokenizer
 
     settings = load(config.Training, file)
+    if placement is not None:
+        settings = settings.model_copy(
+            update={"listener": settings.listener.model_copy(update={"placement": placement})}
+        )
+    if steps is not None:
+        settings = settings.model_copy(update={"tokenizer": settings.tokenizer.model_copy(update={"steps": steps})})
     began_s = time.monotonic()
     figures = tokenizer.train_tokenizer(settings, data, out)
     return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)}

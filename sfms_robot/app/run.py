@@ -6,7 +6,6 @@ then torque. Whatever happens after torque-on, the loop brings the head to rest;
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Callable
@@ -16,10 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sfms_robot.app.heads import SIM, Motion, Opened, build_bus, build_motion, devices, emulated
+from sfms_robot.app.heads import SIM, Motion, Opened, build_bus, build_motion, devices, on_boards, plugged_in
+from sfms_robot.app.knobs import turned
 from sfms_robot.app.report import run_report
-from sfms_robot.config import Head, find, load_head
-from sfms_robot.config.caution import cautious
+from sfms_robot.app.unit import unit_head
+from sfms_robot.config import Head, find
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.listeners.remote import RemoteFeed
@@ -33,8 +33,6 @@ from sfms_robot.runtime.recorder import FullPolicy, Recorder, write_report
 from sfms_robot.runtime.safety import interrupt_flag, realtime_priority
 from sfms_robot.simulator.launch import Chain, launch
 from sfms_robot.sources.recording import open_source
-
-log = logging.getLogger(__name__)
 
 FAST_LATENCY_S = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
@@ -53,6 +51,9 @@ class RunOptions:
     seed: int = 0
     record: Path | None = None
     dry_run: bool = False
+    yes: bool = False
+    intensity: tuple[str, ...] = ()
+    style: tuple[str, ...] = ()
 
 
 def run_head(options: RunOptions, progress: Callable[[float | None], Observer] | None = None) -> dict[str, Any]:
@@ -62,10 +63,13 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
     """
     if options.fast and options.port != SIM:
         raise ConfigError(f"--port {options.port!r}: --fast needs emulated servos, time is virtual (sim)")
-    head = ready(load_head(options.head), real=options.port != SIM, calibrated=False)
+    head = unit_head(options.head, options.port)
     where = {} if options.port == SIM else devices(head, options.port)
+    if options.port != SIM and not options.dry_run:
+        _confirmed(head, options.yes)
     rate_hz = max(bus.rate_hz for bus in head.buses.values())
     motion = build_motion(head, rate_hz)
+    knobs = turned(motion.retargeter, options.intensity, options.style)
     weights = find("listeners", options.listener, "config.yaml")
     source = open_source(options.audio, options.face, options.duration_s)
     if options.fast and source.duration_s is None:
@@ -76,9 +80,9 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
         stack.callback(feed.close)
         opened: Opened = dict(where)
         if options.port == SIM:
-            chains = emulated(head)
+            chains = plugged_in(options.head, head)
             opened = {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
-        bus = build_bus(head, opened, clock)
+        bus = build_bus(head, opened, clock, confirmed=options.yes)
         stack.callback(bus.close)
         bus.connect()
         if options.dry_run:
@@ -86,7 +90,7 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
         observers = _observers(options, head, source.duration_s, progress, stack)
         parts = Parts(
             source, feed, motion.timeline, motion.retargeter, motion.limiter, bus, observers,
-            motion.leads_s, motion.rest_rad, Life(head.life, options.seed),
+            motion.leads_s, motion.rest_rad, Life(head.life, options.seed), lambda: knobs,
         )  # fmt: skip
         report = _drive(options, parts, motion, clock, rate_hz, weights.name, head.name)
         if options.fast:
@@ -96,12 +100,13 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
     return report
 
 
-def ready(head: Head, *, real: bool, calibrated: bool) -> Head:
-    """The head as it may move on this port: on real servos one to be calibrated first holds back until it is."""
-    if not (real and head.calibrate_first and not calibrated):
-        return head
-    log.warning("head %s is not calibrated: 20 %% of its travel, 0.3 of its speed", head.name)
-    return cautious(head)
+def _confirmed(head: Head, yes: bool) -> None:
+    """Hobby servos cannot come on without a jump. Raises ConfigError unless somebody said that this is understood."""
+    if (jumping := on_boards(head)) and not yes:
+        raise ConfigError(
+            f"head {head.name!r}: hobby servos report no position, and each jumps to rest when it comes on "
+            f"({', '.join(jumping)}); keep clear, and confirm it with --yes"
+        )
 
 
 def _drive(

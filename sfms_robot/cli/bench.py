@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import sys
 from enum import StrEnum
 
 import typer
@@ -13,20 +14,61 @@ class Bench(StrEnum):
     startup = "startup"
     bus = "bus"
     retarget = "retarget"
+    lead = "lead"
     listener = "listener"
+    campaign = "campaign"
+    fuzz = "fuzz"
 
 
 def bench(
     name: Bench = typer.Argument(Bench.all, help="What to measure."),
+    head: str | None = typer.Option(None, help="For 'lead', and for 'retarget --frames': this head."),
+    frames: int | None = typer.Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
+    minutes: float = typer.Option(0.0, min=0.0, help="For 'fuzz': go on for so long; 0 = a million bytes each."),
     json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
-    """Measure: start of the command line, one bus tick, one retarget tick, one listener plan."""
+    """Measure: start of the command line, one bus tick, one retarget tick, one listener plan.
+
+    'campaign' tries every fault on every family of servos, 'fuzz' random bytes; both end with exit code 1 when
+    something is not as it should be. They are not part of 'all'.
+    """
+    if name in (Bench.campaign, Bench.fuzz):
+        _trial(name, minutes, json)
+        return
     from sfms_robot.app.bench import run_bench
 
-    result = run_bench(name.value)
+    result = run_bench(name.value, head, frames)
     if json:
         print(json_module.dumps(result))
     else:
         from sfms_robot.cli.tables import print_bench
 
         print_bench(result)
+
+
+def _trial(name: Bench, minutes: float, json: bool) -> None:
+    """A campaign or a fuzz, said line by line on stderr while it runs."""
+    import logging
+    from dataclasses import asdict
+
+    from sfms_robot.app import campaign, fuzz
+    from sfms_robot.cli.tables import print_rows
+
+    logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr)
+
+    if name is Bench.campaign:
+        outcomes = campaign.run_campaign(progress=say)
+        rows, plain = campaign.table(outcomes), [asdict(each) | {"passed": each.passed} for each in outcomes]
+    else:
+        fuzzed = fuzz.run_fuzz(minutes, progress=say)
+        rows, plain = fuzz.table(fuzzed), [asdict(each) | {"passed": each.passed} for each in fuzzed]
+    passed = all(each["passed"] for each in plain)
+    if json:
+        print(json_module.dumps({"passed": passed, "runs": plain}))
+    else:
+        print_rows(rows)
+    if not passed:
+        raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""`sfms-robot evaluate`: what a listener's parts are worth on held-out dyads."""
+"""`sfms-robot evaluate`: what a listener's parts are worth on held-out dyads, and a head's joints on faces."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-app = typer.Typer(help="Evaluate on held-out dyads.", no_args_is_help=True)
+app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 
 LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 DATA = typer.Option(..., help="Folder with validation/ (see `sfms-robot data compose`).")
@@ -35,6 +35,18 @@ def listener_(
     from sfms_robot.app.learn import evaluate_listener
 
     _print(evaluate_listener(listener, data, seed), json)
+
+
+@app.command()
+def fidelity(
+    head: list[str] = typer.Option([], "--head", metavar="NAME|DIR", help="May be given often; all shipped heads."),
+    data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    json: bool = JSON,
+) -> None:
+    """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""
+    from sfms_robot.app.fidelity import fidelity as measure
+
+    _print(measure(head, data), json)
 
 
 def _print(result: Mapping[str, Any], json: bool) -> None:

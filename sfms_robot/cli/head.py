@@ -1,4 +1,4 @@
-"""`sfms-robot head`: the heads at hand, whether one is sound, and what its neck makes of a pose."""
+"""`sfms-robot head`: the heads at hand, whether one is sound, what this build of it measures, and how it moves."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from pathlib import Path
 
 import typer
 
+from sfms_robot.cli.head_fit import fit
 from sfms_robot.errors import ConfigError
 
-app = typer.Typer(help="Heads: list what is shipped, check one, show its values, solve poses.", no_args_is_help=True)
+INTERRUPTED = 130
+
+app = typer.Typer(help="Heads: list, check, show, calibrate, pose, solve.", no_args_is_help=True)
+app.command("fit")(fit)
 
 
 @app.command("list")
@@ -59,21 +63,67 @@ def show(
     joint: str | None = typer.Option(None, "--joint", metavar="JOINT", help="Only this joint."),
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
-    """Every value of every joint, and where it comes from: its own line, its twin, the defaults, or built in."""
-    from sfms_robot.config.origins import origins
+    """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
+    from sfms_robot.config.origins import origins, refusals
 
-    joints = origins(name)
+    joints, refused = origins(name), refusals(name)
     if joint is not None:
         if joint not in joints:
             raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", joints)
         joints = {joint: joints[joint]}
     if json:
         told = {j: {key: {"value": v, "from": o} for key, (v, o) in values.items()} for j, values in joints.items()}
-        print(json_module.dumps({"name": name, "joints": told}))
+        print(json_module.dumps({"name": name, "joints": told, "refused": refused}))
         return
     from sfms_robot.cli.head_tables import print_origins
 
-    print_origins(name, joints)
+    print_origins(name, joints, refused)
+
+
+@app.command("calibrate")
+def calibrate(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    port: str = typer.Option(..., "--port", help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
+    joint: list[str] = typer.Option([], "--joint", metavar="JOINT", help="Only this joint; may be given often."),
+    again: bool = typer.Option(False, "--again", help="Also joints that are measured already."),
+    json: bool = typer.Option(False, "--json", help="Print the outcome as one JSON object, last line of stdout."),
+) -> None:
+    """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
+    from sfms_robot.app.calibrate import calibrate as lead_through
+    from sfms_robot.cli.head_tables import Terminal, print_calibration
+
+    outcome = lead_through(name, port, Terminal(), joint, again)
+    if json:
+        print(json_module.dumps(outcome.as_dict()))
+    else:
+        print_calibration(outcome)
+    if outcome.problems:
+        raise typer.Exit(ConfigError.exit_code)
+    if outcome.exit == "interrupted":
+        raise typer.Exit(INTERRUPTED)
+
+
+@app.command("pose")
+def pose(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    face: list[str] = typer.Argument(..., metavar="EXPRESSION|CHANNEL=VALUE...", help="smile, blink, jawOpen=0.5 ..."),
+    port: str = typer.Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
+    hold: float = typer.Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="How long the pose is held."),
+    fast: bool = typer.Option(False, help="Virtual time, on emulated servos."),
+    yes: bool = typer.Option(False, "--yes", help="Hobby servos may jump to rest when they come on."),
+    json: bool = typer.Option(False, "--json", help="Print what moved as one JSON object, last line of stdout."),
+) -> None:
+    """Move one expression or channel under the head's limits, hold it, and go back to rest."""
+    from sfms_robot.app.pose import PoseOptions, pose_head
+    from sfms_robot.cli.head_tables import print_pose
+
+    told = pose_head(PoseOptions(name, tuple(face), port, hold, fast, yes))
+    if json:
+        print(json_module.dumps(told))
+    else:
+        print_pose(told)
+    if told["exit"] == "interrupted":
+        raise typer.Exit(INTERRUPTED)
 
 
 @app.command("solve")

@@ -9,6 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from sfms_robot.app.calibrate import Outcome
 from sfms_robot.app.head_check import HeadCheck
 
 _OVER = "bold red"
@@ -71,13 +72,54 @@ def print_check(checked: HeadCheck) -> None:
         console.print("calibrate first: on real servos it moves 20 % of its travel at 0.3 of its speed until then")
 
 
-def print_origins(name: str, joints: Mapping[str, Mapping[str, tuple[Any, str]]]) -> None:
-    """Every value of every joint; those that its own line does not give carry their origin."""
+def print_origins(name: str, joints: Mapping[str, Mapping[str, tuple[Any, str]]], refused: Sequence[str] = ()) -> None:
+    """Every value of every joint with its origin, and what is known of this build but does not hold any more."""
+    console = Console()
     for joint, values in joints.items():
         table = Table("key", "value", "from", title=f"{name}: {joint}", title_justify="left")
         for key, (value, origin) in values.items():
             table.add_row(key, f"{value:g}" if isinstance(value, float) else str(value), origin)
-        Console().print(table)
+        console.print(table)
+    for line in refused:
+        console.print(line, style=_OVER, markup=False, highlight=False, soft_wrap=True)
+
+
+class Terminal:
+    """The person in front of it, line by line."""
+
+    def say(self, text: str) -> None:
+        print(text, flush=True)
+
+    def ask(self, prompt: str) -> str:
+        return input(prompt)
+
+
+def print_calibration(outcome: Outcome) -> None:
+    """What is measured, what is missing, and what the check found."""
+    print(f"\n{outcome.head}: {len(outcome.measured)} joints measured now, {len(outcome.before)} before")
+    for joint, reason in outcome.skipped.items():
+        print(f"left out: {joint}: {reason}")
+    for problem in outcome.problems:
+        print(f"does not hold: {problem}")
+    if outcome.missing:
+        print(f"to be calibrated first: {', '.join(outcome.missing)} (until then 20 % of the travel, 0.3 of the speed)")
+    if outcome.measured or outcome.before:
+        print(f"read back and checked: {outcome.file}" if not outcome.problems else f"in {outcome.file}")
+
+
+def print_pose(told: Mapping[str, Any]) -> None:
+    """The joints that moved: how far they were sent, and how far their servos say that they went."""
+    table = Table(box=box.SIMPLE_HEAD, title=f"{told['head']}: {' '.join(told['face'])}", padding=(0, 1, 0, 0))
+    table.add_column("joint", no_wrap=True)
+    for heading in ("sent deg", "reached deg"):
+        table.add_column(heading, justify="right")
+    for joint, row in told["joints"].items():
+        reached = "" if row["reached_deg"] is None else f"{row['reached_deg']:+.1f}"
+        table.add_row(joint, f"{row['sent_deg']:+.1f}", reached)
+    console = Console()
+    console.print(table)
+    if told["blind"]:
+        console.print("cannot show: " + ", ".join(told["blind"]))
 
 
 def _share(share: float) -> str:

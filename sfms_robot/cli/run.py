@@ -27,6 +27,11 @@ def run(
     seed: int = typer.Option(0, min=0, help="Two seeds listen differently, one seed repeats (with --fast)."),
     record: Path | None = typer.Option(None, help="Folder to write the run to, for `sfms-robot replay`."),
     dry_run: bool = typer.Option(False, "--dry-run", help="Open and read the servos, never switch torque on."),
+    yes: bool = typer.Option(
+        False, "--yes", help="Hobby servos may jump when they come on: they report no position to begin from."
+    ),
+    intensity: list[str] = typer.Option([], metavar="REGION=V", help="How far a region goes, 0 to 2; may be repeated."),
+    style: list[str] = typer.Option([], metavar="REGION=V", help="How much of its small motions shows, 0 to 2."),
     json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
@@ -34,7 +39,9 @@ def run(
     from sfms_robot.app.run import RunOptions, run_head
     from sfms_robot.cli.tables import print_dry_run, print_run
 
-    options = RunOptions(head, port, listener, audio, face, duration, fast, seed, record, dry_run)
+    options = RunOptions(
+        head, port, listener, audio, face, duration, fast, seed, record, dry_run, yes, tuple(intensity), tuple(style)
+    )
     try:
         report = run_head(options, RunProgress)
     except KeyboardInterrupt:  # before torque came on; after that an interruption is a flag, and the head comes to rest

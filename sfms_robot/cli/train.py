@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,26 @@ OUT = typer.Option(..., help="Folder for config.yaml and weights; `run --listene
 JSON = typer.Option(False, "--json", help="Print the figures as one JSON object.")
 
 
+class Placement(StrEnum):
+    exact = "exact"
+    static = "static"
+    static_paper = "static_paper"
+    learned = "learned"
+
+
 @app.command()
-def tokenizer(config: Path = CONFIG, data: Path = DATA, out: Path = OUT, json: bool = JSON) -> None:
+def tokenizer(
+    config: Path = CONFIG,
+    data: Path = DATA,
+    out: Path = OUT,
+    placement: Placement | None = typer.Option(None, help="Another keyframe placement than the file's, to compare."),
+    steps: int | None = typer.Option(None, min=1, help="Another number of steps than the file's."),
+    json: bool = JSON,
+) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
     from sfms_robot.app.learn import train_tokenizer
 
-    _print(train_tokenizer(config, data, out), json)
+    _print(train_tokenizer(config, data, out, placement.value if placement else None, steps), json)
 
 
 @app.command()

@@ -55,14 +55,15 @@ def _seen_in_mirror(twin: dict[str, Any], sense: Any) -> dict[str, Any]:
 
 def drives(head: Head) -> dict[str, Expression | None]:
     """What every joint follows, in terms of channels alone; None for a joint that follows nothing."""
-    found = {name: _own(name, joint.drive, head) for name, joint in head.joints.items() if joint.mirror_of is None}
-    for name, joint in head.joints.items():
-        if joint.mirror_of is not None:
-            twin = found[joint.mirror_of]
-            seen = mirrored(twin) if twin else None
-            if seen and joint.mirror_sense == "opposite":
-                seen = Expression(sum=(seen,), gain=-1)
-            found[name] = _own(name, seen, head)
+    mirrors = {name for name, joint in head.joints.items() if joint.mirror_of is not None and joint.drive is None}
+    found = {name: _own(name, joint.drive, head) for name, joint in head.joints.items() if name not in mirrors}
+    for name in mirrors:  # one that has learnt a drive of its own does not look at its twin's
+        joint = head.joints[name]
+        twin = found[joint.mirror_of or ""]
+        seen = mirrored(twin) if twin else None
+        if seen and joint.mirror_sense == "opposite":
+            seen = Expression(sum=(seen,), gain=-1)
+        found[name] = _own(name, seen, head)
     return {name: found[name] for name in head.joints}
 
 

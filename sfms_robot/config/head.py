@@ -58,6 +58,7 @@ class Safety(Model):
 
     Attributes:
         current_limit_mA: the servo never pushes harder; needs a servo with a current sensor.
+        torque_limit_percent: of the servo's full torque (its voltage, to be exact); for those without such a sensor.
         on_fault: hold where it is, limp (torque off), reduce (half the force), or reboot and ease in again.
         pinch: something is in the way. By default 60 % of the servo's own current limit for half a second: limp.
         strain: a pose that takes force for long heats the servo and makes it sing. Off by default.
@@ -66,6 +67,7 @@ class Safety(Model):
     """
 
     current_limit_mA: Positive | None = None
+    torque_limit_percent: Annotated[float, Field(gt=0, le=100)] | None = None
     on_fault: FaultPolicy = "limp"
     pinch: LoadRule | None = None
     strain: LoadRule | None = None

@@ -90,6 +90,10 @@ class JerkLimiter:
         self._acceleration = limits.acceleration * _HEADROOM
         self._jerk = limits.jerk * _HEADROOM
         self._dt_s = dt_s
+        self._piece, self._piece_bounds = self._one_tick()
+        self._stop_s, self._per_acceleration = self._acceleration / self._jerk, 0.5 / self._acceleration
+        self._speed_slack, self._acceleration_slack = self._speed * (1 + _SLACK), self._acceleration * (1 + _SLACK)
+        self._far = self._absurd(self._low, self._high)
         self._planner = ruckig.Ruckig(1)
         self._path = ruckig.Trajectory(1)
         bounds = zip(self._speed.tolist(), self._acceleration.tolist(), self._jerk.tolist(), strict=True)
@@ -116,12 +120,15 @@ class JerkLimiter:
         """Reference (3, J) one tick ahead -> angles (J,) that may be sent, and the state after the tick."""
         finite: Bools = np.logical_and.reduce(np.isfinite(reference_rad), axis=0)
         low, high = state.low, state.high
-        wanted = self._near(np.where(finite, reference_rad, state.motion), low, high)
+        floor, ceiling = self._far if low is self._low and high is self._high else self._absurd(low, high)
+        given = reference_rad if finite.all() else np.where(finite, reference_rad, state.motion)
+        wanted = np.minimum(np.maximum(given, floor), ceiling)
         after = wanted.copy()
-        passes = finite & self._in_one_tick(state.motion, wanted) & self._lawful(wanted, low, high)
+        lawful = self._lawful(wanted, low, high)
+        passes = finite & self._in_one_tick(state.motion, wanted) & lawful
         hard = np.flatnonzero(~passes)
         if len(hard):
-            targets = self._targets(wanted, low, high)
+            targets = self._targets(wanted, lawful, low, high)
             for j in hard.tolist():
                 after[:, j] = self._chased(j, state.motion[:, j], targets[:, j]) if finite[j] else np.nan
             brakes = ~(passes | self._lawful(after, low, high))
@@ -143,28 +150,36 @@ class JerkLimiter:
             return self._low, self._high
         return np.where(inside, self._low, low), np.where(inside, self._high, high)
 
-    def _near(self, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
-        """`wanted` (3, J) with what is absurdly far out of its limits brought just out of them: 1e300 overflows."""
-        bound = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
-        floor = np.stack([low - 1, -bound[1], -bound[2]])
-        near: Doubles = np.minimum(np.maximum(wanted, floor), bound)
-        return near
+    def _absurd(self, low: Doubles, high: Doubles) -> tuple[Doubles, Doubles]:
+        """Just out of the limits, below and above (3, J): what is farther out is brought here, for 1e300 overflows."""
+        ceiling = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
+        return np.stack([low - 1, -ceiling[1], -ceiling[2]]), ceiling
 
-    def _in_one_tick(self, motion: Doubles, wanted: Doubles) -> Bools:
-        """Whether three pieces of bounded jerk lead from `motion` to `wanted` (3, J) in one tick."""
+    def _one_tick(self) -> tuple[Doubles, Doubles]:
+        """What three pieces of constant jerk lead from one state to the next take: (6, 6) matrix, bounds (6, J).
+
+        The matrix takes both states, one below the other (6, J), to the three jerks, the accelerations between the
+        pieces, and the way.
+        """
         dt = self._dt_s
-        p, v, a = motion
-        missing = np.stack(
+        missing = np.array(
             [
-                (wanted[2] - a) / dt,
-                (wanted[1] - v - a * dt) / dt**2,
-                (wanted[0] - p - v * dt - a * (dt**2 / 2)) / dt**3,
+                [0, 0, -1 / dt, 0, 0, 1 / dt],
+                [0, -1 / dt**2, -1 / dt, 0, 1 / dt**2, 0],
+                [-1 / dt**3, -1 / dt**2, -1 / (2 * dt), 1 / dt**3, 0, 0],
             ]
         )
         jerks = _JERKS_FOR @ missing
-        inner = np.abs(np.stack([a + jerks[0] * (dt / 3), wanted[2] - jerks[2] * (dt / 3)]))
-        ok: Bools = (np.abs(jerks).max(axis=0) <= self._jerk) & (inner.max(axis=0) <= self._acceleration)
-        ok &= np.abs(wanted[0] - p) <= self._speed * dt
+        inner = np.stack([jerks[0] * (dt / 3), -jerks[2] * (dt / 3)])
+        inner[0, 2] += 1.0
+        inner[1, 5] += 1.0
+        bounds = [self._jerk, self._jerk, self._jerk, self._acceleration, self._acceleration, self._speed * dt]
+        return np.concatenate([jerks, inner, [[-1.0, 0, 0, 1, 0, 0]]]), np.stack(bounds)
+
+    def _in_one_tick(self, motion: Doubles, wanted: Doubles) -> Bools:
+        """Whether three pieces of bounded jerk lead from `motion` to `wanted` (3, J) in one tick."""
+        needed = self._piece @ np.concatenate([motion, wanted])
+        ok: Bools = np.logical_and.reduce(np.abs(needed) <= self._piece_bounds, axis=0)
         return ok
 
     def _lawful(self, motion: Doubles, low: Doubles, high: Doubles) -> Bools:
@@ -173,29 +188,34 @@ class JerkLimiter:
         Nothing that is not finite is lawful.
         """
         p, v, a = motion
-        peak = v + a * np.abs(a) / (2 * self._jerk)  # speed by the time the acceleration is gone
-        # Stopping takes no more way than: acceleration to 0 first, then a whole stop from the highest speed.
-        top = np.abs(v) + a**2 / (2 * self._jerk)
-        last = top * ((np.abs(a) + self._acceleration) / self._jerk + top / (2 * self._acceleration))
-        first = -last
-        if not ((p + first >= low) & (p + last <= high)).all():
+        speed, size = np.abs(motion[1:])
+        lasts = size / self._jerk  # how long it takes until the acceleration is gone
+        gain = 0.5 * a * lasts
+        peak = v + gain  # speed by then
+        # Stopping takes no more way than: acceleration to 0 first, then a whole stop from the highest speed. The other
+        # way it only goes until it has turned round, which takes no longer than the acceleration lasts.
+        top = speed + np.abs(gain)
+        way, back = top * (lasts + self._stop_s + top * self._per_acceleration), speed * lasts
+        onward = peak >= 0
+        below, above = p - np.where(onward, back, way), p + np.where(onward, way, back)
+        ok: Bools = np.maximum(speed, np.abs(peak)) <= self._speed_slack
+        ok &= size <= self._acceleration_slack
+        if not ((below >= low) & (above <= high)).all():
             first, last = Stop.of(motion, self._acceleration, self._jerk).extent()
-        loose = 1 + _SLACK
-        ok: Bools = (np.abs(v) <= self._speed * loose) & (np.abs(peak) <= self._speed * loose)
-        ok &= np.abs(a) <= self._acceleration * loose
-        ok &= (p + first >= low - _POSITION_SLACK_RAD) & (p + last <= high + _POSITION_SLACK_RAD)
-        ok &= (p >= low - _POSITION_SLACK_RAD) & (p <= high + _POSITION_SLACK_RAD)
+            ok &= (p + first >= low - _POSITION_SLACK_RAD) & (p + last <= high + _POSITION_SLACK_RAD)
         return ok
 
-    def _targets(self, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
+    def _targets(self, wanted: Doubles, lawful: Bools, low: Doubles, high: Doubles) -> Doubles:
         """`wanted` (3, J) made something ruckig may aim at: inside the range, lawful, or else standing still."""
-        p = np.minimum(np.maximum(wanted[0], low), high)
-        v = np.minimum(np.maximum(wanted[1], -self._speed), self._speed)
-        a = np.minimum(np.maximum(wanted[2], -self._acceleration), self._acceleration)
-        outside = p != wanted[0]
-        target = np.stack([p, np.where(outside, 0.0, v), np.where(outside, 0.0, a)])
-        target[2] *= self._lawful(target, low, high)
-        target[1:] *= self._lawful(target, low, high)
+        p, v, a = wanted
+        inside = np.minimum(np.maximum(p, low), high)
+        v = np.minimum(np.maximum(v, -self._speed), self._speed)
+        a = np.minimum(np.maximum(a, -self._acceleration), self._acceleration)
+        target = np.stack([inside, v, a])
+        if not lawful.all():
+            target[1:] *= lawful | (inside == p)  # outside, it is to stop at the edge
+            target[2] *= self._lawful(target, low, high)
+            target[1:] *= self._lawful(target, low, high)
         return target
 
     def _chased(self, j: int, motion: Doubles, target: Doubles) -> Doubles:

@@ -35,6 +35,7 @@ EASE_S = 1.0
 HISTORY = 8  # frames kept before the one in play
 JAW_FULL_OPEN_RAD = math.radians(25.0)  # jaw pitch that stands for jawOpen = 1
 _EVEN = 1e-3  # frames count as evenly spaced within this share of a frame
+_FARTHEST = 1e6  # m or rad
 _BLINKS = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
 _JAW_OPEN = CHANNEL_INDEX["jawOpen"]
 
@@ -201,11 +202,15 @@ def _usable(plan: Plan) -> bool:
 
 
 def _frames(plan: Plan) -> Doubles:
-    """Frames (H, 58) with blendshapes in 0..1, and the jaw pose, when there is one, in the place of jawOpen."""
+    """Frames (H, 58) with blendshapes in 0..1, and the jaw pose, when there is one, in the place of jawOpen.
+
+    A pose beyond all sense stays one, but no curve through it overflows.
+    """
     frames = np.array(plan.frames, dtype=np.float64)
     if plan.jaw_rad is not None:  # axis-angle; y points left, so + about y lowers the chin
         frames[:, _JAW_OPEN] = plan.jaw_rad[:, 1] / JAW_FULL_OPEN_RAD
     frames[:, SHAPES] = np.clip(frames[:, SHAPES], 0.0, 1.0)
+    frames[:, POSE] = np.clip(frames[:, POSE], -_FARTHEST, _FARTHEST)
     return frames
 
 

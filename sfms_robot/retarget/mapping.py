@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping as Table
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class Knobs:
     intensity: Doubles
     style: Doubles
 
-    @property
+    @cached_property
     def neutral(self) -> bool:
         return bool((self.intensity == 1).all() and (self.style == 1).all())
 

@@ -36,7 +36,10 @@ from sfms_robot.runtime.safety import EASE_S, come_to_rest, smooth
 
 @dataclass(frozen=True)
 class Parts:
-    """Everything a run is made of, put together by `app`. `leads_s` and `rest_rad` are (J,) in joint order."""
+    """Everything a run is made of, put together by `app`. `leads_s` and `rest_rad` are (J,) in joint order.
+
+    `knobs` is asked at every tick how much the head is to show; None: what its file says.
+    """
 
     source: Source
     feed: PlanFeed
@@ -48,6 +51,7 @@ class Parts:
     leads_s: Doubles
     rest_rad: Doubles
     life: Life | None = None
+    knobs: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,8 @@ def _tick(parts: Parts, log: RunLog, clock: Clock, beat: Beat, state: State, sta
     life = state.life
     if parts.life:
         motion, life = parts.life.step(motion, times_s, now_s, life)
-    asked_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter)
+    knobs = parts.knobs() if parts.knobs else None
+    asked_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
     eased = smooth((now_s + period_s - state.since_s) / EASE_S)
     ahead_rad = state.held_rad + eased * (asked_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)

@@ -18,7 +18,7 @@ from sfms_robot.config import Faults
 from sfms_robot.errors import BusError
 from sfms_robot.servo.dxl2_link import Dxl2Link
 from sfms_robot.servo.handshake import Handshake
-from sfms_robot.servo.policy import BusServo, LoadWatch, counts
+from sfms_robot.servo.policy import BusServo, LoadWatch, counts, torque_register
 from sfms_robot.servo.recovery import AGAIN_S, ATTEMPTS, Recovery
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.telemetry import Telemetry
@@ -183,7 +183,8 @@ class Care:
         elif policy == "reduce":
             table = self._tables[index]
             current = self._servos[index].safety.current_limit_mA is not None and "goal_current" in table.fields
-            self._write(index, "goal_current" if current else "goal_pwm", lambda raw: raw // 2)
+            strength = "goal_current" if current else torque_register(self._servos[index].map)
+            self._write(index, strength or "", lambda raw: raw // 2)
         else:
             self.away[index] = REBOOT
             self._again(index, now_s, now_s, reboot=True)

@@ -2,6 +2,9 @@
 
 Where time is real and there are several, each has its own writer thread and rate, so that one at 9600 baud does not
 hold up the others. In virtual time they take their turns, and a run is the same every time.
+
+Goals are limited once, at the rate of the loop, and a slower bus sends every k-th of them. Those keep the limits at its
+own rate as well: finite differences of a curve are averages of its derivatives, however far apart the samples lie.
 """
 
 from __future__ import annotations

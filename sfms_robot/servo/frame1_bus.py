@@ -106,7 +106,7 @@ class Frame1Bus:
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
-        return dict.fromkeys(self.joints, self._telemetry.capabilities)
+        return {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
 
     def _group_reader(self, link: Frame1Link) -> GroupRead | None:
         """How the family reads several servos by one request; None when it does not."""
@@ -300,11 +300,11 @@ class Frame1Bus:
         """Of one servo per poll, what is not in the block: whether it has torque, and in turn its current."""
         if not ids:
             return
-        current = self._telemetry.current
         self._checkup += 1
-        kinds = 2 if current is not None else 1
+        kinds = 2 if any(self._telemetry.currents) else 1
         servo = ids[self._checkup // kinds % len(ids)]
         index = self._index[servo]
+        current = self._telemetry.currents[index]
         if current is not None and self._checkup % 2:
             answer = link.read(servo, current.address, current.size)
             if answer is not None and len(answer.data) == current.size:

@@ -106,7 +106,8 @@ class Frame1Care:
         names = [name for bit, name in sorted(table.status_faults.items()) if bits >> bit & 1]
         names = [name for name in names if self._counts(index, name, seen)]
         if not names:
-            if trouble.fault != TORQUE_LOST:
+            stays_out = trouble.away and trouble.due_s is None  # for good, and says why though the cause has passed
+            if trouble.fault != TORQUE_LOST and not stays_out:
                 trouble.fault = None
             return None
         trouble.fault = ", ".join(names)

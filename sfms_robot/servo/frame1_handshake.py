@@ -13,7 +13,7 @@ from sfms_robot.errors import BusError, ServoError
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.frame1_link import Frame1Link
 from sfms_robot.servo.link import Answer, Found
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.policy import BusServo, torque_limit
 from sfms_robot.servo.registers import Field, Table
 
 _TRIES: Final = 3
@@ -111,8 +111,8 @@ class Frame1Handshake:
             if anew and field.eeprom:
                 continue
             value = self._value(index, field)
-            if value == wanted:
-                continue
+            if value == wanted or (field == table.role("torque_limit") and not value):
+                continue  # a torque limit of 0 is a shutdown, and stays until the goal is where the servo stands
             if torque and field.eeprom:
                 if field.name == "return_delay_time":
                     continue  # slower, and no reason to let go
@@ -127,11 +127,20 @@ class Frame1Handshake:
         settings += self._joint_mode(index, table)
         if delay is not None:
             settings.append((delay, 0))
-        own = {name: 0 for name in _UNLIMITED if name in table.fields} | self._servos[index].safety.registers
+        own = {name: 0 for name in _UNLIMITED if name in table.fields} | self._strength(index)
+        own |= self._servos[index].safety.registers
         for name in own:
             if name not in table.fields:
                 raise self._error(index, f"is a {table.model}, which has no register {name}")
         return settings + [(table[name], value) for name, value in own.items()]
+
+    def _strength(self, index: int) -> dict[str, int]:
+        """Register and value of the torque limit: what the head says, else all: an earlier run may have left less."""
+        table = self._tables[index]
+        strength = table.role("torque_limit")
+        if strength is None or "max_torque" not in table.fields:
+            return torque_limit(self._servos[index])
+        return torque_limit(self._servos[index]) or {strength.name: self._value(index, table["max_torque"])}
 
     def _joint_mode(self, index: int, table: Table) -> list[tuple[Field, int]]:
         """Dynamixel 1.0 keeps its mode in its angle limits: both 0 is a wheel, both at the end many turns."""
@@ -150,9 +159,9 @@ class Frame1Handshake:
             present = self._value(index, self._field(index, "present_position"))
             self._refuse_outside(index, present)
             self._set(index, goal, present)
-            strength = table.role("torque_limit")
-            if strength is not None and "max_torque" in table.fields and not self._value(index, strength):
-                self._set(index, strength, self._value(index, table["max_torque"]))  # 0 since it shut down
+            for name, value in self._strength(index).items():
+                if not self._value(index, table[name]):  # since it shut down
+                    self._set(index, table[name], value)
             self._set(index, torque, 1)
         return present
 

@@ -66,6 +66,7 @@ class Frame1Link:
         self._sdk_port = _SdkPort(self._write)
         self._sent = b""
         self._owed: dict[int, dict[int, float]] = {}
+        self._echoed = False
 
     @property
     def port(self) -> Port:
@@ -91,19 +92,22 @@ class Frame1Link:
     def ping(self, servo: int) -> Found | None:
         """Whether it is there; who it is comes from its registers, for this protocol's ping does not say."""
         if self._ask(servo, frame1.PING, b"", 0) is None:
-            return None
+            if not self._echoed:
+                return None
+            # With only the voltage bit set, an answer to a ping has the bytes of the ping: it looks like an echo.
+            who = self._who(servo)
+            return None if who.model_number is None else who
         return self._who(servo)
 
     def broadcast_ping(self) -> dict[int, Found]:
         """Everybody, by id. Dynamixel 1.0 has no such request: all 254 ids are asked, one silence each."""
+        everyone = list(range(frame1.MAX_ID + 1))
         if self.family == "dynamixel":
-            there = [servo for servo in range(frame1.MAX_ID + 1) if self._ask(servo, frame1.PING, b"", 0)]
-        else:
-            everyone = list(range(frame1.MAX_ID + 1))
-            self._send(BROADCAST, frame1.PING, b"")
-            with self.patient(_STAGGER_S * len(everyone)):
-                there = sorted(self._answers(everyone, 0))
-            self._owed.clear()  # nobody owes an answer to a question to everybody
+            return {servo: found for servo in everyone if (found := self.ping(servo)) is not None}
+        self._send(BROADCAST, frame1.PING, b"")
+        with self.patient(_STAGGER_S * len(everyone)):
+            there = sorted(self._answers(everyone, 0))
+        self._owed.clear()  # nobody owes an answer to a question to everybody
         return {servo: self._who(servo) for servo in there}
 
     def read(self, servo: int, address: int, length: int) -> Answer | None:
@@ -228,6 +232,7 @@ class Frame1Link:
         """
         port, buffer, answers, echo = self._port, bytearray(), dict[int, Answer](), self._sent
         pending = set(servos)
+        self._echoed = False
         deadline_s = port.now_s() + len(echo) * self._byte_s + self.silence_s
         answer_s = 2 * len(servos) * (OVERHEAD + length) * self._byte_s
         last_s = deadline_s + answer_s + _NO_PATIENCE * self.silence_s
@@ -240,6 +245,7 @@ class Frame1Link:
             if len(buffer) < len(echo) and echo.startswith(buffer):
                 continue  # perhaps an adapter that hears itself
             if echo and buffer.startswith(echo):
+                self._echoed = True
                 del buffer[: len(echo)]
             echo = b""
             while (frame := maybe_frame(buffer)) is not None:

@@ -29,7 +29,7 @@ class Frame1Telemetry:
     Attributes:
         fields: registers of every tick by role, alike for all servos of the bus.
         block: (address, length) of what is read in every poll.
-        current: the register of the present current; None where the bus has none that tells milliamperes.
+        currents: of each servo the register of its present current; None where it has none that tells milliamperes.
         ticks: (J,) last position.
 
     Raises ConfigError for servos of another family, or whose registers lie at different places.
@@ -40,9 +40,8 @@ class Frame1Telemetry:
         polled = [self.fields[role] for role in POLLED]
         first = min(each.address for each in polled)
         self.block = first, max(each.address + each.size for each in polled) - first
-        currents = {table.role("present_current") for table in tables}
-        current = currents.pop() if len(currents) == 1 else None
-        self.current = current if current is not None and current.unit == "mA" else None
+        currents = [table.role("present_current") for table in tables]
+        self.currents = [each if each is not None and each.unit == "mA" else None for each in currents]
         self._at = {role: self.fields[role].address - first for role in POLLED}
         self._turns = [table.ticks_per_revolution for table in tables]
         self._conversion = conversion
@@ -53,10 +52,9 @@ class Frame1Telemetry:
         self._seen_s = [-math.inf] * len(tables)
         self._extra: list[dict[str, float]] = [{} for _ in tables]
 
-    @property
-    def capabilities(self) -> frozenset[str]:
+    def capabilities(self, index: int) -> frozenset[str]:
         known = {"position", "velocity", "voltage", "temperature", "torque"}
-        return frozenset(known | ({"current"} if self.current is not None else set()))
+        return frozenset(known | ({"current"} if self.currents[index] is not None else set()))
 
     def take(self, index: int, data: bytes, now_s: float) -> None:
         """The block, whole."""

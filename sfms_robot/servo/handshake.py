@@ -15,7 +15,7 @@ from sfms_robot.errors import BusError, ConfigError, ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT, error_text
 from sfms_robot.servo.dxl2_link import Dxl2Link
 from sfms_robot.servo.link import Answer, Found
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.policy import BusServo, torque_limit
 from sfms_robot.servo.registers import Table
 
 T = TypeVar("T")
@@ -161,6 +161,7 @@ class Handshake:
         }
         if "pwm_limit" in now:  # an earlier run may have left it with less
             wanted["goal_pwm"] = now["pwm_limit"]
+        wanted |= torque_limit(self._servos[index])
         if current is not None and safety.current_limit_mA is not None:
             wanted[current.name] = min(current.high, round(safety.current_limit_mA / current.scale))
         wanted |= safety.registers

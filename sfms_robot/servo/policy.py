@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from sfms_robot.config import Faults, FirmwareMap, LoadRule, Safety
+from sfms_robot.config.firmware import Role
 
 PINCH_SHARE: Final = 0.6  # of the servo's own current limit
 PINCH_S: Final = 0.5
@@ -50,9 +51,41 @@ def counts(name: str, faults: Faults, seen: Measured) -> bool:
     return low or high
 
 
+def register_of(table: FirmwareMap, role: Role) -> str | None:
+    """Name of the register that plays a role; None where the model has none."""
+    name = table.roles.get(role, role)
+    return name if name in table.registers else None
+
+
+def tells_current(table: FirmwareMap) -> bool:
+    """Whether the model tells its present current in mA."""
+    name = register_of(table, "present_current")
+    return name is not None and table.registers[name].unit == "mA"
+
+
+def torque_register(table: FirmwareMap) -> str | None:
+    """Name of the register, in percent, that bounds the torque; the PWM where the model has no other.
+
+    Both bound the voltage at the motor, so the torque of a stalled servo falls in proportion.
+    """
+    for name in (register_of(table, "torque_limit"), "goal_pwm"):
+        if name in table.registers and table.registers[name].unit == "percent":
+            return name
+    return None
+
+
+def torque_limit(servo: BusServo) -> dict[str, int]:
+    """Register and raw value that keep `torque_limit_percent`; empty where the joint has no such limit."""
+    percent, name = servo.safety.torque_limit_percent, torque_register(servo.map)
+    if percent is None or name is None:
+        return {}
+    register = servo.map.registers[name]
+    return {name: min(register.high, round(percent / register.scale))}
+
+
 def load_rules(servo: BusServo) -> list[tuple[str, LoadRule]]:
     """The rules of a joint, named; none where its servo cannot tell its current."""
-    if "present_current" not in servo.map.registers:
+    if not tells_current(servo.map):
         return []
     rules = [("pinched", servo.safety.pinch), ("under load too long", servo.safety.strain)]
     limit = servo.map.registers.get("current_limit")

@@ -63,6 +63,7 @@ class Sweep:
         self._config = config
         self._counts = counts
         self._fast = False
+        self._fast_proven = False
         self._fast_failures = 0
         self._blocks = 1
         self._rotation, self._looks = Rotation(), Rotation()
@@ -73,7 +74,7 @@ class Sweep:
     def restart(self, link: Dxl2Link) -> None:
         """Everybody is listed; find out whether they can answer in one packet."""
         self.roster = Roster(self._ids)
-        self._fast, self._fast_failures = self._config.fast_read != "off", 0
+        self._fast, self._fast_proven, self._fast_failures = self._config.fast_read != "off", False, 0
         self._alerting.clear()
         if self._config.fast_read == "auto":
             answers = link.fast_sync_read(*self._telemetry.position, self._ids)
@@ -125,17 +126,23 @@ class Sweep:
             fast = self._fast and attempt == 0 and len(rest) > 1
             got = self._request(link, where, rest, fast)
             if fast and not got:
-                rest = [*rest[1:], rest[0]]  # was it the first servo, or the fast read? Now the others come first
+                if self._fast_proven:  # the first servo is the likely cause: one silence in a tick is enough
+                    missed, rest = rest[:1], rest[1:]
+                else:
+                    rest = [*rest[1:], rest[0]]  # was it the first servo, or the fast read? Now the others come first
                 continue
             if self._fast and attempt == 1 and not answers:
-                self._count_against_fast(len(got) == len(ids))
+                self._count_against_fast(len(got) == len(rest))
             elif fast:
                 self._fast_failures = 0
+                self._fast_proven |= len(got) == len(rest)
             answers |= got
             last = max((i for i, servo in enumerate(rest) if servo in got), default=-1)
             missed += [servo for servo in rest[: last + 1] if servo not in got]
             gaps += rest[last + 1 : last + 2]
             rest = rest[last + 2 :]
+        if not answers:
+            missed = []  # on a quiet wire nobody was passed over
         self._counts["errors"] += len(gaps) + len(missed)
         return answers, gaps, missed
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.heads import FAMILIES, build_bus, emulated
+from sfms_robot.app.heads import FAMILIES, build_bus, emulated, plugged_in
 from sfms_robot.config import Faults, Head, Safety, load_head, parse
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.simulator.launch import launch
+from sfms_robot.simulator.launch import EmulatedServo, launch
 
 
 def head_of(**more) -> Head:
@@ -113,5 +113,68 @@ def test_current_limit_that_cannot_be_kept_is_refused():
     head = head_of()
     jaw = head.joints["jaw"].model_copy(update={"model": "xl430-w250", "safety": Safety(current_limit_mA=300)})
     head = head.model_copy(update={"joints": {**head.joints, "jaw": jaw}})
-    with pytest.raises(ConfigError, match="current_limit_mA = 300.* cannot be kept: xl430-w250 has no current sensor"):
+    with pytest.raises(
+        ConfigError, match="current_limit_mA = 300.* cannot be kept: xl430-w250 cannot limit its current"
+    ):
         build_bus(head, {"face": "/dev/null", "neck": "/dev/null"}, RealClock())
+
+
+def bus_of(family, model, safety, faults=None) -> Head:
+    """One joint on one bus of a family."""
+    joint = {"bus": "main", "model": model, "id": 1, "min_deg": -30, "max_deg": 30, "limits": "slow"}
+    joint["zero_ticks"] = 512 if model == "ax-12a" else 2048
+    more = {"buses": {"main": {"family": family, "baud": 1_000_000}}, "joints": {"jaw": joint}}
+    return head_of(**more, safety=safety, faults=faults or {})
+
+
+@pytest.mark.parametrize(
+    ("family", "model", "safety", "message"),
+    [
+        ("dynamixel1", "ax-12a", {"current_limit_mA": 300}, "limit its current; torque_limit_percent limits its"),
+        ("dynamixel1", "ax-12a", {"pinch": {"current_mA": 300, "for_s": 1}}, "for jaw: ax-12a does not tell its curr"),
+        ("feetech", "scs0009", {"torque_limit_percent": 50}, "for jaw: scs0009 has no torque limit .*percent: null"),
+        ("maestro", "maestro-6", {"current_limit_mA": 300}, "for jaw: maestro-6 cannot limit its current \\("),
+    ],
+)
+def test_limit_of_the_whole_head_names_the_joint_that_cannot_keep_it(family, model, safety, message):
+    with pytest.raises(ConfigError, match=r"two: safety\..* cannot be kept .*" + message):
+        build_bus(bus_of(family, model, safety), {"main": "/dev/null"}, RealClock())
+
+
+@pytest.mark.parametrize(("mask", "fault"), [([], "input voltage"), (["input voltage"], None)])
+@pytest.mark.parametrize(("family", "model"), [("dynamixel1", "ax-12a"), ("feetech", "sts3215")])
+def test_masked_fault_is_none_in_every_family(family, model, mask, fault):
+    head, clock = bus_of(family, model, {}, {"mask": mask}), VirtualClock()
+    servo = EmulatedServo(1, model, start_ticks=head.joints["jaw"].zero_ticks)
+    with launch([servo], virtual=True) as chain:
+        chain.supply(20.0)
+        bus = build_bus(head, {"main": chain}, clock)
+        bus.connect()
+        held = bus.enable(["jaw"])
+        clock.wait_until(0.01)
+        bus.write(held, 0.01)
+        assert bus.poll(0.01)["jaw"].fault == fault
+        bus.stop("release")
+        bus.close()
+
+
+def test_emulated_servos_have_stored_what_those_of_the_head_have():
+    head = load_head("reachy_mini")
+    legs = {servo.id: servo for servo in plugged_in("reachy_mini", head)["main"]}
+    assert all(servo.supply_v == 7.2 and servo.registers["shutdown"] == 52 for servo in legs.values())
+    assert (legs[11].registers["homing_offset"], legs[12].registers["homing_offset"]) == (1024, -1024)
+    assert plugged_in("face28", load_head("face28")) == emulated(load_head("face28"))
+
+
+def test_an_emulated_head_says_its_supply_and_stands_in_its_range():
+    head, clock = load_head("reachy_mini"), VirtualClock()
+    with launch(plugged_in("reachy_mini", head)["main"], virtual=True) as chain:
+        bus = build_bus(head, {"main": chain}, clock)
+        bus.connect()
+        readings = bus.poll(clock.now_s())
+        bus.close()
+        assert {chain.state(joint.id)["faults"] for joint in head.joints.values()} == {"input voltage"}
+    assert all(each.extra["voltage_V"] == 7.2 and each.fault is None for each in readings.values())
+    assert all(
+        head.joints[name].min_rad < each.position_rad < head.joints[name].max_rad for name, each in readings.items()
+    )

@@ -9,7 +9,7 @@ import soundfile
 from sfms_robot.app.replay import read_recording
 from sfms_robot.app.run import RunOptions, run_head
 from sfms_robot.config import load_head
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, PortError
 
 SHORT = RunOptions(duration_s=3.0, fast=True, seed=3)
 
@@ -83,6 +83,23 @@ def test_virtual_time_needs_an_end_and_emulated_servos():
         run_head(dataclasses.replace(SHORT, audio="none", duration_s=None))
     with pytest.raises(ConfigError, match="emulated servos"):
         run_head(dataclasses.replace(SHORT, port="/dev/ttyUSB0"))
+
+
+def test_hobby_servos_on_a_real_port_move_only_when_that_is_confirmed():
+    options = RunOptions(head="inmoov2_ssc32", port="/dev/does-not-exist", duration_s=1.0)
+    with pytest.raises(
+        ConfigError, match=r"'inmoov2_ssc32': hobby servos .* jumps .*\(rothead, .* confirm it with --yes"
+    ):
+        run_head(options)
+    with pytest.raises(PortError, match="does-not-exist"):
+        run_head(dataclasses.replace(options, yes=True))
+
+
+def test_an_emulated_head_has_the_supply_of_the_real_one():
+    seen = run_head(RunOptions(head="reachy_mini", duration_s=1.0, fast=True, dry_run=True))
+    assert all(reading["fault"] is None for reading in seen["readings"].values())  # alert and all: the head allows it
+    done = run_head(RunOptions(head="reachy_mini", duration_s=1.0, fast=True))
+    assert (done["exit"], done["bus"]["faults"], done["limits"]["violations"]) == ("done", [], 0)
 
 
 @pytest.mark.slow

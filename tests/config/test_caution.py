@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.app.run import ready
+from sfms_robot.app.unit import ready
 from sfms_robot.config import load_head
 from sfms_robot.config.caution import PACE, TRAVEL, cautious
 from sfms_robot.data import data_dir, shipped_names
@@ -35,9 +35,18 @@ def test_joints_that_are_calibrated_go_on_as_they_were():
 
 def test_only_an_uncalibrated_head_on_real_servos_holds_back(caplog):
     face, turret = load_head("face28"), load_head("op3_head")
-    assert ready(face, real=False, calibrated=False) is face
-    assert ready(face, real=True, calibrated=True) is face
-    assert ready(turret, real=True, calibrated=False) is turret
+    assert ready(face, real=False) is face
+    assert ready(face, real=True, calibrated=face.joints) is face
+    assert ready(turret, real=True) is turret
     assert not caplog.records
-    assert ready(face, real=True, calibrated=False) == cautious(face)
-    assert "face28 is not calibrated" in caplog.text
+    assert ready(face, real=True) == cautious(face)
+    assert "face28 is not calibrated: 20 %" in caplog.text
+
+
+def test_a_joint_whose_measurement_does_not_hold_holds_back_on_any_head(caplog):
+    turret, face = load_head("op3_head"), load_head("face28")
+    joint = next(iter(turret.joints))
+    assert ready(turret, real=True, refused=[joint]) == cautious(turret, [joint])
+    assert f"not calibrated in {joint}" in caplog.text
+    others = [name for name in face.joints if name != "jaw"]
+    assert ready(face, real=True, calibrated=others, refused=["jaw"]) == cautious(face, ["jaw"])

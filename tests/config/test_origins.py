@@ -11,6 +11,8 @@ def test_a_value_comes_from_its_own_line_its_twin_the_defaults_or_nowhere():
     assert told["eye_pan_right"]["model"] == ("xl330-m288", "joint_defaults")
     assert told["eye_pan_right"]["ratio"] == (1.0, "built in")
     assert told["lid_right"]["sign"] == (-1, "mirror of lid_left")
+    assert told["lid_right"]["drive"][1] == "mirror of lid_left"
+    assert told["lid_left"]["drive"][1] == "head file"
 
 
 def test_every_joint_and_key_is_there():

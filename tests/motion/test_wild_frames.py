@@ -3,23 +3,13 @@
 import numpy as np
 import pytest
 
+from sfms_robot.app.bench.adversary import wild
 from sfms_robot.app.heads import build_motion
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
-from sfms_robot.frames import MOTION_DIM
 from sfms_robot.runtime.loop import difference
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
-
-
-def wild(rng, count: int) -> np.ndarray:
-    """Frames (count, 58): waves, jumps between extremes, absurd sizes, and stretches in which all stands still."""
-    waves = np.sin(np.outer(np.arange(count), rng.uniform(0.01, 2.0, MOTION_DIM)))
-    jumps = rng.choice([0.0, 1.0, -1.0], (count, MOTION_DIM))
-    absurd = rng.choice([0.0, 3e38, -3e38, 1e-45, -7.0], (count, MOTION_DIM))
-    still = np.zeros((count, MOTION_DIM))
-    kind = np.repeat(rng.integers(0, 4, count // 20 + 1), 20)[:count]
-    return np.choose(kind[:, None], [waves, jumps, absurd, still]).astype(np.float32)
 
 
 def violations(name: str, count: int, seed: int) -> tuple[int, bool]:

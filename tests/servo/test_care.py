@@ -163,3 +163,16 @@ def test_gains_are_set_before_torque_and_again_after_a_restart(make_rig):
         rig.bus._link.reboot(2)
         rig.until(held, lambda r: r["joint2"].rejoined, 2.0)
         assert register(rig, 2, "position_p_gain") == 600
+
+
+@pytest.mark.parametrize(
+    ("model", "register_name", "raw"), [("xl430-w250", "goal_pwm", 442), ("xl-320", "torque_limit", 500)]
+)
+def test_torque_is_limited_where_current_cannot_be(make_rig, model, register_name, raw):
+    servos = [EmulatedServo(1, model, start_ticks=load_firmware_map(model).center_ticks)]
+    safety = Safety(torque_limit_percent=50, on_fault="reduce")
+    with make_rig(servos, firmware_map=load_firmware_map(model), safety=safety) as rig:
+        rig.ticks(rig.hold(), 3)
+        assert register(rig, 1, register_name) == raw
+        rig.bus._care._act(0, "reduce", rig.clock.t)
+        assert register(rig, 1, register_name) == raw // 2

@@ -315,6 +315,43 @@ def test_pinched_joint_is_let_go():
     assert rig.bus.statistics()["faults"][0].startswith("joint1: pinched")
 
 
+@pytest.mark.parametrize("models", [["mx-64-1.0"], ["mx-28-1.0", "mx-64-1.0"], ["mx-106-1.0", "mx-28-1.0"]])
+def test_pinched_joint_is_let_go_by_whoever_tells_its_current(models):
+    rule = LoadRule(current_mA=400, for_s=0.1, then="limp")
+    rig = rig_of(models, [2048] * len(models), safety=Safety(pinch=rule))
+    held = rig.hold()
+    for servo in rig.device.servos:
+        servo.plant.stuck = True
+    rig.ticks(held + 0.5, 40)
+    tells = ["current" in what for what in rig.bus.capabilities.values()]
+    assert tells == [model != "mx-28-1.0" for model in models]
+    assert rig.torques() == [int(not each) for each in tells]
+
+
+@pytest.mark.parametrize(("model", "raw"), [("ax-12a", 300), ("mx-28-1.0", 300), ("sts3215", 300)])
+def test_torque_is_limited_where_the_head_says_so(model, raw):
+    middle = 512 if model == "ax-12a" else 2048
+    rig = rig_of(model, [middle], safety=Safety(torque_limit_percent=30))
+    rig.ticks(rig.hold(), 3)
+    assert rig.register(1, "torque_limit") == raw
+
+
+def test_torque_limit_of_an_earlier_run_is_lifted():
+    rig = rig_of("ax-12a", [512])
+    rig.set(1, "torque_limit", 200)
+    rig.hold()
+    assert rig.register(1, "torque_limit") == 1023
+
+
+def test_servo_that_shut_down_gets_its_strength_back_only_where_it_stands():
+    rig = rig_of("ax-12a", [512], safety=Safety(torque_limit_percent=30))
+    rig.set(1, "torque_limit", 0)
+    rig.bus.connect()
+    assert rig.register(1, "torque_limit") == 0
+    rig.bus.enable(rig.bus.joints)
+    assert rig.register(1, "torque_limit") == 300 and rig.register(1, "goal_position") == 512
+
+
 def test_stop_can_hold(rig):
     rig.hold()
     rig.bus.stop("hold")

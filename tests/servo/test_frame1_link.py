@@ -123,6 +123,19 @@ def test_own_words_heard_again_are_no_answer(model):
     assert link.read(1, 36, 2) is None
 
 
+@pytest.mark.parametrize("hears_itself", [False, True])
+@pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
+def test_servo_whose_answer_to_a_ping_is_the_ping_itself_is_there(model, hears_itself):
+    link, rig = link_of(model, [500, 500])
+    rig.wire.hears_itself = hears_itself
+    rig.servo(1).set_supply(20.0, 0.0)  # error byte 1 is the code of a ping
+    assert link.read(1, 0, 1).error == 1
+    number = rig.servo(1).table.model_number
+    assert link.ping(1).model_number == number and set(link.broadcast_ping()) == {1, 2}
+    rig.device.kill(1)
+    assert link.ping(1) is None
+
+
 @given(st.binary(max_size=40))
 def test_rubbish_before_an_answer_does_not_hide_it(rubbish):
     link, rig = link_of("sts3215", [500])

@@ -103,6 +103,34 @@ def test_servos_without_fast_sync_read_are_read_plainly_from_then_on(make_rig, f
         assert ("fast sync read is not answered" in caplog.text) == (fast_read == "on")
 
 
+class Patience(Through):
+    """Counts how often a deadline was waited for in vain."""
+
+    silences = 0
+
+    def read(self, n, deadline_s):
+        data = super().read(n, deadline_s)
+        self.silences += not data
+        return data
+
+
+@pytest.mark.parametrize("dead", [1, 3, 5])
+def test_dead_servo_costs_one_silence_in_a_tick_wherever_it_stands(make_rig, dead):
+    with five(make_rig) as rig, bus_over(rig, Patience) as port:
+        held = rig.hold()
+        rig.ticks(held, 5)
+        port.silences = 0
+        rig.ticks(held, 5)
+        quiet = port.silences
+        rig.chain.kill(dead)
+        for _ in range(12):
+            before = port.silences
+            readings = rig.ticks(held, 1)
+            assert port.silences - before <= 1
+            assert all(r.age_s == 0.0 for joint, r in readings.items() if joint != f"joint{dead}")
+        assert quiet == 0 and rig.bus.statistics()["silent"] == [dead]
+
+
 def test_late_answer_is_never_taken_for_a_fresh_one(make_rig):
     with five(make_rig) as rig, bus_over(rig, SlowAdapter) as port:
         held = rig.hold()

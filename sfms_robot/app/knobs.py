@@ -1,0 +1,25 @@
+"""`--intensity REGION=V` and `--style REGION=V` -> the knobs of a head."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.mapping import Knobs
+
+
+def turned(retargeter: HeadRetargeter, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> Knobs:
+    """Knobs over those of the head's file. Raises ConfigError for an unknown region or a value outside 0..2."""
+    return retargeter.mapping.knobs(_values("--intensity", intensity), _values("--style", style))
+
+
+def _values(option: str, given: Sequence[str]) -> dict[str, float]:
+    values = {}
+    for text in given:
+        region, _, value = text.partition("=")
+        try:
+            values[region] = float(value)
+        except ValueError:
+            raise ConfigError(f"{option} {text!r} is not REGION=VALUE with a value from 0 to 2") from None
+    return values

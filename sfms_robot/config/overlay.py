@@ -1,0 +1,220 @@
+"""What is known of one built head, laid over its shipped file: `$XDG_CONFIG_HOME/sfms-robot/heads/NAME.yaml`.
+
+Two builds of a head differ in their zeros, ranges and directions, and in how their skin answers. Nobody edits the
+shipped file for that; each layer of the overlay replaces what it is about, always in this order:
+
+    head file -> calibrate (zero, ends and direction of each joint) -> fit (drives learnt from sight)
+
+A measurement holds for the servo and the head file that it was made with. Where one of them is another by now, the
+joint counts as not calibrated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import yaml
+from pydantic import Field, model_validator
+
+from sfms_robot.config.base import Model, Name, find, load
+from sfms_robot.config.drives import problems
+from sfms_robot.config.firmware import load_firmware_map
+from sfms_robot.config.head import Head, Joint
+from sfms_robot.config.mapping import Expression
+from sfms_robot.errors import ConfigError
+
+CALIBRATE: Final = "calibrate"
+FIT: Final = "fit"
+LAYERS: Final = (CALIBRATE, FIT)
+OLD_FILE: Final = "the head's file has changed since"
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class Identity(Model):
+    """Which servo it is. None where the family does not tell; `drive_mode` holds the direction bit alone."""
+
+    id: Annotated[int, Field(ge=0, le=253)]
+    model: str
+    firmware: int | None = None
+    homing_offset: int | None = None
+    drive_mode: int | None = None
+
+    def difference(self, now: Identity) -> str | None:
+        """What is another now, or None."""
+        for key in Identity.model_fields:
+            was, is_ = getattr(self, key), getattr(now, key)
+            if was != is_:
+                return f"{key} was {was} and is {is_}"
+        return None
+
+
+class Measured(Identity):
+    """One joint as somebody has found it, in servo ticks; `sign` +1: ticks rise towards the joint's upper end."""
+
+    date: date
+    min_ticks: int
+    center_ticks: int
+    max_ticks: int
+    sign: Literal[1, -1]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Measured:
+        if not self.sign * self.min_ticks <= self.sign * self.center_ticks <= self.sign * self.max_ticks:
+            ticks = f"{self.min_ticks}, {self.center_ticks}, {self.max_ticks}"
+            raise ValueError(f"min_ticks, center_ticks, max_ticks = {ticks} are not in the order of sign {self.sign}")
+        if self.min_ticks == self.max_ticks:
+            raise ValueError(f"min_ticks and max_ticks are both {self.min_ticks}: no travel")
+        return self
+
+    @property
+    def identity(self) -> Identity:
+        return Identity(**{key: getattr(self, key) for key in Identity.model_fields})
+
+
+class CalibrateLayer(Model):
+    """Joints measured so far, and the head file they were measured for."""
+
+    head_sha256: Sha256
+    joints: dict[Name, Measured] = Field(default_factory=dict)
+
+
+class Fitted(Model):
+    """The drive that takes the place of a joint's own."""
+
+    drive: Expression
+
+
+class FitLayer(Model):
+    """Drives learnt from sight, and the head file they were learnt for."""
+
+    head_sha256: Sha256
+    date: date
+    note: str = ""
+    joints: dict[Name, Fitted] = Field(default_factory=dict)
+
+
+class Overlay(Model):
+    """The file of one built head."""
+
+    head: Name
+    calibrate: CalibrateLayer | None = None
+    fit: FitLayer | None = None
+
+
+@dataclass(frozen=True)
+class Layered:
+    """A head with its overlay on.
+
+    Attributes:
+        calibrated: joints whose measurement holds.
+        refused: joint -> why its measurement does not hold.
+        fitted: joints with a learnt drive.
+        notes: one line for each layer that is not used at all.
+    """
+
+    head: Head
+    calibrated: frozenset[str] = frozenset()
+    refused: Mapping[str, str] = field(default_factory=dict)
+    fitted: frozenset[str] = frozenset()
+    notes: tuple[str, ...] = ()
+
+
+def overlay_file(head: str, practice: bool = False) -> Path:
+    """Where the overlay of a head lies; what is practised on emulated servos lies beside it and is never used."""
+    root = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    return root / "sfms-robot" / "heads" / (f"{head}.practice.yaml" if practice else f"{head}.yaml")
+
+
+def head_hash(name: str) -> str:
+    """SHA-256 of a head's file, by shipped name or folder."""
+    return hashlib.sha256((find("heads", name, "head.yaml") / "head.yaml").read_bytes()).hexdigest()
+
+
+def load_overlay(head: Head, file: Path | None = None) -> Overlay:
+    """Empty when there is none. Raises ConfigError for one of another head, or with joints that this one lacks."""
+    file = file or overlay_file(head.name)
+    if not file.is_file():
+        return Overlay(head=head.name)
+    overlay = load(Overlay, file)
+    if overlay.head != head.name:
+        raise ConfigError.at(file, "head", overlay.head, "is another head", [head.name])
+    for layer in LAYERS:
+        part = getattr(overlay, layer)
+        for joint in part.joints if part is not None else ():
+            if joint not in head.joints:
+                raise ConfigError.at(file, f"{layer}.joints", joint, "is not a joint of this head", head.joints)
+    return overlay
+
+
+def save_overlay(overlay: Overlay, file: Path) -> None:
+    """Whole or not at all: an interrupted write leaves what was there. Raises ConfigError."""
+    plain = overlay.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    text = "# Of one built head: written by `sfms-robot head calibrate` and `head fit`.\n" + yaml.safe_dump(
+        plain, sort_keys=False, default_flow_style=None, width=120
+    )
+    new = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with new.open("w", encoding="utf-8") as out:
+            out.write(text)
+            out.flush()
+            os.fsync(out.fileno())
+        new.replace(file)
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
+
+
+def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Identity | None] | None = None) -> Layered:
+    """Both layers over a head.
+
+    Args:
+        sha256: of the head's file now.
+        servos: who answers at each joint, None for nobody; without it only the file is compared.
+
+    Raises ConfigError for a layer that makes no sound head.
+    """
+    joints, refused, notes = dict(head.joints), dict[str, str](), list[str]()
+    measured = overlay.calibrate.joints if overlay.calibrate is not None else {}
+    for name, found in measured.items():
+        joint = head.joints[name]
+        problem = OLD_FILE if overlay.calibrate is None or overlay.calibrate.head_sha256 != sha256 else None
+        problem = problem or _another(found, joint, servos, name)
+        if problem is None:
+            joints[name] = calibrated(joint, found)
+        else:
+            refused[name] = problem
+    fit, fitted = overlay.fit, frozenset[str]()
+    if fit is not None and fit.head_sha256 != sha256:
+        notes.append(f"the fit of {fit.date} is not used: {OLD_FILE}")
+    elif fit is not None:
+        fitted = frozenset(fit.joints)
+        joints |= {name: joints[name].model_copy(update={"drive": fit.joints[name].drive}) for name in fitted}
+        if found_wrong := problems(joints, head.expressions, head.couplings, head.folds, head.regions):
+            raise ConfigError(f"{overlay_file(head.name)}: fit: {found_wrong[0]}")
+    holds = frozenset(measured) - frozenset(refused)
+    return Layered(head.model_copy(update={"joints": joints}), holds, refused, fitted, tuple(notes))
+
+
+def _another(found: Measured, joint: Joint, servos: Mapping[str, Identity | None] | None, name: str) -> str | None:
+    if (found.id, found.model) != (joint.id, joint.model):
+        return f"measured on {found.model} id {found.id}, the head's file says {joint.model} id {joint.id}"
+    if servos is None or name not in servos:
+        return None
+    now = servos[name]
+    return "its servo does not answer" if now is None else found.identity.difference(now)
+
+
+def calibrated(joint: Joint, found: Measured) -> Joint:
+    """The joint with measured zero, direction and ends; its rest keeps its angle, and stands where the centre is."""
+    ticks_per_deg = found.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
+    zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
+    low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
+    ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
+    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, **ends})

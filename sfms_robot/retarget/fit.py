@@ -1,0 +1,180 @@
+"""How the joints of a face really look, learnt from seeing it, and the drives that make up for it.
+
+A face tracker looks at the robot's own face while its joints move. What the tracker saw goes through the head's own
+drives: that is the value each joint *looks like*, beside the value it *has*. For a servo whose skin answered as its
+file says they are the same. What joins them is the joint's response,
+
+    looks like = offset + r(has),    r(0) = 0, rising, no steeper or flatter than a bound, smooth,
+
+found by bounded least squares, and read backwards it is the curve to put over the joint's drive. The offset is the
+tracker's own idea of the face at rest, and is left where it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from sfms_robot.config import Expression, Head, drives
+from sfms_robot.frames import MOTION_DIM, SHAPES, Doubles, Floats
+from sfms_robot.retarget.mapping import Mapping
+
+FLATTEST, STEEPEST = 0.2, 8.0  # slope of a response: no curve multiplies a motion by more than 5
+_KNOTS: Final = 9  # from rest to each end, closer together near rest
+_NEAR_REST: Final = 2.0
+_BINS: Final = 200
+_LEAST_MOVED: Final = 0.2  # of a side's range: what moved less says nothing about it
+_LEAST_SAMPLES: Final = 50
+_FULL_WEIGHT: Final = 20  # samples in a bin from which on more do not count more
+_SMOOTH: Final = 0.002  # price of a change of slope
+_PLAIN: Final = 0.002  # price of a slope other than 1: decides where nothing was seen
+
+
+@dataclass(frozen=True)
+class Units:
+    """Joint angles (..., J) [rad] <-> joint units of the drives: -1 = min, 0 = rest, +1 = max, or rad from rest."""
+
+    rest: Doubles
+    up: Doubles
+    down: Doubles
+    low: Doubles
+    high: Doubles
+
+    @classmethod
+    def of(cls, head: Head) -> Units:
+        joints = head.joints.values()
+        rest = np.array([joint.rest_rad for joint in joints])
+        up = np.array([joint.max_rad for joint in joints]) - rest
+        down = rest - np.array([joint.min_rad for joint in joints])
+        in_rad = np.array([joint.unit == "rad" for joint in joints])
+        ones = np.ones(len(rest))
+        return cls(
+            rest,
+            np.where(in_rad | (up <= 0), ones, up),
+            np.where(in_rad | (down <= 0), ones, down),
+            -np.where(in_rad, down, down > 0),
+            np.where(in_rad, up, up > 0),
+        )
+
+    def values(self, angles_rad: Doubles) -> Doubles:
+        away = angles_rad - self.rest
+        out: Doubles = away / np.where(away > 0, self.up, self.down)
+        return out
+
+    def angles(self, values: Doubles) -> Doubles:
+        out: Doubles = self.rest + values * np.where(values > 0, self.up, self.down)
+        return out
+
+
+def looks_like(head: Head, shapes: Floats | Doubles) -> Doubles:
+    """Blendshapes (N, 52) of the robot's own face -> the joint values (N, J) that explain them."""
+    return asked(head.model_copy(update={"couplings": ()}), shapes)
+
+
+def asked(head: Head, shapes: Floats | Doubles) -> Doubles:
+    """Blendshapes (N, 52) -> what the head makes of them, (N, J) in joint units; the neck's joints stay 0."""
+    motion = np.zeros((len(shapes), MOTION_DIM), dtype=np.float32)
+    motion[:, SHAPES] = shapes
+    mapping = Mapping(head)
+    rows = np.broadcast_to(motion[:, None], (len(motion), len(mapping.joints), MOTION_DIM))
+    return Units.of(head).values(mapping.angles(rows))
+
+
+@dataclass(frozen=True)
+class Response:
+    """How one joint looks. `has` (K,) rising through 0, `looks` (K,) rising through 0; `offset` on top.
+
+    `moved`: (lowest, highest) value that was seen.
+    """
+
+    has: Doubles
+    looks: Doubles
+    offset: float
+    moved: tuple[float, float]
+
+    def __call__(self, has: Doubles) -> Doubles:
+        """What it looks like (N,), offset left out."""
+        return np.asarray(np.interp(has, self.has, self.looks))
+
+    @property
+    def curve(self) -> tuple[tuple[float, float], ...]:
+        """What is asked -> what it takes, as a curve of the language."""
+        return tuple((round(float(x), 5), round(float(y), 5)) for x, y in zip(self.looks, self.has, strict=True))
+
+
+def fit(has: Doubles, looks: Doubles, low: Doubles, high: Doubles) -> list[Response | None]:
+    """Responses from N pairs (N, J) in joint units, in the ranges low..high (J,); None for a joint that hardly moved.
+
+    Raises ValueError where the pairs differ in shape. Rows that are not finite are left out.
+    """
+    if has.shape != looks.shape or has.ndim != 2:
+        raise ValueError(f"has {has.shape} and looks {looks.shape} are not both (N, J)")
+    there = np.isfinite(has).all(axis=1) & np.isfinite(looks).all(axis=1)
+    return [_response(has[there, j], looks[there, j], float(low[j]), float(high[j])) for j in range(has.shape[1])]
+
+
+def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response | None:
+    if len(has) < _LEAST_SAMPLES:
+        return None
+    moved = float(has.min()), float(has.max())
+    if moved[1] < _LEAST_MOVED * high and moved[0] > _LEAST_MOVED * low or high <= low:
+        return None
+    spread = np.linspace(0.0, 1.0, _KNOTS) ** _NEAR_REST
+    below = low * spread[::-1] if low < 0 else np.zeros(1)
+    above = high * spread[1:] if high > 0 else np.zeros(0)
+    knots = np.concatenate([below, above])
+    x, y, weight = _binned(has, looks, low, high)
+    width = np.diff(knots)
+    parts = np.clip((x[:, None] - knots[:-1]) / width, 0.0, 1.0) - (knots[:-1] < 0)  # 0 at rest, of either side
+    data = np.concatenate([parts * width, np.ones((len(x), 1))], axis=1) * weight[:, None]
+    slopes, bends = np.eye(len(width)), np.diff(np.eye(len(width)), axis=0)
+    priors = np.concatenate([_PLAIN * slopes, _SMOOTH * bends])
+    matrix = np.concatenate([data, np.pad(priors, ((0, 0), (0, 1)))])
+    wanted = np.concatenate([y * weight, np.full(len(slopes), _PLAIN), np.zeros(len(bends))])
+    bounds = np.append(np.full(len(width), FLATTEST), -np.inf), np.append(np.full(len(width), STEEPEST), np.inf)
+    found = lsq_linear(matrix, wanted, bounds).x
+    heights = np.concatenate([[0.0], np.cumsum(found[:-1] * width)])
+    heights -= heights[len(below) - 1]
+    heights[len(below) - 1] = 0.0
+    return Response(knots, heights, float(found[-1]), moved)
+
+
+def _binned(has: Doubles, looks: Doubles, low: float, high: float) -> tuple[Doubles, Doubles, Doubles]:
+    """Mean of `has` and median of `looks` per bin, and its weight: much time at rest counts no more."""
+    bins = np.clip(((has - low) / (high - low) * _BINS).astype(int), 0, _BINS - 1)
+    filled = np.unique(bins)
+    x = np.array([has[bins == b].mean() for b in filled])
+    y = np.array([np.median(looks[bins == b]) for b in filled])
+    count = np.array([(bins == b).sum() for b in filled])
+    weight = np.sqrt(np.minimum(count, _FULL_WEIGHT) / _FULL_WEIGHT)
+    return x, y, weight / np.sqrt((weight**2).mean() * len(weight))
+
+
+def rms(errors: Doubles) -> float:
+    """Root of the mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
+
+
+def fitted_drives(head: Head, responses: Sequence[Response | None]) -> dict[str, Expression]:
+    """The drives with the responses made up for, by joint; a twin of a fitted joint gets its own in any case."""
+    plain = drives(head)
+    found: dict[str, Expression] = {}
+    for name, response in zip(head.joints, responses, strict=True):
+        drive = plain[name]
+        if drive is not None and response is not None:
+            found[name] = _unfolded(head, name, Expression(sum=(drive,), curve=response.curve))
+    for name, joint in head.joints.items():
+        drive = plain[name]
+        if joint.mirror_of in found and name not in found and drive is not None:
+            found[name] = _unfolded(head, name, drive)
+    return found
+
+
+def _unfolded(head: Head, name: str, drive: Expression) -> Expression:
+    """The head's folds come on top of any drive: taken off here, because this drive holds them already."""
+    folds = [Expression(channel=fold.channel, gain=-fold.gain) for fold in head.folds if fold.into == name]
+    return Expression(sum=(drive, *folds)) if folds else drive

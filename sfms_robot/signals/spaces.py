@@ -1,0 +1,164 @@
+"""The motion spaces that listener papers work in, in one table, and the way from them to ours and back.
+
+`faceverse58`: 52 expression | 3 rotation, Euler x, y, z with R = Rz Ry Rx | 3 translation. Its neutral is about
+(pi, 0, 0), so every rotation is taken against the neutral one.
+`deca56`: 50 FLAME expression | 3 head axis-angle | 3 jaw axis-angle. FLAME's expression is not ARKit's: it takes a
+matrix that maps one to the other, which no licence lets us ship. Without it pose and jaw move and nothing else.
+
+A rotation R of a space turns our head by A R A^T, where A takes the space's axes to ours (x forward, y left, z up).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats, reorder
+from sfms_robot.signals.flame import FlameMatrix
+
+JAW_FULL_OPEN_RAD: Final = np.radians(25.0)  # jaw angle shown as jawOpen 1, as the timeline has it
+
+
+@dataclass(frozen=True)
+class Space:
+    """One motion space.
+
+    Attributes:
+        dim: numbers per frame.
+        expression, rotation: where they stand; `translation` and `jaw` where there are any.
+        unit: of rotation and translation.
+        euler: order of the rotation for scipy (lower case: about fixed axes), or None for axis-angle.
+        axes: A (3, 3), rows are our x, y, z in the space's axes.
+        neutral: rotation of a face that looks straight ahead, as the space writes it.
+        metres_per_unit: of the translation; None: it has no metric scale and is left out.
+        verified: how the axes are known, or None: nobody has proved them; flip what turns out wrong.
+    """
+
+    name: str
+    dim: int
+    expression: slice
+    rotation: slice
+    translation: slice | None
+    jaw: slice | None
+    unit: str
+    euler: str | None
+    axes: tuple[tuple[int, int, int], ...]
+    neutral: tuple[float, float, float]
+    metres_per_unit: float | None
+    verified: str | None
+
+
+# FaceVerse: camera frame x to the viewer's right, y down, z away from the viewer (LizhenWangT/FaceVerse @ a012b634:
+# row vectors times R transposed; that the neutral is Rx(pi) follows). FLAME: x to the head's left, y up, z forward.
+SPACES: Final[Mapping[str, Space]] = {
+    "faceverse58": Space(
+        "faceverse58", 58, slice(0, 52), slice(52, 55), slice(55, 58), None, "rad, no metric scale", "xyz",
+        ((0, 0, -1), (1, 0, 0), (0, -1, 0)), (np.pi, 0.0, 0.0), None, None,
+    ),
+    "deca56": Space(
+        "deca56", 56, slice(0, 50), slice(50, 53), None, slice(53, 56), "rad", None,
+        ((0, 0, 1), (1, 0, 0), (0, 1, 0)), (0.0, 0.0, 0.0), None, None,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Frames of a space in our terms.
+
+    Attributes:
+        motion: (N, 58).
+        jaw_rad: (N, 3) axis-angle in our axes, + about y lowers the chin, or None: the space has no jaw.
+        missing: one line about what could not be shown, or None.
+    """
+
+    motion: Floats
+    jaw_rad: Floats | None
+    missing: str | None
+
+
+def decode(
+    frames: Floats | Doubles,
+    space: str,
+    *,
+    neutral: Doubles | None = None,
+    metres_per_unit: float | None = None,
+    flame: FlameMatrix | None = None,
+) -> Decoded:
+    """Frames (N, dim) of the space of that name -> ours.
+
+    neutral (dim,): the person's face at rest; by default the space's own, with the translation's median. Blendshapes
+    are clipped to 0..1. Raises ConfigError for an unknown space or a flame matrix where it has no meaning, and
+    ValueError for frames that are not (N, dim) and finite.
+    """
+    known = _space(space)
+    values = np.asarray(frames, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != known.dim:
+        raise ValueError(f"{space}: frames are {values.shape}, not (N, {known.dim})")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{space}: frame {int(np.argwhere(~np.isfinite(values))[0, 0])} is not finite")
+    if flame is not None and known.jaw is None:
+        raise ConfigError(f"{space} already is ARKit's expression: it takes no matrix (deca56 does)")
+    rest = np.asarray(known.neutral) if neutral is None else np.asarray(neutral)[known.rotation]
+    axes = np.array(known.axes, dtype=np.float64)
+
+    motion = np.zeros((len(values), MOTION_DIM))
+    turned = _rotations(known, values[:, known.rotation]) @ _rotations(known, rest[None])[0].T
+    motion[:, POSE][:, :3] = Rotation.from_matrix(axes @ turned @ axes.T).as_euler("xyz")
+    scale = metres_per_unit if metres_per_unit is not None else known.metres_per_unit
+    if known.translation is not None and scale is not None and len(values):
+        place = values[:, known.translation]
+        home = np.median(place, axis=0) if neutral is None else np.asarray(neutral)[known.translation]
+        motion[:, POSE][:, 3:] = scale * (place - home) @ axes.T
+
+    if known.jaw is None:
+        motion[:, SHAPES] = np.clip(reorder(values[:, known.expression], "faceverse"), 0.0, 1.0)
+        return Decoded(motion.astype(np.float32), None, None)
+    jaw_rad = values[:, known.jaw] @ axes.T
+    jaw_open = np.clip(jaw_rad[:, 1] / JAW_FULL_OPEN_RAD, 0.0, 1.0)
+    if flame is not None:
+        motion[:, SHAPES] = flame.solve(values[:, known.expression], jaw_open)
+    motion[:, SHAPES][:, BLENDSHAPES.index("jawOpen")] = jaw_open
+    missing = (
+        None if flame is not None else f"{space} without a matrix drives pose and jaw only: expression is not shown"
+    )
+    return Decoded(motion.astype(np.float32), jaw_rad.astype(np.float32), missing)
+
+
+def encode(motion: Floats | Doubles, space: str = "faceverse58", metres_per_unit: float = 1.0) -> Floats:
+    """Our motion (N, 58) in a space that has ARKit's expression, about the space's own neutral: undoes `decode`.
+
+    Raises ConfigError for a space without.
+    """
+    known = _space(space)
+    if known.jaw is not None or known.translation is None or known.euler is None:
+        raise ConfigError(f"{space}: our expression cannot be written in it (faceverse58)")
+    values = np.asarray(motion, dtype=np.float64)
+    axes = np.array(known.axes, dtype=np.float64)
+    turned = axes.T @ Rotation.from_euler("xyz", values[:, POSE][:, :3]).as_matrix() @ axes
+    out = np.zeros((len(values), known.dim))
+    out[:, known.expression] = values[:, SHAPES]
+    whole = turned @ _rotations(known, np.asarray(known.neutral)[None])[0]
+    angles = Rotation.from_matrix(whole).as_euler(known.euler)
+    angles[:, 0] %= 2 * np.pi  # about pi, not about -pi
+    out[:, known.rotation] = angles
+    out[:, known.translation] = values[:, POSE][:, 3:] @ axes / metres_per_unit
+    return out.astype(np.float32)
+
+
+def _space(name: str) -> Space:
+    if name not in SPACES:
+        raise ConfigError(f"motion space {name!r} is not known ({', '.join(SPACES)})")
+    return SPACES[name]
+
+
+def _rotations(space: Space, values: Doubles) -> Doubles:
+    """(N, 3) as the space writes them -> (N, 3, 3)."""
+    turns = Rotation.from_rotvec(values) if space.euler is None else Rotation.from_euler(space.euler, values)
+    out: Doubles = turns.as_matrix()
+    return out

@@ -1,0 +1,256 @@
+"""Leading through a head's joints: somebody who answers lines and turns emulated servos by hand, in virtual time."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import date
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sfms_robot.app.calibrate import Outcome, calibrate, calibrate_on
+from sfms_robot.app.heads import emulated
+from sfms_robot.app.unit import identify, unit_head
+from sfms_robot.config import load_head
+from sfms_robot.config.caution import cautious
+from sfms_robot.config.overlay import calibrated, head_hash, load_overlay, overlay_file
+from sfms_robot.errors import ConfigError
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
+
+DAY = date(2026, 5, 17)
+LIMIT = {"speed_deg_s": 90, "acceleration_deg_s2": 900, "jerk_deg_s3": 9000}
+
+
+def written(folder: Path, family: str = "dynamixel", model: str = "xl330-m288", zero: int = 2048, **more) -> str:
+    """A head of a jaw that rests at its lower end and a brow that rests between its ends."""
+    joint = {"bus": "main", "model": model, "zero_ticks": zero, "limits": "slow"}
+    raw = {
+        "name": "two",
+        "description": "two joints",
+        "calibrate_first": True,
+        "buses": {"main": {"family": family, "baud": 1_000_000 if family != "maestro" else 115_200}},
+        "limits": {"slow": LIMIT},
+        "joints": {
+            "jaw": {**joint, "id": 1, "min_deg": 0, "max_deg": 30, "drive": "jawOpen", "note": "+ opens"},
+            "brow": {**joint, "id": 2, "min_deg": -20, "max_deg": 40, "drive": "browInnerUp"},
+        },
+    }
+    folder.mkdir(exist_ok=True)
+    (folder / "head.yaml").write_text(yaml.safe_dump(raw | more, sort_keys=False))
+    return str(folder)
+
+
+@pytest.fixture
+def name(tmp_path, monkeypatch) -> str:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return written(tmp_path / "head")
+
+
+Answer = str | Callable[[], str] | type[BaseException]
+
+
+class Person:
+    """Answers one line after the other, doing something first where the answer is a function; then has gone."""
+
+    def __init__(self, *answers: Answer) -> None:
+        self.answers, self.heard = list(answers), ""
+
+    def say(self, text: str) -> None:
+        self.heard += text + "\n"
+
+    def ask(self, prompt: str) -> str:
+        self.heard += prompt + "\n"
+        answer = self.answers.pop(0) if self.answers else EOFError
+        if isinstance(answer, str):
+            return answer
+        if isinstance(answer, type):
+            raise answer
+        return answer()
+
+
+@contextmanager
+def head_on_emulated_servos(name: str) -> Iterator[Chain]:
+    with launch(emulated(load_head(name))["main"], virtual=True) as chain:
+        yield chain
+
+
+def hand(chain: Chain, servo: int, ticks: int) -> Callable[[], str]:
+    def turn() -> str:
+        assert chain.state(servo)["torque"] in (0, False)  # a hand could not move it otherwise
+        chain.turn(servo, ticks)
+        return ""
+
+    return turn
+
+
+def led(name: str, chain: Chain, person: Person, **more) -> Outcome:
+    return calibrate_on(name, {"main": chain}, VirtualClock(), person, overlay_file("two"), DAY, **more)
+
+
+def by_hand(chain: Chain) -> list[Answer]:
+    """Both joints moved by hand, the brow's servo mounted the other way round."""
+    jaw: list[Answer] = ["", hand(chain, 1, 1990), hand(chain, 1, 2300), "", ""]
+    brow: list[Answer] = ["", hand(chain, 2, 2500), hand(chain, 2, 1800), hand(chain, 2, 2200), "y", "", ""]
+    return jaw + brow
+
+
+def test_joints_moved_by_hand_get_their_ends_rest_and_direction(name):
+    with head_on_emulated_servos(name) as chain:
+        outcome = led(name, chain, person := Person(*by_hand(chain)))
+        stands = [chain.state(servo) for servo in (1, 2)]
+    assert (outcome.exit, outcome.measured, outcome.missing, outcome.problems) == ("done", ["jaw", "brow"], [], [])
+    layer = load_overlay(load_head(name)).calibrate
+    assert layer is not None and layer.head_sha256 == head_hash(name)
+    jaw, brow = layer.joints["jaw"], layer.joints["brow"]
+    assert (jaw.min_ticks, jaw.center_ticks, jaw.max_ticks, jaw.sign) == (1990, 1990, 2300, 1)
+    assert (brow.min_ticks, brow.center_ticks, brow.max_ticks, brow.sign) == (2500, 2200, 1800, -1)
+    assert (jaw.id, jaw.model, jaw.firmware, jaw.homing_offset, jaw.drive_mode, jaw.date) == (
+        1, "xl330-m288", 53, 0, 0, DAY,
+    )  # fmt: skip
+    assert [state["position"] for state in stands] == pytest.approx([1990, 2200], abs=10)  # the check ends at rest
+    assert not any(state["torque"] for state in stands)
+    assert "jaw (+ opens): xl330-m288 id 1" in person.heard and "Ticks fall towards the upper end" in person.heard
+
+
+def test_keys_move_a_joint_slowly_and_record_it(name):
+    with head_on_emulated_servos(name) as chain:
+        start = chain.state(1)["position"]
+        keys = ["k", "++", "-", "wave", "", "20", "nan", "", "n"]
+        outcome = led(name, chain, person := Person(*keys), joints=["jaw"])
+        assert outcome.measured == ["jaw"] and outcome.missing == ["brow"]
+        layer = load_overlay(load_head(name)).calibrate
+    assert layer is not None
+    per_deg = 4096 / 360
+    assert layer.joints["jaw"].min_ticks == pytest.approx(start + 4 * per_deg, abs=6)
+    assert layer.joints["jaw"].max_ticks - layer.joints["jaw"].min_ticks == pytest.approx(20 * per_deg, abs=12)
+    assert "'wave' is not a step" in person.heard and "'nan' is not a step" in person.heard
+
+
+@pytest.mark.parametrize("gone", ["q", EOFError, KeyboardInterrupt])
+def test_who_stops_goes_on_there_the_next_time(name, gone):
+    with head_on_emulated_servos(name) as chain:
+        first = led(name, chain, Person(*by_hand(chain)[:7], gone))
+        assert (first.exit, first.measured, first.missing) == ("interrupted", ["jaw"], ["brow"])
+        assert not chain.state(2)["torque"]
+        second = led(name, chain, person := Person(*by_hand(chain)[5:]))
+        assert (second.exit, second.before, second.measured, second.missing) == ("done", ["jaw"], ["brow"], [])
+        assert "1 joints are measured, 1 to go" in person.heard
+        third = led(name, chain, Person())
+        assert (third.exit, third.before, third.measured) == ("done", ["jaw", "brow"], [])
+
+
+@pytest.mark.parametrize(
+    ("ends", "why"),
+    [((2048, 2050), "its ends are only 0.2 deg apart"), ((2048, 2400, 2500), "its rest, 2500 ticks, is not between")],
+)
+def test_what_cannot_be_is_measured_again(name, ends, why):
+    joint, servo = ("jaw", 1) if len(ends) == 2 else ("brow", 2)
+    with head_on_emulated_servos(name) as chain:
+        wrong = ["", *(hand(chain, servo, ticks) for ticks in ends)]
+        person = Person(*wrong, EOFError)
+        outcome = led(name, chain, person, joints=[joint])
+    assert outcome.measured == [] and why in person.heard and "once more" in person.heard
+    assert not overlay_file("two").exists()
+
+
+def test_a_servo_that_falls_silent_on_the_way_is_left_out(name):
+    with head_on_emulated_servos(name) as chain:
+
+        def cable_out() -> str:
+            chain.kill(1)
+            return ""
+
+        answers: list[Answer] = ["", hand(chain, 1, 1990), hand(chain, 1, 2300), cable_out]
+        outcome = led(name, chain, Person(*answers), joints=["jaw"])
+    assert outcome.measured == [] and "jaw (id 1) does not answer" in outcome.skipped["jaw"]
+    assert not overlay_file("two").exists()
+
+
+def test_a_silent_servo_is_left_out_and_the_others_are_done(name):
+    with head_on_emulated_servos(name) as chain:
+        chain.kill(1)
+        outcome = led(name, chain, Person(*by_hand(chain)[5:]))
+    assert outcome.skipped == {"jaw": "no answer from id 1 on bus 'main'"} and outcome.measured == ["brow"]
+
+
+def test_a_swapped_servo_is_measured_again(name):
+    with head_on_emulated_servos(name) as chain:
+        led(name, chain, Person(*by_hand(chain)))
+    servos = [EmulatedServo(1, "xl330-m288", 1_000_000, 2048, firmware=52), EmulatedServo(2)]
+    with launch(servos, virtual=True) as chain:
+        outcome = led(name, chain, Person(EOFError))
+    assert outcome.before == ["brow"] and outcome.missing == ["jaw"]
+    assert outcome.problems == ["jaw: firmware was 53 and is 52"]
+
+
+def test_an_edited_head_file_asks_whether_to_keep_what_was_measured(name, tmp_path):
+    with head_on_emulated_servos(name) as chain:
+        led(name, chain, Person(*by_hand(chain)))
+        written(tmp_path / "head", life={"idle": {"blinks_per_minute": 3}})
+        assert led(name, chain, Person("", "q")).missing == ["jaw", "brow"]
+        again = led(name, chain, Person("k"), joints=["jaw"])
+        assert again.before == ["jaw"]
+
+
+def test_hobby_servos_are_moved_by_keys_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    name = written(tmp_path / "board", "maestro", "maestro-12", zero=6000)
+    with head_on_emulated_servos(name) as chain:
+        outcome = led(name, chain, person := Person("", "5", "", "20", "", "", ""), joints=["jaw"])
+    layer = load_overlay(load_head(name)).calibrate
+    assert outcome.measured == ["jaw"] and layer is not None and "JUMPS" in person.heard
+    jaw, per_deg = layer.joints["jaw"], 16000 / 360
+    assert (jaw.firmware, jaw.homing_offset, jaw.model) == (None, None, "maestro-12")
+    assert (jaw.min_ticks, jaw.max_ticks) == pytest.approx((6000 + 5 * per_deg, 6000 + 25 * per_deg), abs=2)
+
+
+@pytest.mark.parametrize(("family", "model", "zero"), [("dynamixel1", "ax-12a", 512), ("feetech", "sts3215", 2048)])
+def test_every_family_tells_who_it_is(tmp_path, family, model, zero):
+    name = written(tmp_path / "other", family, model, zero)
+    with head_on_emulated_servos(name) as chain:
+        servos = identify(load_head(name), ["jaw", "brow"], {"main": chain}, VirtualClock())
+        chain.kill(2)
+        gone = identify(load_head(name), ["brow"], {"main": chain}, VirtualClock())
+    assert [each and (each.id, each.model) for each in servos.values()] == [(1, model), (2, model)]
+    assert gone == {"brow": None}
+
+
+def test_a_joint_of_another_head_is_refused(name):
+    with pytest.raises(ConfigError, match=r"--joint = 'chin' is not a joint of this head \(jaw, brow\)"):
+        calibrate_on(name, {}, VirtualClock(), Person(), overlay_file("two"), DAY, ["chin"])
+
+
+def test_practice_on_emulated_servos_is_kept_apart(name):
+    outcome = calibrate(name, "sim", Person("k", "5", "", "20", "", "n"), ["jaw"])
+    assert outcome.measured == ["jaw"] and outcome.file == overlay_file("two", practice=True)
+    assert outcome.file.exists() and not overlay_file("two").exists()
+
+
+# --- what a run makes of it -------------------------------------------------------------------------------------
+
+
+def test_a_run_takes_measured_joints_as_they_are_and_holds_the_others_back(name, caplog):
+    head = load_head(name)
+    with head_on_emulated_servos(name) as chain:
+        led(name, chain, Person(*by_hand(chain)[:5]))
+    found = load_overlay(head).calibrate
+    assert found is not None
+    with launch(emulated(head)["main"]) as chain:
+        ready = unit_head(name, chain.device)
+    assert ready.joints["jaw"] == calibrated(head.joints["jaw"], found.joints["jaw"])
+    assert ready.joints["brow"] == cautious(head).joints["brow"]
+    assert unit_head(name, "sim") == head
+    assert "not calibrated in brow" in caplog.text
+
+
+def test_a_run_holds_a_joint_back_whose_servo_is_another(name, caplog):
+    head = load_head(name)
+    with head_on_emulated_servos(name) as chain:
+        led(name, chain, Person(*by_hand(chain)))
+    servos = [EmulatedServo(1, registers={"homing_offset": 100}), EmulatedServo(2)]
+    with launch(servos) as chain:
+        ready = unit_head(name, chain.device)
+    assert ready.joints["jaw"] == cautious(head).joints["jaw"]
+    assert ready.joints["brow"].limits == "slow"
+    assert "the calibration of jaw does not hold: homing_offset was 0 and is 100" in caplog.text

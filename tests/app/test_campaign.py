@@ -1,0 +1,117 @@
+"""Faults and random bytes on every family: a short version of each, and the whole one marked slow."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.campaign import FAMILIES, SPECS, Judge, Outcome, Rig, head_of, one, run_campaign, table
+from sfms_robot.app.fuzz import BYTES, fuzz_one
+from sfms_robot.app.heads import build_bus, emulated
+from sfms_robot.errors import ConfigError
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.simulator.faults import KINDS
+from sfms_robot.simulator.launch import launch
+
+SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
+
+
+@pytest.fixture
+def rig():
+    head, clock = head_of("dynamixel2"), VirtualClock()
+    with launch(emulated(head)["main"], virtual=True) as chain:
+        rig = Rig(head, chain, clock, build_bus(head, {"main": chain}, clock))
+        rig.hold()
+        yield rig
+        rig.bus.stop("release")
+        rig.bus.close()
+
+
+def test_every_kind_of_fault_is_tried():
+    assert set(SPECS) == set(KINDS)
+
+
+def test_unknown_family_is_named():
+    with pytest.raises(ConfigError, match="'hitec' is not a family"):
+        head_of("hitec")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_nothing_escapes_and_everybody_comes_back(family):
+    fault = SHORT[list(FAMILIES).index(family) % len(SHORT)]
+    outcome = one(family, fault, ticks=300)
+    assert outcome.passed, outcome
+    assert outcome.ticks == 300
+
+
+def test_a_family_that_cannot_have_a_fault_says_so():
+    outcome = one("maestro", "voltage", ticks=10)
+    assert not outcome.possible
+    assert table([outcome])[0]["passed"] == "-"
+
+
+def test_a_servo_that_stays_out_says_why():
+    outcome = one("sts", "voltage", ticks=200)
+    assert len(outcome.named) == 4 and all("input voltage" in each for each in outcome.named)
+    assert outcome.passed
+
+
+def test_same_campaign_has_the_same_outcome():
+    assert one("dynamixel2", "noise", ticks=60) == one("dynamixel2", "noise", ticks=60)
+
+
+def test_old_position_told_as_fresh_is_noticed(rig):
+    judge, told = Judge(rig), []
+    for _ in range(100):
+        told.append(rig.tick())
+        judge.see({name: replace(r, position_rad=told[-10:][0][name].position_rad) for name, r in told[-1].items()})
+    assert judge.stale > 0
+
+
+def test_joint_that_does_not_follow_is_noticed(rig):
+    judge = Judge(rig)
+    for _ in range(60):
+        judge.see(rig.tick())
+    assert judge.well_since_s is not None
+    rig.goals = rig.goals + np.array([0.0, 0.5, 0.0, 0.0])
+    judge.see(rig.bus.poll(rig.clock.now_s()))
+    assert judge.well_since_s is None
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        {"escaped": "BusError: gone"},
+        {"outside": 1},
+        {"stale": 1},
+        {"recovered_s": None},
+        {"recovered_s": 2.5},
+        {"named": ["joint1: torque lost"]},
+    ],
+)
+def test_anything_amiss_fails(what):
+    fine = Outcome("sts", "drop", 1000, recovered_s=0.1)
+    assert fine.passed
+    assert not replace(fine, **what).passed
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_random_bytes_do_no_harm(family):
+    fuzzed = fuzz_one(family, 5_000)
+    assert fuzzed.passed, fuzzed
+    assert fuzzed.bytes >= 5_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_whole_campaign(family):
+    failed = [outcome for outcome in run_campaign([family]) if not outcome.passed]
+    assert not failed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_million_random_bytes_do_no_harm(family):
+    fuzzed = fuzz_one(family, BYTES)
+    assert fuzzed.passed, fuzzed
+    assert fuzzed.bytes >= BYTES

@@ -1,0 +1,111 @@
+"""A head fitted from sight: the virtual face, whose skin nobody knows, looks more like what was asked."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.babble import Faces, babble
+from sfms_robot.app.faces import named_faces
+from sfms_robot.app.fidelity import of_head
+from sfms_robot.app.fit import fit_head, read_pairs, see_virtual_face, virtual_tracker, with_drives
+from sfms_robot.config import load_head
+from sfms_robot.config.overlay import load_overlay, overlay_file
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import SHAPES
+from sfms_robot.retarget.fit import Units, asked, fit, looks_like, rms
+from sfms_robot.simulator.tracker import Skin, skin_motion
+
+
+def recorded_shapes():
+    return np.concatenate([clip[::3, SHAPES] for _, clip in named_faces() if clip[:, SHAPES].any()])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_held_out_faces_come_three_times_nearer(seed, record_property):
+    head = load_head("face28")
+    units, rng, joints = Units.of(head), np.random.default_rng(seed), len(head.joints)
+    shapes = recorded_shapes()
+    held_out = np.arange(len(shapes)) // 50 % 4 == 3
+    tracker = virtual_tracker(head, Skin.hidden(joints, seed), noise=0.01)
+    ideal = virtual_tracker(head, Skin.plain(joints))
+
+    train = asked(head, shapes[~held_out])
+    responses = fit(train, looks_like(head, tracker.seen(train, rng)), units.low, units.high)
+    fitted = with_drives(head, responses)
+
+    test = shapes[held_out]
+    told, skin = asked(head, test), skin_motion()
+    best = ideal.face(told)
+    errors = {}
+    for name, candidate in (("before", head), ("after", fitted)):
+        face = tracker.face(asked(candidate, test))
+        missed = face - best
+        way = np.sqrt(np.einsum("ni,ij,nj->n", missed, skin, missed, optimize=True).mean())
+        errors[name] = np.array([rms(looks_like(head, face) - told), way, rms(missed)])
+    ratios = errors["before"] / errors["after"]
+    record_property("times smaller in joint units, on the skin, per blendshape", ratios.round(2).tolist())
+    assert (ratios >= 3).all(), ratios
+
+
+def test_the_virtual_face_without_a_skin_of_its_own_looks_as_asked():
+    head = load_head("face28")
+    shapes = recorded_shapes()[::5]
+    told = asked(head, shapes)
+    face = virtual_tracker(head, Skin.plain(len(head.joints))).face(told)
+    assert face.min() >= 0 and face.max() <= 1
+    assert rms(looks_like(head, face) - told) < 0.01
+
+
+@pytest.fixture(scope="module")
+def babbled(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("babble")
+    done = babble("inmoov2_maestro", "sim", folder, minutes=0.1, seed=2)
+    see_virtual_face(done.head, folder)
+    return folder, done
+
+
+@pytest.mark.slow
+def test_babbling_keeps_to_the_limits_and_is_learnt_from(babbled, monkeypatch, tmp_path):
+    folder, done = babbled
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert done.violations == 0 and done.exit == "done"
+    result = fit_head("inmoov2_maestro", folder, practice=True)
+    assert result.after < result.before
+    json.dumps(result.as_dict())
+    head = load_head("inmoov2_maestro")
+    practice = overlay_file(head.name, practice=True)
+    assert load_overlay(head, practice).fit is not None
+    assert not overlay_file(head.name).exists()
+
+
+@pytest.mark.slow
+def test_what_is_no_recording_of_this_face_is_told(babbled, tmp_path):
+    folder, done = babbled
+    (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
+    with pytest.raises(ConfigError, match=r"has no face\.csv"):
+        read_pairs(done.head, tmp_path)
+    with pytest.raises(ConfigError, match="without joint"):
+        read_pairs(load_head("face28"), folder)
+
+
+def test_random_faces_begin_and_end_at_rest_and_stay_faces():
+    faces = Faces.of([0, 5, 9], 30.0, seed=1)
+    times_s = np.arange(0, faces.duration_s, 0.01)
+    motion, _ = faces.sample(times_s, 0.0, None)
+    assert not motion[0].any() and np.abs(motion[-1]).max() < 0.01
+    assert motion.min() >= 0 and motion.max() <= 1
+    assert np.flatnonzero(motion.any(axis=0)).tolist() == [6, 11, 15]
+    assert np.abs(np.diff(motion, axis=0)).max() < 0.05
+
+
+def test_a_face_shows_more_of_a_face_than_a_neck_does():
+    clips = {}
+    for face, clip in named_faces():
+        clips.setdefault(face, []).append(clip[:200])
+    clips = {face: clips[face][:1] for face in ("faces", "brows", "heads")}
+    face28 = {row.face: row for row in of_head("face28", clips)}
+    neck = {row.face: row for row in of_head("op3_head", clips)}
+    assert face28["all"].expression > 0.5 and neck["all"].expression == 0
+    assert face28["brows"].expression > 0.9
+    assert face28["heads"].pose > 0.9 and face28["faces"].pose is None and face28["heads"].expression is None

@@ -1,0 +1,94 @@
+"""Regions of a head are turned up and down from the command line, and while it runs."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.bench.lead import Nobody, Waves
+from sfms_robot.app.heads import build_bus, build_motion, emulated
+from sfms_robot.app.knobs import turned
+from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.config import load_head
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import MOTION_DIM
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.simulator.launch import launch
+
+RETARGETER = build_motion(load_head("face28"), 100.0).retargeter
+
+
+def test_a_region_at_intensity_0_rests_and_the_others_do_not_notice():
+    face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
+    plain, _ = RETARGETER.step(face, RETARGETER.start())
+    without, _ = RETARGETER.step(face, RETARGETER.start(), turned(RETARGETER, ["brows=0"]))
+    changed = {name for name, a, b in zip(RETARGETER.joints, plain, without, strict=True) if a != b}
+    assert changed and all(name.startswith("brow") for name in changed)
+
+
+def test_nothing_given_is_what_the_file_says():
+    face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
+    plain, _ = RETARGETER.step(face, RETARGETER.start())
+    same, _ = RETARGETER.step(face, RETARGETER.start(), turned(RETARGETER))
+    assert np.array_equal(plain, same)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("nose=1", "'nose' is not a region of this head (neck, eyes"),
+        ("neck=3", "intensity of neck = 3 is not in 0..2"),
+        ("neck=nan", "intensity of neck = nan is not in 0..2"),
+        ("neck", "--intensity 'neck' is not REGION=VALUE"),
+        ("neck=loud", "--intensity 'neck=loud' is not REGION=VALUE"),
+    ],
+)
+def test_a_knob_that_is_none_is_refused_in_one_line(given, said):
+    with pytest.raises(ConfigError) as caught:
+        turned(RETARGETER, [given])
+    assert said in str(caught.value)
+
+
+def test_a_run_with_the_neck_turned_off_keeps_it_at_rest():
+    still = run_head(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=0",)))
+    loud = run_head(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=2",)))
+    assert sum(joint["travel_rad"] for joint in still["joints"].values()) < sum(
+        joint["travel_rad"] for joint in loud["joints"].values()
+    )
+    assert loud["limits"]["violations"] == 0
+
+
+class Goals:
+    """ports.Observer that keeps what was sent."""
+
+    def __init__(self) -> None:
+        self.sent_rad: list[np.ndarray] = []
+
+    def tick(self, seen) -> None:
+        self.sent_rad.append(seen.goals_rad)
+
+    def heard(self, frame) -> None: ...
+
+    def planned(self, plan) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():
+    head, clock, goals = load_head("op3_head"), VirtualClock(), Goals()
+    motion = build_motion(head, 100.0)
+    off, on = turned(motion.retargeter, ["neck=0"]), turned(motion.retargeter)
+    log = RunLog(motion.retargeter.joints, 0.01, motion.audit)
+    with launch(emulated(head)["main"], virtual=True) as chain:
+        bus = build_bus(head, {"main": chain}, clock)
+        bus.connect()
+        parts = Parts(
+            Nobody(), Waves(), motion.timeline, motion.retargeter, motion.limiter, bus, [goals], motion.leads_s,
+            motion.rest_rad, knobs=lambda: off if len(goals.sent_rad) >= 200 else on,
+        )  # fmt: skip
+        drive(parts, clock, log, rate_hz=100.0, duration_s=4.0, interrupted=lambda: False)
+        bus.close()
+    sent = np.array(goals.sent_rad)
+    assert np.ptp(sent[100:200], axis=0).min() > 0.01
+    assert np.abs(sent[320:] - motion.rest_rad).max() < 1e-6
+    assert log.audited.violations == 0

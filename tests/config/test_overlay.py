@@ -1,0 +1,173 @@
+"""What was measured on one build: it goes over the head's file, and holds only for what it was measured on."""
+
+import math
+from datetime import date
+
+import numpy as np
+import pytest
+import yaml
+
+from sfms_robot.config import load_firmware_map, load_head
+from sfms_robot.config.mapping import Expression
+from sfms_robot.config.origins import origins, refusals
+from sfms_robot.config.overlay import (
+    OLD_FILE,
+    CalibrateLayer,
+    FitLayer,
+    Fitted,
+    Identity,
+    Measured,
+    Overlay,
+    calibrated,
+    head_hash,
+    layered,
+    load_overlay,
+    overlay_file,
+    save_overlay,
+)
+from sfms_robot.errors import ConfigError
+from sfms_robot.motion.calibration import Calibration
+
+DAY = date(2026, 5, 17)
+SHA = head_hash("face28")
+FACE = load_head("face28")
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+
+
+def measured(joint="jaw", low=1800, rest=2000, high=2400, sign=1, **more) -> Measured:
+    config = FACE.joints[joint]
+    known = {"id": config.id, "model": config.model, "firmware": 53, "homing_offset": 0, "drive_mode": 0}
+    ticks = {"min_ticks": low, "center_ticks": rest, "max_ticks": high}
+    return Measured.model_validate({**known, "date": DAY, "sign": sign, **ticks, **more})
+
+
+def overlay(sha256=SHA, fit=None, **joints) -> Overlay:
+    return Overlay(head="face28", calibrate=CalibrateLayer(head_sha256=sha256, joints=joints), fit=fit)
+
+
+FITTED = "brow_inner_left"
+LEARNT = Fitted(drive=Expression(channel="browInnerUp", curve=((0, 0), (1, 0.5))))
+FIT = FitLayer(head_sha256=SHA, date=DAY, joints={FITTED: LEARNT})
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("joint", ["jaw", "lid_left", "neck_yaw", "eye_tilt_right"])
+def test_ends_and_rest_lie_where_they_were_measured(joint, sign):
+    config = FACE.joints[joint]
+    at_end = config.rest_deg == config.min_deg
+    ticks = (1800, 1800 if at_end else 2010, 2400)
+    low, rest, high = ticks if sign > 0 else [4095 - t for t in ticks]
+    found = calibrated(config, measured(joint, low, rest, high, sign))
+    turn = load_firmware_map(config.model).ticks_per_revolution
+    conversion = Calibration({joint: found}, np.array([turn]))
+    angles = [[math.radians(found.min_deg)], [found.rest_rad], [found.max_rad]]
+    assert [int(conversion.to_ticks(np.array(a))[0]) for a in angles] == pytest.approx([low, rest, high], abs=1)
+    assert found.rest_deg == config.rest_deg and found.min_deg <= found.rest_deg <= found.max_deg
+    assert conversion.low_ticks[0] >= min(low, high) and conversion.high_ticks[0] <= max(low, high)
+
+
+def test_it_is_read_back_as_it_was_written():
+    whole = overlay(jaw=measured(), lid_left=measured("lid_left", firmware=None), fit=FIT)
+    save_overlay(whole, overlay_file("face28"))
+    assert load_overlay(FACE) == whole
+    assert list(overlay_file("face28").parent.iterdir()) == [overlay_file("face28")]
+
+
+def test_without_an_overlay_the_head_is_as_its_file_says():
+    layers = layered(FACE, load_overlay(FACE), SHA)
+    assert layers.head == FACE and not layers.calibrated and not layers.refused
+
+
+def test_only_what_was_measured_changes():
+    layers = layered(FACE, overlay(jaw=measured()), SHA, {"jaw": measured().identity})
+    assert layers.calibrated == {"jaw"} and not layers.refused
+    assert layers.head.joints["jaw"] == calibrated(FACE.joints["jaw"], measured())
+    assert {**layers.head.joints, "jaw": None} == {**FACE.joints, "jaw": None}
+
+
+@pytest.mark.parametrize(
+    ("now", "why"),
+    [
+        ({"firmware": 52}, "firmware was 53 and is 52"),
+        ({"homing_offset": -40}, "homing_offset was 0 and is -40"),
+        ({"drive_mode": 1}, "drive_mode was 0 and is 1"),
+        ({"model": "xl330-m077"}, "model was xl330-m288 and is xl330-m077"),
+        (None, "its servo does not answer"),
+    ],
+)
+def test_a_joint_with_another_servo_is_to_be_calibrated_first_and_no_other(now, why):
+    both = overlay(jaw=measured(), lid_left=measured("lid_left"))
+    servos = {"jaw": measured().identity, "lid_left": measured("lid_left").identity}
+    servos["jaw"] = None if now is None else Identity(**{**servos["jaw"].model_dump(), **now})
+    layers = layered(FACE, both, SHA, servos)
+    assert layers.refused == {"jaw": why} and layers.calibrated == {"lid_left"}
+    assert layers.head.joints["jaw"] == FACE.joints["jaw"]
+
+
+def test_an_edited_head_file_puts_every_joint_back():
+    layers = layered(FACE, overlay("0" * 64, jaw=measured(), fit=FIT), SHA)
+    assert layers.refused == {"jaw": OLD_FILE} and layers.fitted == {FITTED}
+    old = FIT.model_copy(update={"head_sha256": "0" * 64})
+    layers = layered(FACE, overlay(jaw=measured(), fit=old), SHA)
+    assert layers.calibrated == {"jaw"} and not layers.fitted and OLD_FILE in layers.notes[0]
+
+
+def test_a_fitted_drive_lies_over_a_measured_joint():
+    joint = FITTED
+    layers = layered(FACE, overlay(fit=FIT, **{joint: measured(joint)}), SHA)
+    assert layers.head.joints[joint].zero_ticks != FACE.joints[joint].zero_ticks
+    assert layers.head.joints[joint].drive == FIT.joints[joint].drive
+
+
+def test_show_tells_calibrated_and_fitted_values_from_those_of_the_file():
+    save_overlay(overlay(jaw=measured(), fit=FIT), overlay_file("face28"))
+    told = origins("face28")
+    assert told["jaw"]["sign"] == (1, "calibrate 2026-05-17")
+    assert told["jaw"]["max_deg"][1] == "calibrate 2026-05-17"
+    assert told["jaw"]["id"][1] == "head file"
+    assert told[FITTED]["drive"][1] == "fit 2026-05-17"
+    assert told["lid_left"]["drive"][1] == "head file"
+    assert refusals("face28") == []
+
+
+def test_show_tells_what_does_not_hold():
+    save_overlay(overlay("0" * 64, jaw=measured()), overlay_file("face28"))
+    assert refusals("face28") == [f"jaw: its calibration does not hold: {OLD_FILE}"]
+    assert origins("face28")["jaw"]["sign"][1] == "built in"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"head": "op3_head"}, r"head = 'op3_head' is another head \(face28\)"),
+        ({"joints": {"chin": {}}}, "calibrate.joints.chin.id"),
+        ({"sign": 2}, "calibrate.joints.jaw.sign = 2"),
+        ({"min_ticks": 2100}, "are not in the order of sign 1"),
+        ({"min_ticks": 2400, "center_ticks": 2400}, "no travel"),
+        ({"colour": "red"}, "'colour' is not a known key"),
+    ],
+)
+def test_a_mistake_in_the_overlay_is_named_with_its_file(change, message):
+    plain = overlay(jaw=measured()).model_dump(mode="json", exclude_none=True)
+    if "head" in change:
+        plain |= change
+    elif "joints" in change:
+        plain["calibrate"] |= change
+    else:
+        plain["calibrate"]["joints"]["jaw"] |= change
+    file = overlay_file("face28")
+    file.parent.mkdir(parents=True)
+    file.write_text(yaml.safe_dump(plain))
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_overlay(FACE)
+    assert str(file) in str(caught.value)
+
+
+def test_an_unknown_joint_is_named_with_those_there_are():
+    save_overlay(overlay(chin=measured()), overlay_file("face28"))
+    with pytest.raises(ConfigError, match="calibrate.joints = 'chin' is not a joint of this head .*jaw"):
+        load_overlay(FACE)
