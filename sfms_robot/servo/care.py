@@ -11,14 +11,14 @@ once. A servo that gets into trouble of its own again and again is left alone; a
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from sfms_robot.config import Faults
 from sfms_robot.errors import BusError
 from sfms_robot.servo.dxl2_link import Dxl2Link
 from sfms_robot.servo.handshake import Handshake
-from sfms_robot.servo.policy import BusServo, LoadWatch, counts, torque_register
+from sfms_robot.servo.policy import BusServo, LoadWatch, Voice, torque_register
 from sfms_robot.servo.recovery import AGAIN_S, ATTEMPTS, Recovery
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.telemetry import Telemetry
@@ -43,7 +43,6 @@ class Care:
         away: whose goals are withheld, and why.
         rejoining: who holds a position (ticks) and waits for goals that begin there.
         rejoined: who came to hold a position in this tick.
-        said: every fault so far, `joint: fault`, in the order of appearance.
     """
 
     def __init__(
@@ -51,7 +50,7 @@ class Care:
     ) -> None:
         self._servos = servos
         self._tables = tables
-        self._config = faults
+        self._voice = Voice(servos, faults)
         self._telemetry = telemetry
         self._loads = LoadWatch(servos)
         self._recovery = Recovery()
@@ -60,13 +59,16 @@ class Care:
         self._bits = [0] * len(servos)
         self._faulty: list[list[str]] = [[] for _ in servos]  # faults that count
         self._attempts_s: list[list[float]] = [[] for _ in servos]
-        self._excused: set[str] = set()
         self.wanted: set[int] = set()
         self.fault: list[str | None] = [None] * len(servos)
         self.away: dict[int, str] = {}
         self.rejoining: dict[int, int] = {}
         self.rejoined: set[int] = set()
-        self.said: dict[str, None] = {}
+
+    @property
+    def said(self) -> Mapping[str, None]:
+        """Every fault so far, `joint: fault`, in the order of appearance."""
+        return self._voice.said
 
     def attach(self, link: Dxl2Link, shake: Handshake) -> None:
         """The wire in use from now on."""
@@ -96,11 +98,15 @@ class Care:
         if not bits and not self._bits[index]:
             return
         self._bits[index] = bits
-        names = [name for name in self._names(index, bits) if self._counts(index, name)]
+        names = [
+            name
+            for name in self._names(index, bits)
+            if self._voice.counts(index, name, self._telemetry.measured(index))
+        ]
         new, self._faulty[index] = set(names) - set(self._faulty[index]), names
         self.fault[index] = ", ".join(names) or None
         if new:
-            self._say(index, ", ".join(names))
+            self._voice.say(index, ", ".join(names))
             if index in self.wanted and index not in self._recovery:
                 self._act(index, self._servos[index].safety.on_fault, now_s)
 
@@ -114,7 +120,7 @@ class Care:
             broken = self._loads.step(index, current, now_s)
             if broken is not None and index in self.wanted and index not in self.away:
                 name, rule = broken
-                self._say(index, f"{name} ({current:.0f} mA)")
+                self._voice.say(index, f"{name} ({current:.0f} mA)")
                 self._act(index, rule.then, now_s)
                 if rule.then == "limp":
                     self._again(index, now_s + REST_S, now_s)
@@ -126,7 +132,7 @@ class Care:
         if self._faulty[index]:
             self.away[index] = "limp"  # its own protection took the torque, and said why
             return
-        self._say(index, TORQUE_LOST)
+        self._voice.say(index, TORQUE_LOST)
         if index not in self.away:
             self.fault[index] = self.fault[index] or TORQUE_LOST
             self.away[index] = TORQUE_LOST
@@ -165,7 +171,7 @@ class Care:
             self.rejoining[index] = ticks
             self.rejoined.add(index)
             self._telemetry.ticks[index], self._telemetry.seen_s[index] = ticks, now_s
-            log.warning("%s is back and holds where it stands", self._about(index))
+            log.warning("%s is back and holds where it stands", self._voice.about(index))
         return len(out.back)
 
     def near(self, index: int, goal_ticks: int) -> bool:
@@ -211,7 +217,9 @@ class Care:
             return
         recent = self._attempts_s[index] = [t for t in self._attempts_s[index] if now_s - t < FORGET_S]
         if len(recent) >= ATTEMPTS:
-            log.warning("%s came back %d times in %g s and is left alone", self._about(index), len(recent), FORGET_S)
+            log.warning(
+                "%s came back %d times in %g s and is left alone", self._voice.about(index), len(recent), FORGET_S
+            )
             self.fault[index] = self.fault[index] or "left alone"
             return
         recent.append(now_s)
@@ -223,21 +231,3 @@ class Care:
     def _names(self, index: int, bits: int) -> list[str]:
         faults = self._tables[index].faults
         return [faults.get(bit, f"hardware error bit {bit}") for bit in range(8) if bits >> bit & 1]
-
-    def _counts(self, index: int, name: str) -> bool:
-        if counts(name, self._config, self._telemetry.measured(index)):
-            return True
-        excuse = f"{self._servos[index].joint}: {name}"
-        if excuse not in self._excused:
-            self._excused.add(excuse)
-            log.info("%s reports %s, which this head's configuration allows", self._about(index), name)
-        return False
-
-    def _say(self, index: int, fault: str) -> None:
-        named = f"{self._servos[index].joint}: {fault}"
-        if named not in self.said:
-            log.warning("%s: %s", self._about(index), fault)
-        self.said[named] = None
-
-    def _about(self, index: int) -> str:
-        return f"{self._servos[index].joint} (id {self._servos[index].id})"

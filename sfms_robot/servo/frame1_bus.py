@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import logging
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Final, TypeVar
 
@@ -51,7 +52,7 @@ _STOP_PATIENCE_S: Final = 0.02
 _REOPEN_S: Final = 0.2
 
 
-class Frame1Bus:
+class Frame1Bus(ABC):
     """One wire of servos, as `ports.Bus`. Subclasses say which family, and how it reads several servos at once.
 
     Args:
@@ -108,9 +109,9 @@ class Frame1Bus:
     def capabilities(self) -> Mapping[str, frozenset[str]]:
         return {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
 
+    @abstractmethod
     def _group_reader(self, link: Frame1Link) -> GroupRead | None:
         """How the family reads several servos by one request; None when it does not."""
-        raise NotImplementedError
 
     # --- start and stop -----------------------------------------------------------------------------------------
 

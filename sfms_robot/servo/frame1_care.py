@@ -11,12 +11,12 @@ one limp. Everything is said once. Who comes back too often is left alone.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from sfms_robot.config import Faults
-from sfms_robot.servo.policy import BusServo, LoadWatch, Measured, counts
+from sfms_robot.servo.policy import BusServo, LoadWatch, Measured, Voice
 from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)
@@ -50,20 +50,22 @@ class Frame1Care:
 
     Attributes:
         wanted: who was switched on and not off again.
-        said: every fault so far, `joint: fault`, in the order of appearance.
         rejoined: who came to hold a position in this tick.
     """
 
     def __init__(self, servos: Sequence[BusServo], tables: Sequence[Table], faults: Faults) -> None:
         self._servos = servos
         self._tables = tables
-        self._config = faults
+        self._voice = Voice(servos, faults)
         self._loads = LoadWatch(servos)
         self._troubles = [_Trouble() for _ in servos]
-        self._excused: set[str] = set()
         self.wanted: set[int] = set()
-        self.said: dict[str, None] = {}
         self.rejoined: set[int] = set()
+
+    @property
+    def said(self) -> Mapping[str, None]:
+        """Every fault so far, `joint: fault`, in the order of appearance."""
+        return self._voice.said
 
     def fault(self, index: int) -> str | None:
         return self._troubles[index].fault
@@ -104,14 +106,14 @@ class Frame1Care:
         bits = sum(1 << bit for bit in table.status_faults if error >> bit & 1)
         new, trouble.bits = bits & ~trouble.bits, bits
         names = [name for bit, name in sorted(table.status_faults.items()) if bits >> bit & 1]
-        names = [name for name in names if self._counts(index, name, seen)]
+        names = [name for name in names if self._voice.counts(index, name, seen)]
         if not names:
             stays_out = trouble.away and trouble.due_s is None  # for good, and says why though the cause has passed
             if trouble.fault != TORQUE_LOST and not stays_out:
                 trouble.fault = None
             return None
         trouble.fault = ", ".join(names)
-        self._say(index, trouble.fault)
+        self._voice.say(index, trouble.fault)
         fresh = any(new >> bit & 1 and name in names for bit, name in table.status_faults.items())
         return self._policy(index, self._servos[index].safety.on_fault, now_s) if fresh else None
 
@@ -121,7 +123,7 @@ class Frame1Care:
         if broken is None or self._troubles[index].away:
             return None
         name, rule = broken
-        self._say(index, f"{name} ({abs(current_mA):.0f} mA)")
+        self._voice.say(index, f"{name} ({abs(current_mA):.0f} mA)")
         policy = self._policy(index, rule.then, now_s)
         if policy == "limp":
             self._again(index, now_s + REST_S, now_s)
@@ -145,7 +147,7 @@ class Frame1Care:
         if index in self.wanted and not trouble.away:
             if trouble.fault is None:
                 trouble.fault = TORQUE_LOST
-                self._say(index, TORQUE_LOST)
+                self._voice.say(index, TORQUE_LOST)
             self.distrust(index, now_s)
 
     def gone(self, index: int) -> None:
@@ -180,7 +182,7 @@ class Frame1Care:
         trouble.away, trouble.due_s, trouble.rejoining = False, None, ticks
         trouble.fault, trouble.bits = None, 0
         self.rejoined.add(index)
-        log.warning("%s is back and holds where it stands", self._about(index))
+        log.warning("%s is back and holds where it stands", self._voice.about(index))
 
     def later(self, index: int, now_s: float) -> None:
         """It fell silent on its way back, which is not its last word."""
@@ -196,27 +198,7 @@ class Frame1Care:
         trouble = self._troubles[index]
         trouble.ends_s = [time_s for time_s in trouble.ends_s if now_s - time_s < FORGET_S]
         if len(trouble.ends_s) >= ATTEMPTS:
-            log.warning("%s: %d attempts in %g s, it is left alone", self._about(index), ATTEMPTS, FORGET_S)
+            log.warning("%s: %d attempts in %g s, it is left alone", self._voice.about(index), ATTEMPTS, FORGET_S)
             trouble.due_s, trouble.fault = None, trouble.fault or "left alone"
             return
         trouble.due_s = due_s
-
-    # --- what is said -------------------------------------------------------------------------------------------
-
-    def _counts(self, index: int, name: str, seen: Measured) -> bool:
-        if counts(name, self._config, seen):
-            return True
-        excuse = f"{self._servos[index].joint}: {name}"
-        if excuse not in self._excused:
-            self._excused.add(excuse)
-            log.info("%s reports %s, which this head's configuration allows", self._about(index), name)
-        return False
-
-    def _say(self, index: int, fault: str) -> None:
-        named = f"{self._servos[index].joint}: {fault}"
-        if named not in self.said:
-            log.warning("%s: %s", self._about(index), fault)
-        self.said[named] = None
-
-    def _about(self, index: int) -> str:
-        return f"{self._servos[index].joint} (id {self._servos[index].id})"

@@ -7,12 +7,15 @@ outside a threshold of the head's own.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from sfms_robot.config import Faults, FirmwareMap, LoadRule, Safety
 from sfms_robot.config.firmware import Role
+
+log = logging.getLogger(__name__)
 
 PINCH_SHARE: Final = 0.6  # of the servo's own current limit
 PINCH_S: Final = 0.5
@@ -49,6 +52,39 @@ def counts(name: str, faults: Faults, seen: Measured) -> bool:
     low = threshold.min is not None and value < threshold.min
     high = threshold.max is not None and value > threshold.max
     return low or high
+
+
+class Voice:
+    """Says of every servo what is wrong with it, and what is not held against it, once each.
+
+    Attributes:
+        said: every fault so far, `joint: fault`, in the order of appearance.
+    """
+
+    def __init__(self, servos: Sequence[BusServo], faults: Faults) -> None:
+        self._servos = servos
+        self._faults = faults
+        self._excused: set[str] = set()
+        self.said: dict[str, None] = {}
+
+    def counts(self, index: int, name: str, seen: Measured) -> bool:
+        """`counts` for servo `index`; a fault that does not is mentioned."""
+        if counts(name, self._faults, seen):
+            return True
+        excuse = f"{self._servos[index].joint}: {name}"
+        if excuse not in self._excused:
+            self._excused.add(excuse)
+            log.info("%s reports %s, which this head's configuration allows", self.about(index), name)
+        return False
+
+    def say(self, index: int, fault: str) -> None:
+        named = f"{self._servos[index].joint}: {fault}"
+        if named not in self.said:
+            log.warning("%s: %s", self.about(index), fault)
+        self.said[named] = None
+
+    def about(self, index: int) -> str:
+        return f"{self._servos[index].joint} (id {self._servos[index].id})"
 
 
 def register_of(table: FirmwareMap, role: Role) -> str | None:
