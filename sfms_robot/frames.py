@@ -45,6 +45,14 @@ POSE: Final = slice(0, 6)
 SHAPES: Final = slice(6, 58)
 MOTION_DIM: Final = len(CHANNELS)  # 58
 
+# Columns of each motion space a listener may work in (`signals.spaces`); arkit58 is a motion array itself.
+_AXES: Final = ("x", "y", "z")
+SPACE_CHANNELS: Final[Mapping[str, tuple[str, ...]]] = {
+    "arkit58": CHANNELS,
+    "faceverse58": (*BLENDSHAPES, *(f"rotation_{a}" for a in _AXES), *(f"translation_{a}" for a in _AXES)),
+    "deca56": (*(f"expression_{i}" for i in range(50)), *(f"head_{a}" for a in _AXES), *(f"jaw_{a}" for a in _AXES)),
+}
+
 # The order of Apple's ARKit header (eyes, jaw, mouth, brows, cheeks, nose, tongue).
 _APPLE: Final = (
     "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft",

@@ -62,9 +62,10 @@ def evaluate_tokenizer(name: str, data: Path) -> dict[str, Any]:
     from sfms_robot.learning.tokenizer import reconstruction_error
     from sfms_robot.listeners.sfms import load as load_sfms
 
-    model = load_sfms(find("listeners", name, "config.yaml")).model
+    listener = load_sfms(find("listeners", name, "config.yaml"))
+    model = listener.model
     window = model.tokenizer.window
-    corpus = gather(clips.load(data / "validation"), window)
+    corpus = gather(clips.load(data / "validation"), window, listener.space)
     usable = [p for p in PLACEMENTS if p != "learned" or model.tokenizer.score is not None]
     return {
         "listener": name,

@@ -1,5 +1,6 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices."""
 
+from sfms_robot.config.arig import Arig, Diffusion
 from sfms_robot.config.base import Model, find, load, parse
 from sfms_robot.config.drives import drives
 from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
@@ -15,21 +16,25 @@ from sfms_robot.config.head import (
     Threshold,
     load_head,
 )
+from sfms_robot.config.kinds import load_listener, parse_listener
 from sfms_robot.config.life import Gaze, Idle, Life
 from sfms_robot.config.listener import (
     ChannelGroup,
     Listener,
     PredictorTraining,
     Sampling,
+    Sfms,
     TokenizerTraining,
     Training,
 )
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
 
 __all__ = [
+    "Arig",
     "Bus",
     "ChannelGroup",
     "Coupling",
+    "Diffusion",
     "Expression",
     "Faults",
     "FirmwareMap",
@@ -49,6 +54,7 @@ __all__ = [
     "Register",
     "Safety",
     "Sampling",
+    "Sfms",
     "Threshold",
     "TokenizerTraining",
     "Training",
@@ -57,7 +63,9 @@ __all__ = [
     "load",
     "load_firmware_map",
     "load_head",
+    "load_listener",
     "map_files",
     "parse",
+    "parse_listener",
     "variant",
 ]

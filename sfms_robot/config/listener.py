@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
-from sfms_robot.frames import CHANNEL_INDEX
+from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS
 
 Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
+MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
 
 
 class ChannelGroup(Model):
@@ -22,13 +23,6 @@ class ChannelGroup(Model):
     keyframes: Count
     transition_bias: Finite = 0.0
     nucleus: Annotated[float, Field(gt=0, le=1)] | None = None
-
-    @model_validator(mode="after")
-    def _known(self) -> ChannelGroup:
-        for name in self.channels:
-            if name not in CHANNEL_INDEX:
-                raise ValueError(f"channels: {name!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
-        return self
 
     @property
     def codes(self) -> int:
@@ -45,11 +39,42 @@ class Sampling(Model):
 
 
 class Listener(Model):
-    """A listener: `configs/listeners/NAME/config.yaml`."""
+    """What every family of listeners says of itself: `configs/listeners/NAME/config.yaml`.
+
+    Attributes:
+        motion_space: what the model works in (`frames.SPACE_CHANNELS`); plans are `FaceFrame`s whatever it is.
+        neutral: face at rest in that space, one number per channel; None: the space's own.
+        metres_per_unit: scale of the space's translation; None: it has none and is left out.
+        flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
+    """
+
+    kind: str
+    description: str = ""
+    motion_space: MotionSpace = "arkit58"
+    neutral: tuple[Finite, ...] | None = None
+    metres_per_unit: Positive | None = None
+    flame_matrix: str | None = None
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return SPACE_CHANNELS[self.motion_space]
+
+    @model_validator(mode="after")
+    def _fits_space(self) -> Listener:
+        if self.neutral is not None and len(self.neutral) != len(self.channels):
+            raise ValueError(f"neutral: {len(self.neutral)} numbers, {self.motion_space} has {len(self.channels)}")
+        if self.flame_matrix is not None and self.motion_space != "deca56":
+            raise ValueError(f"flame_matrix: {self.motion_space} already is ARKit's expression (deca56 takes one)")
+        return self
+
+
+class Sfms(Listener):
+    """Sparse keyframe tokens and their predictor.
+
+    `groups` are written out, or named as a whole: `{preset: one|four|all, levels: [...], keyframes: k}`.
+    """
 
     kind: Literal["sfms"]
-    description: str = ""
-    motion_space: Literal["arkit58"] = "arkit58"
     past_frames: Count = 40
     future_frames: Count = 8
     hop: Count = 4
@@ -62,14 +87,24 @@ class Listener(Model):
     heads: Count = 4
     sampling: Sampling = Sampling()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _presets(cls, raw: Any) -> Any:
+        if isinstance(raw, dict) and isinstance(raw.get("groups"), dict) and "preset" in raw["groups"]:
+            return raw | {"groups": preset_groups(raw.get("motion_space", "arkit58"), raw["groups"])}
+        return raw
+
     @model_validator(mode="after")
-    def _consistent(self) -> Listener:
+    def _consistent(self) -> Sfms:
         owner: dict[str, str] = {}
         for name, group in self.groups.items():
             for channel in group.channels:
+                if channel not in self.channels:
+                    choices = ", ".join(self.channels)
+                    raise ValueError(f"groups.{name}.channels: {channel!r} is not a channel ({choices})")
                 if owner.setdefault(channel, name) != name:
                     raise ValueError(f"groups.{name}.channels: {channel!r} is already in group {owner[channel]}")
-        missing = [channel for channel in CHANNEL_INDEX if channel not in owner]
+        missing = [channel for channel in self.channels if channel not in owner]
         if missing:
             raise ValueError(f"groups: no group holds {', '.join(missing)}")
         if len({len(group.levels) for group in self.groups.values()}) != 1:
@@ -84,6 +119,41 @@ class Listener(Model):
     @property
     def window_frames(self) -> int:
         return self.past_frames + self.future_frames
+
+
+def preset_groups(space: str, wanted: dict[str, Any]) -> dict[str, Any]:
+    """Groups of channels by the number of keyframe sets: one, four (neck, brows, eyes, mouth and jaw), or all.
+
+    Raises ValueError for an unknown preset, key or space.
+    """
+    if set(wanted) != {"preset", "levels", "keyframes"}:
+        raise ValueError(f"groups: a preset takes the keys preset, levels, keyframes, not {', '.join(wanted)}")
+    if space not in SPACE_CHANNELS:
+        raise ValueError(f"motion_space: {space!r} is not known ({', '.join(SPACE_CHANNELS)})")
+    channels = SPACE_CHANNELS[space]
+    if wanted["preset"] == "one":
+        sets = {"face": channels}
+    elif wanted["preset"] == "all":
+        sets = {channel: (channel,) for channel in channels}
+    elif wanted["preset"] == "four" and space != "deca56":  # FLAME's components are not parts of a face
+        sets = {"neck": (), "brows": (), "eyes": (), "mouth": ()}
+        for channel in channels:
+            sets[_part(channel)] += (channel,)
+    else:
+        raise ValueError(f"groups.preset: {wanted['preset']!r} is none of one, four (not for deca56), all")
+    return {
+        name: {"channels": c, "levels": wanted["levels"], "keyframes": wanted["keyframes"]} for name, c in sets.items()
+    }
+
+
+def _part(channel: str) -> str:
+    if channel not in BLENDSHAPES:
+        return "neck"
+    return (
+        next((part for part in ("brow", "eye") if channel.startswith(part)), "mouth")
+        .replace("brow", "brows")
+        .replace("eye", "eyes")
+    )
 
 
 class TokenizerTraining(Model):
@@ -122,6 +192,6 @@ class Training(Model):
     """How a listener is trained: `configs/training/NAME.yaml`."""
 
     seed: int = 1
-    listener: Listener
+    listener: Sfms
     tokenizer: TokenizerTraining
     predictor: PredictorTraining

@@ -19,15 +19,17 @@ from sfms_robot.learning.rollout import speaker_frames
 from sfms_robot.learning.tokens import tokenise
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.listeners.space import MotionSpace
 
 LARGEST_STEP = 1.0  # of a bias, per round
 
 
 def calibrated(
-    settings: config.Listener, model: SfmsModel, dyads: Sequence[Dyad], rounds: int, seed: int = 1
-) -> config.Listener:
+    settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], rounds: int, seed: int = 1
+) -> config.Sfms:
     """`settings` with the biases of `rounds` roll-outs over `dyads`. The model is left in evaluation mode."""
-    wanted = data_rates(model, dyads, settings.window_frames)
+    space = MotionSpace.of(settings)
+    wanted = data_rates(model, dyads, settings.window_frames, space)
     for _ in range(rounds):
         rates = rollout_rates(SfmsListener(settings, model), dyads, seed)
         groups = {}
@@ -39,9 +41,9 @@ def calibrated(
     return settings
 
 
-def data_rates(model: SfmsModel, dyads: Sequence[Dyad], window: int) -> list[float]:
+def data_rates(model: SfmsModel, dyads: Sequence[Dyad], window: int, space: MotionSpace) -> list[float]:
     """Keyframes per frame of each group in the dyads' own listeners."""
-    return _rates(tokenise(model, gather(dyads, window)))
+    return _rates(tokenise(model, gather(dyads, window, space)))
 
 
 def rollout_rates(listener: SfmsListener, dyads: Sequence[Dyad], seed: int) -> list[float]:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_SAMPLES, MOTION_DIM
+from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, Floats
 from sfms_robot.learning.datasets.clips import Dyad
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
 from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 
 STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
@@ -23,8 +25,8 @@ class Corpus:
     """N frames of all dyads, one after another.
 
     Attributes:
-        motion: (N, 58) listener, raw units.
-        face: (N, 58) speaker, raw units, 0 where unknown; face_known: (N,) bool.
+        motion: (N, C) listener, in the motion space of the model.
+        face: (N, C) speaker, likewise, 0 where unknown; face_known: (N,) bool.
         mel: (N, 4, 128) half precision, natural log.
         heard: (N,) bool.
         lengths: frames of each dyad.
@@ -46,16 +48,19 @@ class Corpus:
         return torch.cat(firsts)
 
 
-def gather(dyads: Sequence[Dyad], window: int) -> Corpus:
-    """Stack dyads; those shorter than a window are left out. Raises ConfigError when none is left."""
+def gather(dyads: Sequence[Dyad], window: int, space: MotionSpace) -> Corpus:
+    """Stack dyads in one motion space; those shorter than a window are left out.
+
+    Raises ConfigError when none is left, or one is in a space that cannot be turned into the wanted one.
+    """
     kept = [dyad for dyad in dyads if len(dyad.listener) >= window]
     if not kept:
         raise ConfigError(f"none of {len(dyads)} dyads is as long as a window of {window} frames")
-    face = torch.cat([torch.from_numpy(dyad.speaker) for dyad in kept])
+    face = torch.cat([_in_space(dyad, dyad.speaker, space) for dyad in kept])
     known = face.isfinite().all(-1)
     rows = [torch.from_numpy(mel.log_mel(dyad.audio, mel.start())[0]).half() for dyad in kept]
     return Corpus(
-        motion=torch.cat([torch.from_numpy(dyad.listener) for dyad in kept]),
+        motion=torch.cat([_in_space(dyad, dyad.listener, space) for dyad in kept]),
         face=torch.where(known[:, None], face, 0.0),
         face_known=known,
         mel=torch.cat(rows).view(-1, mel.ROWS_PER_FRAME, mel.MEL_BINS),
@@ -64,21 +69,31 @@ def gather(dyads: Sequence[Dyad], window: int) -> Corpus:
     )
 
 
+def _in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
+    """(N, C); rows that are not finite stay so."""
+    if dyad.space == space.name:
+        return torch.from_numpy(motion)
+    if dyad.space != "arkit58":
+        raise ConfigError(f"dyad {dyad.name} is in {dyad.space}, the listener in {space.name}: set motion_space to it")
+    known = np.isfinite(motion).all(axis=1)
+    out = np.full((len(motion), space.dim), np.nan, dtype=np.float32)
+    out[known] = space.encode(motion[known])
+    return torch.from_numpy(out)
+
+
 def _heard(dyad: Dyad) -> Tensor:
     """A dyad without any sound has no voice, rather than a silent one."""
     frames = len(dyad.audio) // FRAME_SAMPLES
     return torch.full((frames,), bool(dyad.audio.any()))
 
 
-def fit_scales(model: SfmsModel, corpus: Corpus) -> None:
+def fit_scales(model: SfmsModel, corpus: Corpus, channels: Sequence[str]) -> None:
     """Set the model's means, deviations and speeds.
 
     Deviations are kept between what an eye just sees and what nobody misses: a still channel's noise is not blown up,
     and small movements of a channel that also makes large ones (a turning head) still count.
     """
-    least, most = torch.full((MOTION_DIM,), 0.04), torch.full((MOTION_DIM,), 0.12)
-    least[:3], most[:3] = 0.01, 0.03  # [rad]
-    least[3:6], most[3:6] = 0.01, 0.01  # [m]
+    least, most = _spread(channels)
     model.motion_mean.copy_(corpus.motion.mean(0))
     model.motion_std.copy_(corpus.motion.std(0).clamp(min=least, max=most))
     steps = (corpus.motion.diff(dim=0) / model.motion_std).abs()
@@ -88,6 +103,22 @@ def fit_scales(model: SfmsModel, corpus: Corpus) -> None:
     rows = corpus.mel[:: max(1, len(corpus.mel) // 20_000)].float().flatten(0, 1)
     model.mel_mean.copy_(rows.mean(0))
     model.mel_std.copy_(rows.std(0).clamp(min=0.5))
+
+
+def _spread(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Least and largest deviation (C,) that a channel is divided by: blendshapes, rotations [rad], places [m]."""
+    bounds = []
+    for name in channels:
+        if name in BLENDSHAPES:
+            bounds.append((0.04, 0.12))
+        elif name in ("roll", "pitch", "yaw") or name.startswith(("rotation", "head", "jaw_")):
+            bounds.append((0.01, 0.03))
+        elif name.startswith("expression"):  # FLAME's components, in units of their own deviation
+            bounds.append((0.1, 1e6))
+        else:
+            bounds.append((0.01, 0.01))
+    least, most = torch.tensor(bounds).T
+    return least, most
 
 
 @torch.no_grad()

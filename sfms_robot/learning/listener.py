@@ -23,6 +23,7 @@ from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
 from sfms_robot.listeners.sfms.stream import neutral_tokens
+from sfms_robot.listeners.space import MotionSpace
 
 CALIBRATION_DYADS = 8
 LN_PER_DB = math.log(10) / 10  # of power
@@ -40,7 +41,7 @@ def train_listener(
     model = SfmsModel(settings.listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
     dyads = clips.load(data / "train")
-    corpus = gather(dyads, settings.listener.window_frames)
+    corpus = gather(dyads, settings.listener.window_frames, MotionSpace.of(settings.listener))
     model.train()
     try:
         loss = _fit(model, corpus, settings, each_step)
@@ -52,11 +53,13 @@ def train_listener(
         :CALIBRATION_DYADS
     ]  # of the training set: held out stays so
     checkpoint.save_config(out, calibrated(corrected(settings), model, some, rounds))
-    held_out = gather(clips.load(data / "validation"), settings.listener.window_frames)
+    held_out = gather(
+        clips.load(data / "validation"), settings.listener.window_frames, MotionSpace.of(settings.listener)
+    )
     return {"loss": loss, "held_out_loss": held_out_loss(model, held_out, settings)}
 
 
-def corrected(settings: config.Training) -> config.Listener:
+def corrected(settings: config.Training) -> config.Sfms:
     """The listener with the weight of class 0 in (14) taken out of its probability again: p' ~ w p."""
     bias = -math.log(settings.predictor.transition_weight)
     groups = {
@@ -75,7 +78,7 @@ def _fit(
     training, listener = settings.predictor, settings.listener
     tokens = tokenise(model, corpus)
     starts = corpus.starts(listener.window_frames)
-    neutral = neutral_tokens(model, listener.past_frames)
+    neutral = neutral_tokens(model, MotionSpace.of(listener), listener.past_frames)
 
     def loss_of(step: int) -> Tensor:
         chosen = starts[torch.randint(len(starts), (training.batch,))]

@@ -16,6 +16,7 @@ from sfms_robot.learning.losses import masking, reconstruction
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
 from sfms_robot.listeners.sfms.placement import Strategy, place, place_learned
+from sfms_robot.listeners.space import MotionSpace
 
 WEIGHTS = "tokenizer.safetensors"
 DRAWS = 2  # placements tried per window; the better one is the target of the masking loss
@@ -30,10 +31,12 @@ def train_tokenizer(
     `each_step(step, loss)` is called after every step.
     """
     torch.manual_seed(settings.seed)
-    corpus = gather(clips.load(data / "train"), settings.listener.window_frames)
-    held_out = gather(clips.load(data / "validation"), settings.listener.window_frames)
+    corpus = gather(clips.load(data / "train"), settings.listener.window_frames, MotionSpace.of(settings.listener))
+    held_out = gather(
+        clips.load(data / "validation"), settings.listener.window_frames, MotionSpace.of(settings.listener)
+    )
     model = SfmsModel(settings.listener)
-    fit_scales(model, corpus)
+    fit_scales(model, corpus, settings.listener.channels)
     model.train()
     try:
         loss = _fit(model, corpus, settings.tokenizer, each_step)

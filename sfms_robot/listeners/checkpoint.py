@@ -58,4 +58,4 @@ def load_weights(file: Path, module: nn.Module) -> None:
 
 def load_config(folder: Path) -> config.Listener:
     """Read `folder`/config.yaml. Raises ConfigError."""
-    return config.load(config.Listener, folder / CONFIG)
+    return config.load_listener(folder / CONFIG)

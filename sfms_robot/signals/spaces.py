@@ -124,31 +124,59 @@ def decode(
     if flame is not None:
         motion[:, SHAPES] = flame.solve(values[:, known.expression], jaw_open)
     motion[:, SHAPES][:, BLENDSHAPES.index("jawOpen")] = jaw_open
-    missing = (
-        None if flame is not None else f"{space} without a matrix drives pose and jaw only: expression is not shown"
-    )
-    return Decoded(motion.astype(np.float32), jaw_rad.astype(np.float32), missing)
+    return Decoded(motion.astype(np.float32), jaw_rad.astype(np.float32), limitation(space, flame))
 
 
-def encode(motion: Floats | Doubles, space: str = "faceverse58", metres_per_unit: float = 1.0) -> Floats:
-    """Our motion (N, 58) in a space that has ARKit's expression, about the space's own neutral: undoes `decode`.
+def encode(
+    motion: Floats | Doubles,
+    space: str = "faceverse58",
+    *,
+    neutral: Doubles | None = None,
+    metres_per_unit: float | None = None,
+) -> Floats:
+    """Our motion (N, 58) in a space (N, dim), about `neutral` (dim,), by default the space's own: undoes `decode`.
 
-    Raises ConfigError for a space without.
+    Without `metres_per_unit` the translation stays at rest. deca56 takes pose and jaw, its expression stays at rest:
+    ours cannot be written in it. Raises ConfigError for an unknown space.
     """
     known = _space(space)
-    if known.jaw is not None or known.translation is None or known.euler is None:
-        raise ConfigError(f"{space}: our expression cannot be written in it (faceverse58)")
     values = np.asarray(motion, dtype=np.float64)
     axes = np.array(known.axes, dtype=np.float64)
+    rest = rest_of(space) if neutral is None else np.asarray(neutral, dtype=np.float64)
     turned = axes.T @ Rotation.from_euler("xyz", values[:, POSE][:, :3]).as_matrix() @ axes
-    out = np.zeros((len(values), known.dim))
-    out[:, known.expression] = values[:, SHAPES]
-    whole = turned @ _rotations(known, np.asarray(known.neutral)[None])[0]
-    angles = Rotation.from_matrix(whole).as_euler(known.euler)
-    angles[:, 0] %= 2 * np.pi  # about pi, not about -pi
-    out[:, known.rotation] = angles
-    out[:, known.translation] = values[:, POSE][:, 3:] @ axes / metres_per_unit
+    whole = Rotation.from_matrix(turned @ _rotations(known, rest[known.rotation][None])[0])
+    out = np.tile(rest, (len(values), 1))
+    if known.euler is None:
+        out[:, known.rotation] = whole.as_rotvec()
+    else:
+        out[:, known.rotation] = whole.as_euler(known.euler)
+        out[:, known.rotation.start] %= 2 * np.pi  # about pi, not about -pi
+    scale = metres_per_unit if metres_per_unit is not None else known.metres_per_unit
+    if known.translation is not None and scale is not None:
+        out[:, known.translation] += values[:, POSE][:, 3:] @ axes / scale
+    if known.jaw is None:
+        out[:, known.expression] = values[:, SHAPES]
+    else:
+        opening = JAW_FULL_OPEN_RAD * values[:, SHAPES][:, BLENDSHAPES.index("jawOpen")]
+        out[:, known.jaw] += opening[:, None] * axes[1]
     return out.astype(np.float32)
+
+
+def rest_of(space: str) -> Doubles:
+    """(dim,) a face at rest that looks straight ahead. Raises ConfigError for an unknown space."""
+    if space == "arkit58":  # our own
+        return np.zeros(MOTION_DIM)
+    known = _space(space)
+    out = np.zeros(known.dim)
+    out[known.rotation] = known.neutral
+    return out
+
+
+def limitation(space: str, flame: FlameMatrix | None) -> str | None:
+    """One line about what the space cannot show, or None."""
+    if space != "deca56" or flame is not None:
+        return None
+    return f"{space} without a matrix drives pose and jaw only: expression is not shown"
 
 
 def _space(name: str) -> Space:

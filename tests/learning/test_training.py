@@ -6,7 +6,7 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, ModelError
-from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
+from sfms_robot.frames import BLENDSHAPES, CHANNELS, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.learning import listener, loop, tokenizer
 from sfms_robot.learning.corpus import Corpus, fit_scales, gather, place_all, windows
 from sfms_robot.learning.datasets import clips
@@ -15,6 +15,9 @@ from sfms_robot.learning.rollout import evaluate_rollout
 from sfms_robot.listeners import checkpoint, sfms
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
+from sfms_robot.listeners.space import MotionSpace
+
+ARKIT = MotionSpace("arkit58", np.zeros(58))
 
 
 def settings(placement: str = "exact", **phases) -> config.Training:
@@ -108,7 +111,7 @@ def test_the_weight_of_class_0_is_taken_out_of_its_probability():
 
 
 def _corpus() -> Corpus:
-    return gather([dyad("a"), dyad("short", 40), dyad("b", 130, seed=1)], 48)
+    return gather([dyad("a"), dyad("short", 40), dyad("b", 130, seed=1)], 48, ARKIT)
 
 
 def test_windows_never_cross_from_one_dyad_into_the_next():
@@ -122,13 +125,13 @@ def test_windows_never_cross_from_one_dyad_into_the_next():
 
 def test_only_short_dyads_are_refused():
     with pytest.raises(ConfigError, match="none of 1 dyads is as long as a window of 48"):
-        gather([dyad("short", 40)], 48)
+        gather([dyad("short", 40)], 48, ARKIT)
 
 
 @pytest.mark.parametrize("placement", ["exact", "static"])
 def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement):
     model, corpus = SfmsModel(settings(placement).listener), _corpus()
-    fit_scales(model, corpus)
+    fit_scales(model, corpus, CHANNELS)
     mask = place_all(model.tokenizer, model.standardise(corpus.motion), corpus.lengths)
     assert mask.mean(0) * 48 == pytest.approx(torch.tensor([8.0, 8.0]), rel=0.1)
     for part in mask.split(corpus.lengths):

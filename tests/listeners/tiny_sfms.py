@@ -9,7 +9,7 @@ from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 
 
-def tiny_settings(**changes) -> config.Listener:
+def tiny_settings(**changes) -> config.Sfms:
     raw = {
         "kind": "sfms",
         "groups": {
@@ -21,7 +21,7 @@ def tiny_settings(**changes) -> config.Listener:
         "predictor_layers": 1,
         "heads": 2,
     }
-    return config.parse(config.Listener, raw | changes, "tiny")
+    return config.parse(config.Sfms, raw | changes, "tiny")
 
 
 def tiny_listener(**changes) -> SfmsListener:

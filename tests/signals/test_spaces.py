@@ -30,7 +30,7 @@ def test_axes_are_a_rotation(space):
 def test_faceverse_and_back_is_the_same_face():
     motion = faces()
     neutral = encode(np.zeros((1, 58)))[0]
-    back = decode(encode(motion), "faceverse58", neutral=neutral, metres_per_unit=1.0)
+    back = decode(encode(motion, metres_per_unit=1.0), "faceverse58", neutral=neutral, metres_per_unit=1.0)
     assert np.abs(back.motion - motion).max() < 1e-5
     assert back.jaw_rad is None and back.missing is None
 

@@ -1,61 +1,121 @@
-"""One conversation seen from one listener, as arrays, and how a set of them is kept on disk."""
+"""One conversation seen from one listener, as arrays, and how a set of our own is kept on disk."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_SAMPLES, MOTION_DIM, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, SPACE_CHANNELS, Floats
+from sfms_robot.signals import mel as log_mel
+
+# Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
+WIDTHS: Final[Mapping[str, int]] = {
+    **{name: len(channels) for name, channels in SPACE_CHANNELS.items()},
+    "faceverse58-centred": 58,  # less a mean face: how far from it, not where
+    "deep3d73": 73,  # Deep3DFaceRecon: angle 3 | expression 64 | translation 3 | crop 3
+}
+_FEATURE: Final = "feature."  # key prefix on disk
 
 
 @dataclass(frozen=True)
 class Dyad:
-    """N frames of 40 ms: what the speaker does, what the listener did.
+    """N frames: what the speaker does, what the listener did. Sound is `audio`, or `mel`, or not at hand.
 
     Attributes:
         name: unique, tells the origin (meeting, listener).
-        audio: (N * 640,) speaker's voice, 16 kHz mono.
-        speaker: (N, 58) speaker's motion; a row of NaN where the face is not known.
-        listener: (N, 58) listener's motion: what is to be learned.
+        audio: (samples_of(N, fps),) speaker's voice, 16 kHz mono, or None: the data ships no waveform.
+        speaker: (N, D) speaker's motion; a row of NaN where the face is not known.
+        listener: (N, D) listener's motion: what is to be learned.
         listening: (N,) True where somebody else spoke in the last 2 s and the listener is silent.
+        space: of both motions, a key of `WIDTHS`.
+        fps: frames a second.
+        mel: (4N, 128) natural log of the speaker's mel power, for data that ships this in place of a waveform.
+        features: more about each frame by name, (N, F): "hubert", "attributes", ...
     """
 
     name: str
-    audio: Floats
+    audio: Floats | None
     speaker: Floats
     listener: Floats
     listening: NDArray[np.bool_]
+    space: str = "arkit58"
+    fps: float = float(FRAME_HZ)
+    mel: Floats | None = None
+    features: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        frames = len(self.listener)
-        for key, shape in (
-            ("audio", (frames * FRAME_SAMPLES,)),
-            ("speaker", (frames, MOTION_DIM)),
-            ("listener", (frames, MOTION_DIM)),
-            ("listening", (frames,)),
-        ):
-            if getattr(self, key).shape != shape:
-                raise ValueError(f"{self.name}: {key} has shape {getattr(self, key).shape}, expected {shape}")
-        if not np.isfinite(self.listener).all() or not np.isfinite(self.audio).all():
-            raise ValueError(f"{self.name}: listener and audio must be finite")
+        if self.space not in WIDTHS:
+            raise ValueError(f"{self.name}: motion space {self.space!r} is not known ({', '.join(WIDTHS)})")
+        if not self.fps > 0:
+            raise ValueError(f"{self.name}: fps {self.fps:g} must be above 0")
+        frames, width = len(self.listener), WIDTHS[self.space]
+        expected: dict[str, tuple[Floats | NDArray[np.bool_] | None, tuple[int, ...]]] = {
+            "audio": (self.audio, (samples_of(frames, self.fps),)),
+            "speaker": (self.speaker, (frames, width)),
+            "listener": (self.listener, (frames, width)),
+            "listening": (self.listening, (frames,)),
+            "mel": (self.mel, (log_mel.ROWS_PER_FRAME * frames, log_mel.MEL_BINS)),
+        }
+        for key, (values, shape) in expected.items():
+            if values is not None and values.shape != shape:
+                raise ValueError(f"{self.name}: {key} has shape {values.shape}, expected {shape}")
+        for key, rows in self.features.items():
+            if rows.ndim != 2 or len(rows) != frames:
+                raise ValueError(f"{self.name}: feature {key} has shape {rows.shape}, expected ({frames}, F)")
+        for key in ("listener", "audio", "mel"):
+            values = getattr(self, key)
+            if values is not None and not np.isfinite(values).all():
+                raise ValueError(f"{self.name}: {key} must be finite")
+
+    def mel_rows(self) -> Floats | None:
+        """(4N, 128) natural log of mel power: `mel`, or made from `audio`; None where there is no sound.
+
+        At other rates than 25 each row is the newest of the 100 a second that is complete by its time.
+        """
+        if self.mel is not None or self.audio is None:
+            return self.mel
+        rows, _ = log_mel.log_mel(self.audio, log_mel.start())
+        wanted = log_mel.ROWS_PER_FRAME * len(self.listener)
+        if self.fps == FRAME_HZ:
+            return rows
+        ratio = AUDIO_HZ / log_mel.HOP / (log_mel.ROWS_PER_FRAME * self.fps)
+        newest = np.floor((np.arange(wanted) + 1) * ratio + 1e-6).astype(int) - 1
+        return rows[newest.clip(0, len(rows) - 1)]
+
+
+def samples_of(frames: int, fps: float) -> int:
+    """Samples at 16 kHz in that many frames: 640 each at 25 fps."""
+    return round(frames * AUDIO_HZ / fps)
 
 
 def save(folder: Path, dyads: Sequence[Dyad]) -> None:
-    """One NAME.npz per dyad: audio as int16, motion as float16 (3 decimals are more than a servo shows)."""
+    """One NAME.npz per dyad: audio as int16, motion of ours as float16 (3 decimals are more than a servo shows).
+
+    Motion in other spaces stays float32: angles near pi would lose what a nod is made of.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for dyad in dyads:
-        np.savez_compressed(
-            folder / f"{dyad.name}.npz",
-            audio=np.round(dyad.audio * 32767).astype(np.int16),
-            speaker=dyad.speaker.astype(np.float16),
-            listener=dyad.listener.astype(np.float16),
-            listening=dyad.listening,
-        )
+        kind = np.float16 if dyad.space == "arkit58" else np.float32
+        arrays: dict[str, NDArray[np.generic]] = {
+            "speaker": dyad.speaker.astype(kind),
+            "listener": dyad.listener.astype(kind),
+            "listening": dyad.listening,
+        }
+        if dyad.audio is not None:
+            arrays["audio"] = np.round(dyad.audio * 32767).astype(np.int16)
+        if dyad.mel is not None:
+            arrays["mel"] = dyad.mel
+        if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
+            arrays |= {"space": np.array(dyad.space), "fps": np.array(dyad.fps)}
+        arrays |= {_FEATURE + name: rows for name, rows in dyad.features.items()}
+        np.savez_compressed(folder / f"{dyad.name}.npz", **arrays)  # type: ignore[arg-type]
 
 
 def load(folder: Path) -> list[Dyad]:
@@ -63,18 +123,23 @@ def load(folder: Path) -> list[Dyad]:
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise ConfigError(f"{folder}: no dyads (*.npz) here; `sfms-robot data compose` makes them")
-    return [_read(file) for file in files]
+    return [read(file) for file in files]
 
 
-def _read(file: Path) -> Dyad:
+def read(file: Path) -> Dyad:
+    """One dyad as `save` wrote it. Raises ConfigError."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return Dyad(
                 file.stem,
-                arrays["audio"].astype(np.float32) / 32767,
+                arrays["audio"].astype(np.float32) / 32767 if "audio" in arrays else None,
                 arrays["speaker"].astype(np.float32),
                 arrays["listener"].astype(np.float32),
                 arrays["listening"].astype(bool),
+                str(arrays["space"]) if "space" in arrays else "arkit58",
+                float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
+                arrays["mel"].astype(np.float32) if "mel" in arrays else None,
+                {key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
             )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error

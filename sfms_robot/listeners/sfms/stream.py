@@ -17,10 +17,11 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from sfms_robot import config
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.reach import Reach
+from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 
 NEUTRAL_STRIDE = 8  # frames between the keyframes of the neutral face a stream begins with
@@ -34,10 +35,10 @@ class Memory:
         frames: how many have been heard.
         sound: samples that unfinished mel rows still need.
         mel: (4P, 128) standardised; heard: (P,) bool.
-        face: (P, 58) standardised; face_known: (P,) bool.
+        face: (P, C) standardised; face_known: (P,) bool.
         past: (P, G) own tokens up to now.
         ahead: (A, G) own tokens already drawn for the next A frames.
-        path: (2 + H, 58) standardised: the frame before, this frame, then the plan in force.
+        path: (2 + H, C) standardised: the frame before, this frame, then the plan in force.
         random: state of the stream's own generator.
     """
 
@@ -54,9 +55,9 @@ class Memory:
 
 
 @torch.no_grad()
-def neutral_tokens(model: SfmsModel, frames: int) -> Tensor:
+def neutral_tokens(model: SfmsModel, space: MotionSpace, frames: int) -> Tensor:
     """(frames, G): a still, neutral face up to now, as tokens."""
-    still = model.standardise(torch.zeros(1, frames, MOTION_DIM))
+    still = model.standardise(_still(space, frames))[None]
     mask = torch.zeros(1, frames, model.tokenizer.member.shape[0])
     mask[:, (frames - 1) % NEUTRAL_STRIDE :: NEUTRAL_STRIDE] = 1.0
     return model.tokenizer.encode(still, mask)[0]
@@ -65,11 +66,12 @@ def neutral_tokens(model: SfmsModel, frames: int) -> Tensor:
 class SfmsListener:
     """`ports.Listener` over an SfmsModel. Holds weights only."""
 
-    def __init__(self, settings: config.Listener, model: SfmsModel) -> None:
+    def __init__(self, settings: config.Sfms, model: SfmsModel, space: MotionSpace | None = None) -> None:
         self.settings = settings
         self.model = model.eval()
+        self.space = space or MotionSpace.of(settings)
         self.reach = Reach(self.model)
-        self._neutral = neutral_tokens(self.model, settings.past_frames)
+        self._neutral = neutral_tokens(self.model, self.space, settings.past_frames)
 
     @property
     def hop(self) -> int:
@@ -82,13 +84,13 @@ class SfmsListener:
     def start(self, seed: int) -> Memory:
         """Memory of a stream that has heard nothing and looked neutral so far."""
         p, h = self.settings.past_frames, self.settings.future_frames
-        still = self.model.standardise(torch.zeros(2 + h, MOTION_DIM))
+        still = self.model.standardise(_still(self.space, 2 + h))
         return Memory(
             frames=0,
             sound=mel.start(),
             mel=torch.zeros(mel.ROWS_PER_FRAME * p, mel.MEL_BINS),
             heard=torch.zeros(p, dtype=torch.bool),
-            face=torch.zeros(p, MOTION_DIM),
+            face=torch.zeros(p, self.space.dim),
             face_known=torch.zeros(p, dtype=torch.bool),
             past=self._neutral,
             ahead=self._neutral[:0],
@@ -112,7 +114,8 @@ class SfmsListener:
         path = join(heard.path[:2], decoded, self.settings.sampling.seam_frames)
         now = replace(heard, ahead=ahead, path=path, random=generator.get_state())
         times_s = np.asarray(speaker.time_s + FRAME_S * np.arange(1, self.horizon + 1), dtype=np.float64)
-        return Plan(speaker.time_s, times_s, self.model.restore(path[2:]).numpy()), now
+        motion, jaw_rad = self.space.decode(self.model.restore(path[2:]).numpy())
+        return Plan(speaker.time_s, times_s, motion, jaw_rad), now
 
     def _hear(self, speaker: SpeakerFrame, memory: Memory) -> Memory:
         """Memory with the newest frame in place of the oldest."""
@@ -121,10 +124,10 @@ class SfmsListener:
             raise ValueError(f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(speaker.audio)}")
         samples = speaker.audio if present else np.zeros(FRAME_SAMPLES, dtype=np.float32)
         rows, sound = mel.log_mel(samples, memory.sound)
-        face = torch.zeros(MOTION_DIM)
+        face = torch.zeros(self.space.dim)
         known = speaker.face is not None and bool(np.isfinite(speaker.face.motion).all())
         if speaker.face is not None and known:
-            face = self.model.standardise(torch.from_numpy(speaker.face.motion))
+            face = self.model.standardise(torch.from_numpy(self.space.encode(speaker.face.motion[None])[0]))
         # The frame that has just passed was in the plan; before the first plan it is part of the neutral face.
         passed = memory.ahead[:1] if len(memory.ahead) else torch.zeros_like(memory.past[:1])
         return replace(
@@ -141,6 +144,11 @@ class SfmsListener:
         )
 
 
+def _still(space: MotionSpace, frames: int) -> Tensor:
+    """(frames, C) of a face at rest."""
+    return torch.tensor(space.neutral, dtype=torch.float32).expand(frames, -1)
+
+
 def _push(queue: Tensor, new: Tensor) -> Tensor:
     return torch.cat([queue[len(new) :], new])
 
@@ -152,7 +160,7 @@ def _context(memory: Memory) -> Context:
 
 def draw(
     model: SfmsModel,
-    settings: config.Listener,
+    settings: config.Sfms,
     reach: Reach,
     context: Context,
     ahead: Tensor,

@@ -31,7 +31,9 @@ def offline(listener, speaker, seed):
     face = torch.from_numpy(np.stack([frame.face.motion for frame in speaker]))
     face = torch.cat([torch.zeros(p, 58), model.standardise(face)])
     known = torch.cat([torch.zeros(p), torch.ones(n)]).bool()
-    tokens = torch.cat([neutral_tokens(model, p), torch.zeros(n + h, 2).long()])  # frame t at index p + t
+    tokens = torch.cat(
+        [neutral_tokens(model, listener.space, p), torch.zeros(n + h, 2).long()]
+    )  # frame t at index p + t
     generator = torch.Generator().manual_seed(seed)
     still = model.standardise(torch.zeros(n + h + 2, 58))  # frame t at index 2 + t; two before the start
     path, plans, decided = still, {}, 1
@@ -47,7 +49,7 @@ def offline(listener, speaker, seed):
         window = model.tokenizer.decode(tokens[None, past.start : past.stop + h])[0]
         joined = join(path[now + 1 : now + 3], window[-h - 2 :], settings.sampling.seam_frames)
         path = torch.cat([path[: now + 1], joined, path[now + 1 + len(joined) :]])
-        plans[now] = model.restore(joined[2:]).numpy()
+        plans[now] = listener.space.decode(model.restore(joined[2:]).numpy())[0]
     return plans
 
 
