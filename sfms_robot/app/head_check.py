@@ -15,6 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sfms_robot.app.faces import recorded_faces
+from sfms_robot.app.limitation import limitation
 from sfms_robot.config import Head, drives, load_head
 from sfms_robot.config.check import check_head
 from sfms_robot.errors import ConfigError
@@ -69,7 +70,10 @@ class NeckCheck:
 
 @dataclass(frozen=True)
 class HeadCheck:
-    """Everything about one head; after `problems` there is nothing else."""
+    """Everything about one head; after `problems` there is nothing else.
+
+    `limitation`: what the listener that was named cannot show on any head, or None.
+    """
 
     name: str
     problems: Sequence[str]
@@ -79,13 +83,18 @@ class HeadCheck:
     neck: NeckCheck | None = None
     calibrate_first: bool = False
     seconds: float = 0.0
+    limitation: str | None = None
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
-def check(name: str, data: Path | None = None) -> HeadCheck:
-    """A head by shipped name or folder, on the bundled faces or those in a folder. Raises ConfigError for bad data."""
+def check(name: str, data: Path | None = None, listener: str | None = None) -> HeadCheck:
+    """A head by shipped name or folder, on the bundled faces or those in a folder.
+
+    Raises ConfigError for bad data, and for a listener that is none.
+    """
+    limited = limitation(listener) if listener is not None else None
     problems = check_head(name)
     if problems:
         return HeadCheck(name, problems)
@@ -106,6 +115,7 @@ def check(name: str, data: Path | None = None) -> HeadCheck:
         neck,
         head.calibrate_first,
         round(sum(len(clip) for clip in clips) * FRAME_S, 1),
+        limited,
     )
 
 

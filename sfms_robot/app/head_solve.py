@@ -19,6 +19,7 @@ from sfms_robot.retarget.kinematics import Solved, build_neck
 
 POSE_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")  # in the order of a pose
 BODY_COLUMN = "body_yaw_rad"
+_FARTHEST = 1e6  # rad or m: squares of what is asked must not overflow
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +67,10 @@ def read_poses(file: Path) -> tuple[Doubles, Doubles | None]:
     wanted = [*POSE_COLUMNS, BODY_COLUMN] if BODY_COLUMN in columns else list(POSE_COLUMNS)
     if missing := [name for name in POSE_COLUMNS if name not in columns]:
         raise ConfigError(f"{file}: no column {', '.join(missing)} (has {', '.join(columns) or 'none'})")
+    if twice := [name for name in wanted if columns.count(name) > 1]:
+        raise ConfigError(f"{file}: column {', '.join(twice)} is there twice")
+    if longer := [line for line, row in enumerate(rows, 2) if None in row]:
+        raise ConfigError(f"{file}:{longer[0]}: has more cells than the header has columns ({len(columns)})")
     if not rows:
         raise ConfigError(f"{file}: no poses, only a header")
     if unused := [name for name in columns if name not in wanted]:
@@ -82,4 +87,6 @@ def _number(row: dict[str, str | None], column: str, line: int, file: Path) -> f
         number = math.nan
     if not math.isfinite(number):
         raise ConfigError.at(f"{file}:{line}", column, text, "is not a number")
+    if abs(number) > _FARTHEST:
+        raise ConfigError.at(f"{file}:{line}", column, number, f"is out of all bounds (at most {_FARTHEST:g})")
     return number

@@ -6,6 +6,7 @@ then torque. Whatever happens after torque-on, the loop brings the head to rest;
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from typing import Any
 
 from sfms_robot.app.heads import SIM, Motion, Opened, build_bus, build_motion, devices, on_boards, plugged_in
 from sfms_robot.app.knobs import turned
+from sfms_robot.app.limitation import limitation
 from sfms_robot.app.report import run_report
 from sfms_robot.app.unit import unit_head
 from sfms_robot.config import Head, find
@@ -33,6 +35,8 @@ from sfms_robot.runtime.recorder import FullPolicy, Recorder, write_report
 from sfms_robot.runtime.safety import interrupt_flag, realtime_priority
 from sfms_robot.simulator.launch import Chain, launch
 from sfms_robot.sources.recording import open_source
+
+logger = logging.getLogger(__name__)
 
 FAST_LATENCY_S = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
@@ -71,6 +75,9 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
     motion = build_motion(head, rate_hz)
     knobs = turned(motion.retargeter, options.intensity, options.style)
     weights = find("listeners", options.listener, "config.yaml")
+    limited = limitation(options.listener)
+    if limited is not None:
+        logger.warning("%s: %s", weights.name, limited)
     source = open_source(options.audio, options.face, options.duration_s)
     if options.fast and source.duration_s is None:
         raise ConfigError("--fast without a recording never ends: give it a --duration")
@@ -93,6 +100,7 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
             motion.leads_s, motion.rest_rad, Life(head.life, options.seed), lambda: knobs,
         )  # fmt: skip
         report = _drive(options, parts, motion, clock, rate_hz, weights.name, head.name)
+        report["limitation"] = limited
         if options.fast:
             report["wire"] = {name: _digest(chain) for name, chain in opened.items() if isinstance(chain, Chain)}
     if options.record is not None:

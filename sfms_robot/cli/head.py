@@ -37,12 +37,13 @@ def check(
     name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
     data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
     plot: Path | None = typer.Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
+    listener: str | None = typer.Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
     from sfms_robot.app.head_check import check as check_head
 
-    checked = check_head(name, data)
+    checked = check_head(name, data, listener)
     if plot is not None and not checked.problems:
         from sfms_robot.app.head_plot import plot as draw
 

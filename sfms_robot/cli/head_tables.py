@@ -67,6 +67,8 @@ def print_check(checked: HeadCheck) -> None:
         )
         console.print(f"neck, one axis at a time: {reach}; {share}")
     console.print("cannot show: " + (", ".join(checked.blind_channels) or "nothing is left out"))
+    if checked.limitation is not None:
+        console.print(f"the listener: {checked.limitation}")
     console.print("not driven: " + (", ".join(checked.dead_joints) or "none"))
     if checked.calibrate_first:
         console.print("calibrate first: on real servos it moves 20 % of its travel at 0.3 of its speed until then")

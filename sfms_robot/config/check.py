@@ -14,10 +14,12 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from sfms_robot.config.base import UNKNOWN_KEY, Name, find, one_line, read
 from sfms_robot.config.drives import expanded, problems
-from sfms_robot.config.head import Bus, Head, Joint, LimitClass, wiring
+from sfms_robot.config.firmware import load_firmware_map
+from sfms_robot.config.head import Bus, Head, Joint, LimitClass, load_head, wiring
 from sfms_robot.config.kinematics import Kinematics
 from sfms_robot.config.kinematics import problems as neck_problems
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
+from sfms_robot.config.overlay import load_overlay
 from sfms_robot.errors import ConfigError
 
 _TABLES: dict[str, Any] = {
@@ -47,7 +49,7 @@ class _Rest(Head):
 def check_head(name: str) -> list[str]:
     """Problems of a head, by shipped name or folder, one line each with file, key, value and choices; none if sound.
 
-    Raises ConfigError where there is no such head.
+    Of a sound head the overlay of this build is looked at too. Raises ConfigError where there is no such head.
     """
     file = find("heads", name, "head.yaml") / "head.yaml"
     try:
@@ -55,6 +57,11 @@ def check_head(name: str) -> list[str]:
     except ConfigError as error:
         return [str(error)]
     found = [f"{file}: {line}" for line in _problems(raw)]
+    if not found:
+        try:
+            load_overlay(load_head(name))
+        except ConfigError as error:
+            found = [str(error)]
     return list(dict.fromkeys(found))
 
 
@@ -73,11 +80,22 @@ def _problems(raw: Any) -> list[str]:
     rest = {key: value if key not in parts else _names_only(key, value) for key, value in raw.items()}
     _parsed(_Rest, rest | {"kinematics": None}, "", found)
     table = {key: parts.get(key, {}) for key in (*_TABLES, *_LISTS)}
-    found += wiring(table["joints"], table["buses"], table["limits"])
+    found += wiring(table["joints"], table["buses"], table["limits"]) + _unknown_servos(table["joints"])
     couplings, folds = list(table["couplings"].values()), list(table["folds"].values())
     if neck is not None:
         found += neck_problems(neck, table["joints"], folds)
     return found + problems(table["joints"], table["expressions"], couplings, folds, table["regions"])
+
+
+def _unknown_servos(joints: dict[str, Joint | None]) -> list[str]:
+    found = []
+    for name, joint in joints.items():
+        try:
+            if joint is not None:
+                load_firmware_map(joint.model)
+        except ConfigError as error:
+            found.append(f"joints.{name}.model: {error}")
+    return found
 
 
 def _names_only(key: str, value: Any) -> Any:

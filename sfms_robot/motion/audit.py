@@ -33,8 +33,9 @@ class Audit:
     """Holds the limits of the joints of one bus; `calibration` has the same joints in the same order."""
 
     def __init__(self, limits: JointLimits, calibration: Calibration, dt_s: float) -> None:
-        self._limits, self._calibration, self._dt_s = limits, calibration, dt_s
-        self._bounds = np.stack([limits.speed, limits.acceleration, limits.jerk]) * (1 + _TOLERANCE)
+        self._limits, self._calibration = limits, calibration
+        self._bounds = np.stack([limits.speed * dt_s, limits.acceleration * dt_s**2, limits.jerk * dt_s**3])
+        self._bounds *= 1 + _TOLERANCE
         self._stride_ticks = limits.speed * dt_s * np.abs(calibration.ticks_per_rad) * (1 + _TOLERANCE) + 1
 
     def start(self, angles_rad: Doubles) -> AuditState:
@@ -57,10 +58,12 @@ class Audit:
         finite = np.isfinite(angles_rad)
         angles = np.where(finite, angles_rad, state.recent_rad[-1])
         stream = np.concatenate([state.recent_rad, angles[None]])
-        rates = [np.diff(stream, order, axis=0)[-1] / self._dt_s**order for order in (1, 2, 3)]
+        first = stream[1:] - stream[:-1]
+        second = first[1:] - first[:-1]
+        differences = np.stack([first[-1], second[-1], second[-1] - second[-2]])
         last = state.recent_rad[-1]
         bad = ~finite | (angles < np.minimum(self._limits.low, last)) | (angles > np.maximum(self._limits.high, last))
-        bad |= (np.abs(rates) > self._bounds).any(axis=0)
+        bad |= np.logical_or.reduce(np.abs(differences) > self._bounds, axis=0)
 
         ticks = self._calibration.to_ticks(angles)
         bad |= (ticks < self._calibration.low_ticks) | (ticks > self._calibration.high_ticks)

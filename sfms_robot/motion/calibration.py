@@ -51,11 +51,13 @@ class Calibration:
 
     def to_ticks(self, angles_rad: Doubles) -> NDArray[np.int64]:
         """Nearest ticks (J,) inside the position limits. Raises ValueError for what is not finite."""
-        if not np.isfinite(angles_rad).all():
-            raise ValueError(f"joint {int(np.argmin(np.isfinite(angles_rad)))} is asked for {angles_rad}: not finite")
-        ticks = np.rint(self.zero_ticks + self.ticks_per_rad * angles_rad)
-        inside: NDArray[np.int64] = np.clip(ticks, self.low_ticks, self.high_ticks).astype(np.int64)
-        return inside
+        finite = np.isfinite(angles_rad)
+        if np.count_nonzero(finite) < finite.size:
+            raise ValueError(f"joint {int(np.argmin(finite))} is asked for {angles_rad}: not finite")
+        ticks = self.ticks_per_rad * angles_rad
+        ticks += self.zero_ticks
+        inside: NDArray[np.float64] = np.minimum(np.maximum(np.rint(ticks), self.low_ticks), self.high_ticks)
+        return inside.astype(np.int64)
 
     def to_rad(self, ticks: NDArray[np.int64]) -> Doubles:
         """Angles (J,) of servo positions, also of those outside the limits."""

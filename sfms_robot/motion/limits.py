@@ -10,6 +10,9 @@ range, its speed and acceleration being within their limits all the way. A tick 
 3. Otherwise the joint brakes for one tick. The braking curve of a lawful state stays lawful, so by induction there
    is always a way out.
 
+Nearly always all joints pass, and bounds that are a little too strict but cost a few array operations for all of them
+show it. The joints that they do not settle are looked at one by one.
+
 A joint that is found outside its range starts there, and the range reaches out to it until it has come in.
 
 Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, hence within
@@ -18,8 +21,10 @@ the same limits. A reference that is not finite is refused: the joint brakes, an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import ruckig
@@ -27,13 +32,12 @@ from numpy.typing import NDArray
 
 from sfms_robot.config import Head
 from sfms_robot.frames import Doubles
+from sfms_robot.motion.stop import SLACK, Bound, State, Stop, lawful
 
 Bools = NDArray[np.bool_]
 
-# Rounding eats into a limit at about 1e-9 of it; the law is tested at 1e-6.
-_HEADROOM = 1 - 2e-7
-_SLACK = 1e-9
-_POSITION_SLACK_RAD = 1e-10
+_HEADROOM: Final = 1 - 2e-7  # of a limit, for rounding; the law is tested at 1e-6
+_EDGE_SLACK_RAD: Final = 1e-12  # so that rounding does not make a joint at the end of its range a hard case
 
 # Three pieces of a third each, jerks (1, 0, 0), (0, 1, 0), (0, 0, 1): what they add to acceleration, speed, position
 # at the end of a tick of length 1. The inverse turns what is missing into jerks.
@@ -81,203 +85,191 @@ class LimiterState:
     refused: int = 0
 
 
+@dataclass(frozen=True)
+class _Range:
+    """A range in force, as the array arithmetic needs it.
+
+    Attributes:
+        low, high, middle: (J,).
+        floor, ceiling: (3, J) just out of the limits: what is farther out is brought here, for 1e300 overflows.
+        bounds: (10, J) of what `JerkLimiter._needed` gives.
+    """
+
+    low: Doubles
+    high: Doubles
+    middle: Doubles
+    floor: Doubles
+    ceiling: Doubles
+    bounds: Doubles
+
+
 class JerkLimiter:
     """Implements `ports.Limiter` for joints that share one tick of `dt_s`."""
 
     def __init__(self, limits: JointLimits, dt_s: float) -> None:
-        self._low, self._high = limits.low, limits.high
         self._speed = limits.speed * _HEADROOM
         self._acceleration = limits.acceleration * _HEADROOM
         self._jerk = limits.jerk * _HEADROOM
         self._dt_s = dt_s
-        self._piece, self._piece_bounds = self._one_tick()
+        self._piece = _one_tick(dt_s)
         self._stop_s, self._per_acceleration = self._acceleration / self._jerk, 0.5 / self._acceleration
-        self._speed_slack, self._acceleration_slack = self._speed * (1 + _SLACK), self._acceleration * (1 + _SLACK)
-        self._far = self._absurd(self._low, self._high)
+        self._own = self._range(limits.low, limits.high)
         self._planner = ruckig.Ruckig(1)
         self._path = ruckig.Trajectory(1)
-        bounds = zip(self._speed.tolist(), self._acceleration.tolist(), self._jerk.tolist(), strict=True)
-        self._inputs = [_input(*bound, dt_s) for bound in bounds]
+        each = zip(self._speed.tolist(), self._acceleration.tolist(), self._jerk.tolist(), strict=True)
+        self._bounds = [Bound(*bound) for bound in each]
+        self._inputs = [_input(bound, dt_s) for bound in self._bounds]
 
     def start(self, angles_rad: Doubles) -> LimiterState:
         """At rest at `angles_rad` (J,), in its range or not. Raises ValueError when an angle is not finite."""
         if not np.isfinite(angles_rad).all():
             raise ValueError(f"joint {int(np.argmin(np.isfinite(angles_rad)))} starts at an angle that is not finite")
-        still = np.zeros_like(self._low)
-        low, high = np.minimum(self._low, angles_rad), np.maximum(self._high, angles_rad)
+        still = np.zeros_like(self._own.low)
+        low, high = np.minimum(self._own.low, angles_rad), np.maximum(self._own.high, angles_rad)
         return LimiterState(np.stack([angles_rad, still, still]), low, high)
 
     def restart(self, joints: Bools, angles_rad: Doubles, state: LimiterState) -> LimiterState:
         """Some `joints` (J,) stand still at `angles_rad` (J,), in their range or not; the others go on."""
-        motion = np.where(
-            joints, np.stack([angles_rad, np.zeros_like(angles_rad), np.zeros_like(angles_rad)]), state.motion
-        )
-        low = np.where(joints, np.minimum(self._low, angles_rad), state.low)
-        high = np.where(joints, np.maximum(self._high, angles_rad), state.high)
+        still = np.zeros_like(angles_rad)
+        motion = np.where(joints, np.stack([angles_rad, still, still]), state.motion)
+        low = np.where(joints, np.minimum(self._own.low, angles_rad), state.low)
+        high = np.where(joints, np.maximum(self._own.high, angles_rad), state.high)
         return replace(state, motion=motion, low=low, high=high)
 
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Reference (3, J) one tick ahead -> angles (J,) that may be sent, and the state after the tick."""
-        finite: Bools = np.logical_and.reduce(np.isfinite(reference_rad), axis=0)
-        low, high = state.low, state.high
-        floor, ceiling = self._far if low is self._low and high is self._high else self._absurd(low, high)
-        given = reference_rad if finite.all() else np.where(finite, reference_rad, state.motion)
-        wanted = np.minimum(np.maximum(given, floor), ceiling)
-        after = wanted.copy()
-        lawful = self._lawful(wanted, low, high)
-        passes = finite & self._in_one_tick(state.motion, wanted) & lawful
-        hard = np.flatnonzero(~passes)
-        if len(hard):
-            targets = self._targets(wanted, lawful, low, high)
-            for j in hard.tolist():
-                after[:, j] = self._chased(j, state.motion[:, j], targets[:, j]) if finite[j] else np.nan
-            brakes = ~(passes | self._lawful(after, low, high))
-            if brakes.any():
-                stop = Stop.of(state.motion, self._acceleration, self._jerk).after(self._dt_s)
-                stop[0] += state.motion[0]
-                after = np.where(brakes, stop, after)
-        after[0] = np.minimum(np.maximum(after[0], low), high)
-        if low is not self._low or high is not self._high:
-            low, high = self._come_in(after, low, high)
-        refused = int(len(finite) - np.count_nonzero(finite))
-        chased = state.chased + len(hard) - refused
-        return after[0].copy(), LimiterState(after, low, high, chased, state.refused + refused)
+        at_home = state.low is self._own.low and state.high is self._own.high
+        within = self._own if at_home else self._range(state.low, state.high)
+        after = np.minimum(np.maximum(reference_rad, within.floor), within.ceiling)
+        fine = self._needed(state.motion, after, within.middle) <= within.bounds  # False for NaN
+        chased, refused = state.chased, state.refused
+        if np.count_nonzero(fine) < fine.size:
+            hard = np.flatnonzero(~np.logical_and.reduce(fine, axis=0))
+            met = np.logical_and.reduce(fine[:6, hard], axis=0)
+            each = [
+                *state.motion[:, hard],
+                *reference_rad[:, hard],
+                *after[:, hard],
+                within.low[hard],
+                within.high[hard],
+            ]
+            settled = []
+            for j, ok, column in zip(hard.tolist(), met.tolist(), np.stack(each).T.tolist(), strict=True):
+                before, reference, wanted, (low, high) = column[:3], column[3:6], column[6:9], column[9:]
+                if not all(map(math.isfinite, reference)):
+                    settled.append(self._braked(j, before))
+                    refused += 1
+                elif ok and lawful(wanted, low, high, self._bounds[j]):
+                    settled.append(wanted)
+                else:
+                    settled.append(self._chased(j, before, wanted, low, high))
+                    chased += 1
+            after[:, hard] = np.array(settled).T
+        angles = after[0]
+        np.maximum(angles, within.low, out=angles)
+        np.minimum(angles, within.high, out=angles)
+        if at_home:
+            return angles.copy(), LimiterState(after, state.low, state.high, chased, refused)
+        return angles.copy(), LimiterState(after, *self._come_in(after, state.low, state.high), chased, refused)
 
     def _come_in(self, motion: Doubles, low: Doubles, high: Doubles) -> tuple[Doubles, Doubles]:
         """The range in force, without the way out where a joint is lawful in its own range."""
-        inside = self._lawful(motion, self._low, self._high)
+        own = zip(motion.T.tolist(), self._own.low.tolist(), self._own.high.tolist(), self._bounds, strict=True)
+        inside = np.array([lawful((p, v, a), first, last, bound) for (p, v, a), first, last, bound in own])
         if inside.all():
-            return self._low, self._high
-        return np.where(inside, self._low, low), np.where(inside, self._high, high)
+            return self._own.low, self._own.high
+        return np.where(inside, self._own.low, low), np.where(inside, self._own.high, high)
 
-    def _absurd(self, low: Doubles, high: Doubles) -> tuple[Doubles, Doubles]:
-        """Just out of the limits, below and above (3, J): what is farther out is brought here, for 1e300 overflows."""
+    def _range(self, low: Doubles, high: Doubles) -> _Range:
         ceiling = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
-        return np.stack([low - 1, -ceiling[1], -ceiling[2]]), ceiling
+        half = (high - low) / 2 + _EDGE_SLACK_RAD
+        one_tick = [self._jerk] * 3 + [self._acceleration] * 2 + [self._speed * self._dt_s]
+        stop = [self._speed * (1 + SLACK), self._acceleration * (1 + SLACK), half, half]
+        floor = np.stack([low - 1, -ceiling[1], -ceiling[2]])
+        return _Range(low, high, (low + high) / 2, floor, ceiling, np.stack([*one_tick, *stop]))
 
-    def _one_tick(self) -> tuple[Doubles, Doubles]:
-        """What three pieces of constant jerk lead from one state to the next take: (6, 6) matrix, bounds (6, J).
+    def _needed(self, motion: Doubles, wanted: Doubles, middle: Doubles) -> Doubles:
+        """What it takes to go from `motion` to `wanted` (3, J) in one tick, and to stop from there: sizes (10, J).
 
-        The matrix takes both states, one below the other (6, J), to the three jerks, the accelerations between the
-        pieces, and the way.
+        The six of `_one_tick`; the highest speed and acceleration of the stop; and how far from the middle of the
+        range it leads, along and against its way. Stopping takes no more way than: acceleration to 0 first, then a
+        whole stop from the highest speed. The other way it only goes until it has turned round, which takes no longer
+        than the acceleration lasts.
         """
-        dt = self._dt_s
-        missing = np.array(
-            [
-                [0, 0, -1 / dt, 0, 0, 1 / dt],
-                [0, -1 / dt**2, -1 / dt, 0, 1 / dt**2, 0],
-                [-1 / dt**3, -1 / dt**2, -1 / (2 * dt), 1 / dt**3, 0, 0],
-            ]
-        )
-        jerks = _JERKS_FOR @ missing
-        inner = np.stack([jerks[0] * (dt / 3), -jerks[2] * (dt / 3)])
-        inner[0, 2] += 1.0
-        inner[1, 5] += 1.0
-        bounds = [self._jerk, self._jerk, self._jerk, self._acceleration, self._acceleration, self._speed * dt]
-        return np.concatenate([jerks, inner, [[-1.0, 0, 0, 1, 0, 0]]]), np.stack(bounds)
-
-    def _in_one_tick(self, motion: Doubles, wanted: Doubles) -> Bools:
-        """Whether three pieces of bounded jerk lead from `motion` to `wanted` (3, J) in one tick."""
-        needed = self._piece @ np.concatenate([motion, wanted])
-        ok: Bools = np.logical_and.reduce(np.abs(needed) <= self._piece_bounds, axis=0)
-        return ok
-
-    def _lawful(self, motion: Doubles, low: Doubles, high: Doubles) -> Bools:
-        """Whether states (3, J) can stop inside the range, speed and acceleration within limits all the way.
-
-        Nothing that is not finite is lawful.
-        """
-        p, v, a = motion
-        speed, size = np.abs(motion[1:])
+        out = np.empty((10, wanted.shape[1]))
+        np.matmul(self._piece, np.concatenate([motion, wanted]), out=out[:6])
+        speed, size = np.abs(wanted[1:])
         lasts = size / self._jerk  # how long it takes until the acceleration is gone
-        gain = 0.5 * a * lasts
-        peak = v + gain  # speed by then
-        # Stopping takes no more way than: acceleration to 0 first, then a whole stop from the highest speed. The other
-        # way it only goes until it has turned round, which takes no longer than the acceleration lasts.
-        top = speed + np.abs(gain)
-        way, back = top * (lasts + self._stop_s + top * self._per_acceleration), speed * lasts
-        onward = peak >= 0
-        below, above = p - np.where(onward, back, way), p + np.where(onward, way, back)
-        ok: Bools = np.maximum(speed, np.abs(peak)) <= self._speed_slack
-        ok &= size <= self._acceleration_slack
-        if not ((below >= low) & (above <= high)).all():
-            first, last = Stop.of(motion, self._acceleration, self._jerk).extent()
-            ok &= (p + first >= low - _POSITION_SLACK_RAD) & (p + last <= high + _POSITION_SLACK_RAD)
-        return ok
+        gain = 0.5 * size * lasts  # of speed by then
+        top = speed + gain
+        onward = wanted[1] + np.copysign(gain, wanted[2])
+        off = wanted[0] - middle
+        out[6], out[7] = top, size
+        np.add(off, np.copysign(top * (lasts + self._stop_s + top * self._per_acceleration), onward), out=out[8])
+        np.subtract(off, np.copysign(speed * lasts, onward), out=out[9])
+        return np.abs(out, out=out)
 
-    def _targets(self, wanted: Doubles, lawful: Bools, low: Doubles, high: Doubles) -> Doubles:
-        """`wanted` (3, J) made something ruckig may aim at: inside the range, lawful, or else standing still."""
-        p, v, a = wanted
-        inside = np.minimum(np.maximum(p, low), high)
-        v = np.minimum(np.maximum(v, -self._speed), self._speed)
-        a = np.minimum(np.maximum(a, -self._acceleration), self._acceleration)
-        target = np.stack([inside, v, a])
-        if not lawful.all():
-            target[1:] *= lawful | (inside == p)  # outside, it is to stop at the edge
-            target[2] *= self._lawful(target, low, high)
-            target[1:] *= self._lawful(target, low, high)
-        return target
-
-    def _chased(self, j: int, motion: Doubles, target: Doubles) -> Doubles:
-        """State (3,) of joint j after the first tick of the fastest way to `target`; NaN where ruckig finds none."""
-        given = self._inputs[j]
-        given.current_position, given.current_velocity, given.current_acceleration = ([x] for x in motion.tolist())
-        given.target_position, given.target_velocity, given.target_acceleration = ([x] for x in target.tolist())
+    def _chased(self, j: int, before: State, wanted: State, low: float, high: float) -> State:
+        """Joint j one tick on its fastest way to what is possible of `wanted`; braked where that is not lawful."""
+        given, bound = self._inputs[j], self._bounds[j]
+        position, speed, acceleration = _possible(wanted, low, high, bound)
+        given.current_position, given.current_velocity, given.current_acceleration = ([x] for x in before)
+        given.target_position, given.target_velocity, given.target_acceleration = [position], [speed], [acceleration]
         try:
             self._planner.calculate(given, self._path)
-        except ruckig.RuckigError:
-            return np.full(3, np.nan)
-        return np.array(self._path.at_time(self._dt_s))[:, 0]
+        except (
+            ruckig.RuckigError,
+            ValueError,
+        ):  # it finds no way at the rim of the law, or one of hours (-101, unnamed)
+            return self._braked(j, before)
+        (position,), (speed,), (acceleration,) = self._path.at_time(self._dt_s)
+        after = (position, speed, acceleration)
+        return after if lawful(after, low, high, bound) else self._braked(j, before)
+
+    def _braked(self, j: int, before: State) -> State:
+        way, speed, acceleration = Stop.of(before[1], before[2], self._bounds[j]).after(self._dt_s)
+        return before[0] + way, speed, acceleration
 
 
-def _input(speed: float, acceleration: float, jerk: float, dt_s: float) -> ruckig.InputParameter:
+def _one_tick(dt: float) -> Doubles:
+    """What three pieces of constant jerk lead from one state to the next take: (6, 6).
+
+    It takes both states, one below the other (6, J), to the three jerks, the two accelerations between, and the way.
+    """
+    missing = np.array(
+        [
+            [0, 0, -1 / dt, 0, 0, 1 / dt],
+            [0, -1 / dt**2, -1 / dt, 0, 1 / dt**2, 0],
+            [-1 / dt**3, -1 / dt**2, -1 / (2 * dt), 1 / dt**3, 0, 0],
+        ]
+    )
+    jerks = _JERKS_FOR @ missing
+    inner = np.stack([jerks[0] * (dt / 3), -jerks[2] * (dt / 3)])
+    inner[0, 2] += 1.0
+    inner[1, 5] += 1.0
+    return np.concatenate([jerks, inner, [[-1.0, 0, 0, 1, 0, 0]]])
+
+
+def _input(bound: Bound, dt_s: float) -> ruckig.InputParameter:
     given = ruckig.InputParameter(1)
-    given.max_velocity, given.max_acceleration, given.max_jerk = [speed], [acceleration], [jerk]
+    given.max_velocity, given.max_acceleration, given.max_jerk = [bound.speed], [bound.acceleration], [bound.jerk]
     given.minimum_duration = dt_s
     return given
 
 
-@dataclass(frozen=True)
-class Stop:
-    """The fastest stop from states (3, J), everything along s, the sign of the speed once the acceleration is gone.
+def _possible(wanted: State, low: float, high: float, bound: Bound) -> State:
+    """What ruckig may aim at: `wanted` where it is lawful, else inside the range, and slower or standing still."""
+    position = _clipped(wanted[0], low, high)
+    speed = _clipped(wanted[1], -bound.speed, bound.speed)
+    acceleration = _clipped(wanted[2], -bound.acceleration, bound.acceleration)
+    if lawful(wanted, low, high, bound):
+        return position, speed, acceleration
+    if position == wanted[0]:  # outside, it is to stop at the edge
+        for target in ((position, speed, acceleration), (position, speed, 0.0)):
+            if lawful(target, low, high, bound):
+                return target
+    return position, 0.0, 0.0
 
-    Jerk -J until the acceleration is -peak, which is held where it is the limit, then +J; all (J,).
-    """
 
-    s: Doubles
-    speed: Doubles
-    acceleration: Doubles
-    jerk: Doubles
-    times_s: tuple[Doubles, Doubles, Doubles]
-
-    @classmethod
-    def of(cls, motion: Doubles, acceleration: Doubles, jerk: Doubles) -> Stop:
-        v, a = motion[1], motion[2]
-        s = np.where(v + a * np.abs(a) / (2 * jerk) >= 0, 1.0, -1.0)
-        v, a = s * v, s * a
-        peak = np.minimum(np.sqrt(np.maximum(jerk * v + a**2 / 2, 0.0)), acceleration)
-        t1 = np.maximum((a + peak) / jerk, 0.0)
-        t2 = np.maximum(v + a * t1 - jerk * t1**2 / 2 - peak**2 / (2 * jerk), 0.0) / acceleration
-        return cls(s, v, a, jerk, (t1, t2, peak / jerk))
-
-    def after(self, time_s: float) -> Doubles:
-        """Way, speed and acceleration (3, J), with their signs, `time_s` into the stop; inf for its end."""
-        p, v, a = np.zeros_like(self.speed), self.speed, self.acceleration
-        left = np.full_like(v, time_s)
-        for jerk, lasts in zip((-self.jerk, 0.0, self.jerk), self.times_s, strict=True):
-            t = np.minimum(lasts, left)
-            left = left - t
-            p, v, a = p + v * t + a * t**2 / 2 + jerk * t**3 / 6, v + a * t + jerk * t**2 / 2, a + jerk * t
-        over = left > 0  # what rounding leaves of speed and acceleration at the end is none
-        return np.stack([self.s * p, np.where(over, 0.0, self.s * v), np.where(over, 0.0, self.s * a)])
-
-    def extent(self) -> tuple[Doubles, Doubles]:
-        """How far it goes below and above the position it starts from [rad].
-
-        Where the joint moves against s at first, it turns round on the way, while the acceleration still falls.
-        """
-        end = self.after(np.inf)[0]
-        back = np.minimum(self.speed, 0.0)
-        t = (self.acceleration - np.sqrt(np.maximum(self.acceleration**2 + 2 * self.jerk * back, 0.0))) / self.jerk
-        turn = np.where(back < 0, self.s * (back * t + self.acceleration * t**2 / 2 - self.jerk * t**3 / 6), 0.0)
-        return np.minimum(np.minimum(end, turn), 0.0), np.maximum(np.maximum(end, turn), 0.0)
+def _clipped(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)

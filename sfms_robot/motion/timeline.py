@@ -26,6 +26,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats, Plan
 
@@ -157,28 +159,36 @@ class PlanTimeline:
         `now_s` is the time of the tick; instants after it are leads.
         """
         curve = state.curve
-        played_s = max(state.played_s, float(np.max(times_s)) - (curve.delay_s if curve else 0.0))
+        played_s = max(state.played_s, float(times_s.max()) - (curve.delay_s if curve else 0.0))
         if curve is None:
             return np.zeros((len(times_s), MOTION_DIM), np.float32), replace(state, played_s=played_s)
-        asked_s = times_s - curve.delay_s
-        motion = _motion(curve, asked_s)
-        around_s = np.concatenate([asked_s - self._widening_s, asked_s + self._widening_s])
-        widened = _motion(curve, around_s, _BLINKS).reshape(2, len(asked_s), -1).max(axis=0)
-        motion[:, _BLINKS] = np.maximum(motion[:, _BLINKS], widened)
-        motion[:, _BLINKS] = np.maximum(motion[:, _BLINKS], self._near(curve, asked_s))
+        instants_s, which = _distinct(times_s)
+        asked_s = instants_s - curve.delay_s
+        around_s = np.concatenate([asked_s, asked_s - self._widening_s, asked_s + self._widening_s])
+        motion = _motion(curve, around_s)
+        blinks = motion[:, _BLINKS].reshape(3, len(asked_s), -1).max(axis=0)
+        motion[: len(asked_s), _BLINKS] = np.maximum(blinks, self._near(curve, asked_s))
         held = bool(played_s > curve.knots.times_s[-1])
         eased = now_s - curve.delay_s - curve.made_at_s > STALL_S
-        return motion.astype(np.float32), replace(
+        return motion.astype(np.float32).take(which, axis=0), replace(
             state, played_s=played_s, held=state.held + held, eased=state.eased + eased
         )
 
     def _near(self, curve: Curve, asked_s: Doubles) -> Doubles:
         """Blink (N, 2) of a frame close enough to be widened to here, 0 where there is none."""
         times_s = curve.knots.times_s
-        nearest = np.searchsorted(times_s, asked_s + self._widening_s, side="right") - 1
-        near = np.abs(times_s[np.maximum(nearest, 0)] - asked_s) <= self._widening_s
-        blinks: Doubles = curve.knots.values[np.maximum(nearest, 0), _BLINKS]
+        nearest = times_s.searchsorted(asked_s + self._widening_s, side="right") - 1
+        frame = np.maximum(nearest, 0)
+        near = np.abs(times_s[frame] - asked_s) <= self._widening_s
+        blinks: Doubles = curve.knots.values[frame, _BLINKS]
         return blinks * (near & (nearest >= 0) & (asked_s - curve.made_at_s < STALL_S))[:, None]
+
+
+def _distinct(times_s: Doubles) -> tuple[Doubles, NDArray[np.intp]]:
+    """The instants, each once, and which of them each of (N,) is: joints share their leads."""
+    seen: dict[float, int] = {}
+    which = [seen.setdefault(time_s, len(seen)) for time_s in times_s.tolist()]
+    return np.array(list(seen)), np.array(which, dtype=np.intp)
 
 
 def _blend(before: Doubles, after: Doubles, share: float) -> Doubles:
@@ -260,11 +270,12 @@ def _derivatives(times_s: Doubles, values: Doubles) -> tuple[Doubles, Doubles]:
     slopes, bends = np.zeros_like(values), np.zeros_like(values)
     slopes[1:-1] = (wr * left + wl * right) / (wl + wr)
     bends[1:-1] = 2 * (right - left) / (wl + wr)
-    for i in range(2, len(times_s) - 2):
-        if np.ptp(width[i - 2 : i + 2]) < _EVEN * width[i]:
-            a, b, c, d, e = values[i - 2 : i + 3]
-            slopes[i] = (a - 8 * b + 8 * d - e) / (12 * width[i])
-            bends[i] = (-a + 16 * b - 30 * c + 16 * d - e) / (12 * width[i] ** 2)
+    if len(times_s) > 4:
+        a, b, c, d, e = (values[k : len(values) - 4 + k] for k in range(5))
+        after = width[2:-1]
+        even = np.ptp(sliding_window_view(width[:, 0], 4), axis=1)[:, None] < _EVEN * after
+        slopes[2:-2] = np.where(even, (a - 8 * b + 8 * d - e) / (12 * after), slopes[2:-2])
+        bends[2:-2] = np.where(even, (-a + 16 * b - 30 * c + 16 * d - e) / (12 * after**2), bends[2:-2])
     if len(times_s) > 3 and np.ptp(width[-3:-1]) < _EVEN * width[-2]:  # nothing is known past the last frame
         a, b, c = values[-4:-1]
         slopes[-2], bends[-2] = (a - 4 * b + 3 * c) / (2 * width[-2]), (a - 2 * b + c) / width[-2] ** 2
@@ -301,22 +312,30 @@ def _curve(knots: _Knots, made_at_s: float, delay_s: float) -> Curve:
     return Curve(knots, coefficients, low, high, made_at_s, delay_s)
 
 
-def _motion(curve: Curve | None, asked_s: Doubles, columns: slice = slice(None)) -> Doubles:
-    """Motion (N, columns) on the curve's own time; held outside it, faded to neutral once plans stopped coming."""
+def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:
+    """Motion (N, 58) on the curve's own time; held outside it, faded to neutral once plans stopped coming."""
     if curve is None:
-        return np.zeros((len(asked_s), MOTION_DIM))[:, columns]
+        return np.zeros((len(asked_s), MOTION_DIM))
     times_s = curve.knots.times_s
-    piece = np.clip(np.searchsorted(times_s, asked_s, side="right") - 1, 0, len(times_s) - 2)
-    along = np.clip((asked_s - times_s[piece]) / (times_s[piece + 1] - times_s[piece]), 0.0, 1.0)
-    powers = np.ones((len(asked_s), 6))
-    np.multiply.accumulate(np.broadcast_to(along[:, None], (len(along), 5)), axis=1, out=powers[:, 1:])
-    out = np.empty((len(asked_s), len(range(MOTION_DIM)[columns])))
-    for i in set(piece.tolist()):  # leads differ by less than a frame: one piece or two
-        rows = piece == i
-        values = powers[rows] @ curve.coefficients[i, :, columns]
-        out[rows] = np.minimum(np.maximum(values, curve.low[i, columns]), curve.high[i, columns])
-    gone = (asked_s - curve.made_at_s - STALL_S) / EASE_S
-    if np.max(gone) > 0:
-        u = np.clip(gone, 0.0, 1.0)
+    piece = np.minimum(np.maximum(times_s.searchsorted(asked_s, side="right") - 1, 0), len(times_s) - 2)
+    along = (asked_s - times_s[piece]) / (times_s[piece + 1] - times_s[piece])
+    first, last = int(piece.min()), int(piece.max())
+    # One product for all the pieces in play: each row has its powers in the columns of its own piece, 0 elsewhere.
+    powers = np.zeros((len(asked_s), last + 1 - first, 6))
+    powers[np.arange(len(asked_s)), piece - first] = _powers(np.minimum(np.maximum(along, 0.0), 1.0))
+    coefficients = curve.coefficients[first : last + 1].reshape(-1, MOTION_DIM)
+    out: Doubles = powers.reshape(len(asked_s), -1) @ coefficients
+    np.maximum(out, curve.low[piece], out=out)
+    np.minimum(out, curve.high[piece], out=out)
+    if float(asked_s.max()) > curve.made_at_s + STALL_S:
+        u = np.clip((asked_s - curve.made_at_s - STALL_S) / EASE_S, 0.0, 1.0)
         out *= (1 - u**3 * (10 - 15 * u + 6 * u**2))[:, None]
     return out
+
+
+def _powers(x: Doubles) -> Doubles:
+    """(N,) -> (N, 6): 1, x, x^2, ... x^5."""
+    powers = np.empty((len(x), 6))
+    powers[:, 0], powers[:, 1:] = 1.0, x[:, None]
+    np.multiply.accumulate(powers, axis=1, out=powers)
+    return powers

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from sfms_robot.config import Expression
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, Doubles, Floats
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
 
 Indices = NDArray[np.intp]
 Tree = tuple[int, Expression]  # joint, node
@@ -73,13 +73,13 @@ class _Curves:
 
 @dataclass(frozen=True)
 class _Shape:
-    """What happens to the values (..., n) of a level's nodes; None for what no node has."""
+    """What happens to the values (..., n) of a level's nodes; None for what no node has: one tick has little time."""
 
     dead_band: Doubles | None
     curves: _Curves | None
-    gain_up: Doubles
+    gain_up: Doubles | None
     gain_down: Doubles | None
-    offset: Doubles
+    offset: Doubles | None
     low: Doubles | None
     high: Doubles | None
 
@@ -89,15 +89,17 @@ class _Shape:
         dead = np.array([node.dead_band for node in nodes]) * count
         gains = np.array([node.gains for node in nodes])
         gains /= np.where([node.curve is None for node in nodes], count, 1.0)[:, None]
+        gained = bool((gains != 1).any())
+        offset = np.array([node.offset for node in nodes])
         limit = [_PRODUCT_LIMIT if node.product else np.inf for node in nodes]
         low, high = np.array([node.clamp or (-top, top) for node, top in zip(nodes, limit, strict=True)]).T
         clamped = bool(np.isfinite(low).any())
         return cls(
             dead if dead.any() else None,
             _Curves.of([node.curve for node in nodes], count),
-            gains[:, 1],
+            gains[:, 1] if gained else None,
             gains[:, 0] if (gains[:, 0] != gains[:, 1]).any() else None,
-            np.array([node.offset for node in nodes]),
+            offset if offset.any() else None,
             low if clamped else None,
             high if clamped else None,
         )
@@ -108,8 +110,10 @@ class _Shape:
             values -= np.minimum(np.maximum(values, -self.dead_band), self.dead_band)
         if self.curves is not None:
             self.curves.into(values)
-        values *= self.gain_up if self.gain_down is None else np.where(values > 0, self.gain_up, self.gain_down)
-        values += self.offset
+        if self.gain_up is not None:
+            values *= self.gain_up if self.gain_down is None else np.where(values > 0, self.gain_up, self.gain_down)
+        if self.offset is not None:
+            values += self.offset
         if self.low is not None and self.high is not None:
             np.maximum(values, self.low, out=values)
             np.minimum(values, self.high, out=values)
@@ -134,10 +138,15 @@ class _Level:
 
 @dataclass(frozen=True)
 class Program:
-    """The drives of J joints, compiled: motion -> values in joint units."""
+    """The drives of J joints, compiled: motion -> values in joint units.
 
-    rows: Indices
+    Attributes:
+        columns: the channel of each leaf.
+        cells: the same in a flattened (J, 58), in the row of the leaf's joint.
+    """
+
     columns: Indices
+    cells: Indices
     leaves: _Shape
     levels: tuple[_Level, ...]
 
@@ -150,17 +159,19 @@ class Program:
             level, forest = _level(forest)
             levels.insert(0, level)
         nodes = [leaf for _, leaf in forest]
+        rows = np.array([row for row, _ in forest], dtype=np.intp)
+        columns = np.array([CHANNEL_INDEX[leaf.channel or ""] for leaf in nodes], dtype=np.intp)
         return cls(
-            np.array([row for row, _ in forest], dtype=np.intp),
-            np.array([CHANNEL_INDEX[leaf.channel or ""] for leaf in nodes], dtype=np.intp),
+            columns,
+            rows * MOTION_DIM + columns,
             _Shape.of(nodes),
             tuple(levels),
         )
 
     def __call__(self, motion: Floats) -> Doubles:
         """(58,) or (..., J, 58), row j for joint j -> (J,) or (..., J)."""
-        where = (self.rows, self.columns) if motion.ndim > 1 else (self.columns,)
-        values = self.leaves(motion[(..., *where)].astype(np.float64))
+        flat = motion.reshape(*motion.shape[:-2], -1)
+        values = self.leaves(flat.take(self.columns if motion.ndim == 1 else self.cells, axis=-1).astype(np.float64))
         for level in self.levels:
             values = level(values)
         return values
@@ -176,6 +187,8 @@ def _level(forest: list[Tree]) -> tuple[_Level, list[Tree]]:
     groups = [[(row, part) for part in node.parts] for row, node in nodes]
     starts = np.cumsum([0, *(len(group) for group in groups[:-1])])
     ways = [_REDUCE[node.group or "sum"] for _, node in nodes]
+    needed = [way for way, group in zip(ways, groups, strict=True) if len(group) > 1] or [np.add]
+    ways = [way if way in needed else needed[0] for way in ways]  # a group of one is the same whatever the way
     kinds = [(way, np.array([other is way for other in ways])) for way in dict.fromkeys(ways)]
     level = _Level(starts, tuple(kinds), _Shape.of([node for _, node in nodes]))
     return level, [part for group in groups for part in group]

@@ -20,6 +20,7 @@ from sfms_robot.retarget.kinematics import build_neck
 from sfms_robot.retarget.mapping import Knobs, Mapping
 
 _POSE = len(POSE_CHANNELS)
+_LARGE = np.array([0.5, 0.6, 1.0, 0.05, 0.05, 0.05])  # roll, pitch, yaw [rad], place [m]: where style changes nothing
 _HOME_RAD = np.radians(0.1)  # how far from its rest a joint may stand where the neck is at home
 
 
@@ -61,7 +62,7 @@ class HeadRetargeter:
     def step(self, motion: Floats, memory: Doubles, knobs: Knobs | None = None) -> tuple[Doubles, Doubles]:
         """(58,) for all joints, or (J, 58) with row j for joint j -> rad (J,), and the memory after this tick.
 
-        The pose is that of the row of the neck's first joint; the intensity of that joint's region scales it. Raises
+        The pose is that of the row of the neck's first joint; the knobs of that joint's region turn it. Raises
         ValueError where the motion is not finite.
         """
         angles = self.mapping.angles(motion, knobs)
@@ -81,5 +82,8 @@ class HeadRetargeter:
         first = self.neck_columns[0]
         row = motion if motion.ndim == 1 else motion[..., first, :]
         knobs = knobs or self._knobs
-        pose: Doubles = knobs.intensity[first] * row[..., :_POSE].astype(np.float64)
+        pose: Doubles = row[..., :_POSE].astype(np.float64)
+        if knobs.style[first] != 1.0:  # the same law as of the mapping's joints, over the pose
+            pose *= 1.0 + (knobs.style[first] - 1.0) * (1.0 - np.minimum(np.abs(pose) / _LARGE, 1.0))
+        pose *= knobs.intensity[first]
         return pose

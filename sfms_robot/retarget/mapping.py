@@ -60,7 +60,7 @@ class _Couplings:
     def apply(self, values: Doubles, low: Doubles, high: Doubles) -> None:
         """Change values (..., J), which lie inside low..high (J,), as far as it takes and the ranges allow."""
         missing = np.maximum(self.at_least - values @ self.weights.T, 0.0)
-        if not missing.any():
+        if not np.count_nonzero(missing):
             return
         for rows, columns, weights in self.turns:
             now = values[..., columns]
@@ -121,8 +121,9 @@ class Mapping:
         """
         if motion.shape[-1:] != (MOTION_DIM,) or (motion.ndim > 1 and motion.shape[-2] != len(self.joints)):
             raise ValueError(f"motion is {motion.shape}, not (58,) or (..., {len(self.joints)}, {MOTION_DIM})")
-        if not np.isfinite(motion).all():
-            where = np.argwhere(~np.isfinite(motion))[0]
+        finite = np.isfinite(motion)
+        if np.count_nonzero(finite) < finite.size:
+            where = np.argwhere(~finite)[0]
             raise ValueError(f"motion channel {CHANNELS[where[-1]]} is {motion[tuple(where)]}")
         values = self._inside(self._program(motion))
         knobs = knobs or self._knobs
@@ -130,7 +131,8 @@ class Mapping:
             values = self._inside(self._turned(values, knobs))
         if self._couplings is not None:
             self._couplings.apply(values, self._low, self._high)
-        angles: Doubles = self._rest_rad + values * np.where(values > 0, self._up, self._down)
+        values *= np.where(values > 0, self._up, self._down)
+        angles: Doubles = values + self._rest_rad
         np.maximum(angles, self._low_rad, out=angles)
         np.minimum(angles, self._high_rad, out=angles)
         return angles

@@ -70,6 +70,9 @@ def test_the_command_prints_a_column_per_joint_in_rad_and_whether_it_got_there(p
         (f"{HEADER}\n", "poses.csv: no poses, only a header"),
         (f"{HEADER}\n0,0,0,0,0,0\n0,0,0,0,0,left\n", "poses.csv:3: yaw_rad = 'left' is not a number"),
         (f"{HEADER}\n0,0,0,0,0\n", "poses.csv:2: yaw_rad = None is not a number"),
+        (f"{HEADER}\n0,0,0,0,0,0,7\n", "poses.csv:2: has more cells than the header has columns"),
+        (f"x_m,{HEADER}\n0,0,0,0,0,0,0\n", "poses.csv: column x_m is there twice"),
+        (f"{HEADER}\n1e300,0,0,0,0,0\n", r"poses.csv:2: x_m = 1e\+300 is out of all bounds"),
         (f"{HEADER}\n0,0,0,nan,0,0\n", "poses.csv:2: roll_rad = 'nan' is not a number"),
     ],
 )

@@ -56,6 +56,18 @@ def test_intensity_of_the_necks_region_scales_the_pose():
         assert retargeter.angles(motion(yaw=0.2), knobs)[yaw] == pytest.approx(0.2 * intensity)
 
 
+def test_style_of_the_necks_region_bends_small_poses_and_leaves_large_ones():
+    retargeter = HeadRetargeter(load_head("face28"))
+    yaw = retargeter.joints.index("neck_yaw")
+
+    def turn(angle: float, style: float) -> float:
+        return float(retargeter.angles(motion(yaw=angle), retargeter.mapping.knobs(style={"neck": style}))[yaw])
+
+    assert turn(0.05, 2.0) == pytest.approx(1.95 * turn(0.05, 1.0), rel=1e-3)
+    assert abs(turn(0.05, 0.0)) < 0.1 * turn(0.05, 1.0)
+    assert turn(1.0, 0.0) == pytest.approx(turn(1.0, 2.0))
+
+
 def test_what_the_neck_remembers_is_handed_through():
     head = load_head("reachy_mini")
     body = head.kinematics.body_yaw.model_copy(update={"low_pass_hz": 0.5})

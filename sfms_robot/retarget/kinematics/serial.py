@@ -36,6 +36,13 @@ class Serial:
         self._ranges = {name: ranges[name] for name in self.joints}
         self._column = {name: column for column, name in enumerate(self.joints)}
         self._axes = tuple(pose.AXIS[name] for name in config.order)
+        places = [config.axes.get(name) for name in config.order]
+        self._places: Sequence[str | Split | None] = places  # per axis its joint, or two; None: the differential's
+        single = [(column, place) for column, place in enumerate(places) if isinstance(place, str)]
+        self._single_axes = np.array([column for column, _ in single], dtype=np.intp)
+        self._single_joints = np.array([self._column[name] for _, name in single], dtype=np.intp)
+        self._single_low, self._single_high = np.array([ranges[name] for _, name in single]).reshape(-1, 2).T
+        self._splits = [(column, place) for column, place in enumerate(places) if isinstance(place, Split)]
 
     def solve(self, poses: Doubles, body_yaw_rad: Doubles | None = None) -> Solved:
         if body_yaw_rad is not None:
@@ -50,8 +57,8 @@ class Serial:
     def step(self, pose: Doubles, dt_s: float, memory: Doubles) -> tuple[Doubles, Doubles]:
         wanted = checked(pose)
         angles, slow = self._axis_angles(wanted), memory.copy()
-        for column, place in enumerate(self._places()):
-            if isinstance(place, Split) and place.crossover_hz is not None:
+        for column, place in self._splits:
+            if place.crossover_hz is not None:
                 slow[column] = split.low_pass(angles[column], memory[column], place.crossover_hz, dt_s)
         return self._joint_angles(angles, slow), slow
 
@@ -59,10 +66,6 @@ class Serial:
         out = np.zeros((*angles_rad.shape[:-1], 6))
         out[..., :3] = pose.euler(self._rotation(angles_rad), (2, 1, 0))[..., ::-1]
         return out
-
-    def _places(self) -> list[str | Split | None]:
-        """Per axis its joint, its two joints, or None where the differential has it."""
-        return [self._config.axes.get(name) for name in self._config.order]
 
     def _axis_angles(self, poses: Doubles) -> Doubles:
         """Poses (..., 6) -> the angle of each axis (..., k), whatever the joints can do."""
@@ -85,15 +88,14 @@ class Serial:
     def _joint_angles(self, angles: Doubles, slow: Doubles) -> Doubles:
         """Axis angles and their low-passed ones (..., k) -> joints (..., J) inside their ranges."""
         out = np.zeros((*angles.shape[:-1], len(self.joints)))
-        for column, place in enumerate(self._places()):
+        alone = np.minimum(np.maximum(angles[..., self._single_axes], self._single_low), self._single_high)
+        out[..., self._single_joints] = alone
+        for column, place in self._splits:
             angle = angles[..., column]
-            if isinstance(place, str):
-                out[..., self._column[place]] = np.clip(angle, *self._ranges[place])
-            elif place is not None:
-                low = slow[..., column] if place.lower_share is None else place.lower_share * angle
-                parts = split.shared(angle, low, self._ranges[place.lower], self._ranges[place.upper])
-                for joint, part in zip((place.lower, place.upper), parts, strict=True):
-                    out[..., self._column[joint]] = part
+            low = slow[..., column] if place.lower_share is None else place.lower_share * angle
+            parts = split.shared(angle, low, self._ranges[place.lower], self._ranges[place.upper])
+            for joint, part in zip((place.lower, place.upper), parts, strict=True):
+                out[..., self._column[joint]] = part
         if (pair := self._config.differential) is not None:
             order = self._config.order
             pitch, roll = angles[..., order.index("pitch")], angles[..., order.index("roll")]
@@ -106,7 +108,7 @@ class Serial:
     def _rotation(self, joints: Doubles) -> Doubles:
         """Joints (..., J) -> R (..., 3, 3)."""
         turns = []
-        for name, axis, place in zip(self._config.order, self._axes, self._places(), strict=True):
+        for name, axis, place in zip(self._config.order, self._axes, self._places, strict=True):
             if isinstance(place, str):
                 angle = joints[..., self._column[place]]
             elif place is not None:

@@ -1,0 +1,64 @@
+"""A listener that cannot show everything says so before anything moves."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from safetensors.torch import save_file
+
+from sfms_robot.app.head_check import check
+from sfms_robot.app.limitation import limitation
+from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.config.kinds import load_listener
+from sfms_robot.errors import ConfigError
+from sfms_robot.listeners.sfms.model import SfmsModel
+
+TINY = {
+    "kind": "sfms",
+    "motion_space": "deca56",
+    "groups": {"preset": "one", "levels": [3, 2], "keyframes": 6},
+    "tokenizer_width": 16,
+    "predictor_width": 16,
+    "predictor_layers": 1,
+    "heads": 2,
+}
+
+
+@pytest.fixture
+def deca(tmp_path):
+    """A folder with a tiny, untrained listener that works in deca56."""
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(TINY))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = SfmsModel(load_listener(tmp_path / "config.yaml"))
+    save_file(model.state_dict(), tmp_path / "model.safetensors")
+    return tmp_path
+
+
+def test_the_shipped_listener_shows_everything():
+    assert limitation("sfms-small") is None and check("op3_head", listener="sfms-small").limitation is None
+
+
+def test_deca56_without_a_matrix_says_pose_and_jaw_only(deca):
+    assert "pose and jaw only" in limitation(str(deca))
+    assert "pose and jaw only" in check("op3_head", listener=str(deca)).limitation
+
+
+def test_with_a_matrix_beside_it_nothing_is_missing(deca):
+    np.save(deca / "mine.npy", np.random.default_rng(0).normal(size=(52, 50)))
+    (deca / "config.yaml").write_text(yaml.safe_dump(TINY | {"flame_matrix": "mine.npy"}))
+    assert limitation(str(deca)) is None
+
+
+def test_a_matrix_that_is_not_there_is_told_before_anything_moves(deca):
+    (deca / "config.yaml").write_text(yaml.safe_dump(TINY | {"flame_matrix": "gone.npy"}))
+    with pytest.raises(ConfigError, match=r"gone\.npy"):
+        run_head(RunOptions(listener=str(deca), duration_s=0.4, fast=True))
+
+
+def test_a_run_logs_it_and_reports_it(deca, caplog):
+    report = run_head(RunOptions(head="op3_head", listener=str(deca), duration_s=0.4, fast=True))
+    assert "pose and jaw only" in report["limitation"] and "pose and jaw only" in caplog.text
+    assert json.dumps(report)
