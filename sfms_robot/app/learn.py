@@ -1,8 +1,7 @@
-"""Data, training and evaluation behind `data`, `train` and `evaluate`: files in, figures out."""
+"""Data and evaluation behind `data` and `evaluate`: files in, figures out."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from sfms_robot import config
-from sfms_robot.config import find, load
+from sfms_robot.config import find
 from sfms_robot.learning.datasets import clips, composed
 from sfms_robot.listeners.sfms.placement import Strategy
 
@@ -26,34 +24,6 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str,
     """Compose into out/train and out/validation. Returns the minutes written per split."""
     with _stderr().status(f"composing {minutes:g} minutes of dyads"):
         return dict(composed.compose_folder(data, out, seed, minutes))
-
-
-def train_tokenizer(
-    file: Path, data: Path, out: Path, placement: str | None = None, steps: int | None = None
-) -> dict[str, Any]:
-    """Phase 1, with another placement or number of steps than the file's if given. Returns its figures and minutes."""
-    from sfms_robot.learning import tokenizer
-
-    settings = load(config.Training, file)
-    if placement is not None:
-        settings = settings.model_copy(
-            update={"listener": settings.listener.model_copy(update={"placement": placement})}
-        )
-    if steps is not None:
-        settings = settings.model_copy(update={"tokenizer": settings.tokenizer.model_copy(update={"steps": steps})})
-    began_s = time.monotonic()
-    figures = tokenizer.train_tokenizer(settings, data, out)
-    return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)}
-
-
-def train_listener(file: Path, data: Path, out: Path) -> dict[str, Any]:
-    """Phase 2, on the tokenizer in `out`. Returns its figures and the minutes it took."""
-    from sfms_robot.learning import listener
-
-    settings = load(config.Training, file)
-    began_s = time.monotonic()
-    figures = listener.train_listener(settings, data, out)
-    return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)}
 
 
 def evaluate_tokenizer(name: str, data: Path) -> dict[str, Any]:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import typer
 
-app = typer.Typer(help="Train a listener: first its tokenizer, then its predictor.", no_args_is_help=True)
+INTERRUPTED = 130
 
-CONFIG = typer.Option(..., help="A configs/training/*.yaml, or your own.")
-DATA = typer.Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
-OUT = typer.Option(..., help="Folder for config.yaml and weights; `run --listener` takes it.")
-JSON = typer.Option(False, "--json", help="Print the figures as one JSON object.")
+app = typer.Typer(help="Train a listener: first its tokenizer, then its predictor.", no_args_is_help=True)
 
 
 class Placement(StrEnum):
@@ -25,30 +23,72 @@ class Placement(StrEnum):
     learned = "learned"
 
 
+class Device(StrEnum):
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+CONFIG = typer.Option(..., help="A configs/training/*.yaml, or your own.")
+DATA = typer.Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
+OUT = typer.Option(..., help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
+RESUME = typer.Option(False, "--resume", help="Go on from the checkpoint in --out, with the same settings and data.")
+DEVICE = typer.Option(Device.auto, help="auto: the GPU if there is one.")
+STEPS = typer.Option(None, min=1, help="Another number of steps than the file's.")
+TENSORBOARD = typer.Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
+JSON = typer.Option(False, "--json", help="Print the figures as one JSON object.")
+
+
 @app.command()
 def tokenizer(
     config: Path = CONFIG,
     data: Path = DATA,
     out: Path = OUT,
+    resume: bool = RESUME,
+    device: Device = DEVICE,
+    steps: int | None = STEPS,
     placement: Placement | None = typer.Option(None, help="Another keyframe placement than the file's, to compare."),
-    steps: int | None = typer.Option(None, min=1, help="Another number of steps than the file's."),
+    tensorboard: bool | None = TENSORBOARD,
     json: bool = JSON,
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
-    from sfms_robot.app.learn import train_tokenizer
+    from sfms_robot.app.training import TrainOptions, train_tokenizer
 
-    _print(train_tokenizer(config, data, out, placement.value if placement else None, steps), json)
+    placed = placement.value if placement else None
+    options = TrainOptions(config, data, out, resume, device.value, steps, placed, tensorboard)
+    _print(_interruptible(lambda: train_tokenizer(options)), json)
 
 
 @app.command()
-def listener(config: Path = CONFIG, data: Path = DATA, out: Path = OUT, json: bool = JSON) -> None:
+def listener(
+    config: Path = CONFIG,
+    data: Path = DATA,
+    out: Path = OUT,
+    resume: bool = RESUME,
+    device: Device = DEVICE,
+    steps: int | None = STEPS,
+    tensorboard: bool | None = TENSORBOARD,
+    json: bool = JSON,
+) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
-    from sfms_robot.app.learn import train_listener
+    from sfms_robot.app.training import TrainOptions, train_listener
 
-    _print(train_listener(config, data, out), json)
+    options = TrainOptions(config, data, out, resume, device.value, steps, None, tensorboard)
+    _print(_interruptible(lambda: train_listener(options)), json)
+
+
+def _interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Ctrl-C says how to go on, where there is something to go on from."""
+    try:
+        return train()
+    except KeyboardInterrupt as stopped:
+        print(f"sfms-robot: {stopped if stopped.args else 'interrupted'}", file=sys.stderr)
+        sys.exit(INTERRUPTED)
 
 
 def _print(figures: Mapping[str, Any], json: bool) -> None:
+    if figures["resumed_at"] == figures["steps"]:
+        print(f"sfms-robot: had already finished at step {figures['steps']}", file=sys.stderr)
     if json:
         print(json_module.dumps(figures))
     else:

@@ -21,25 +21,27 @@ from sfms_robot.config.life import Gaze, Idle, Life
 from sfms_robot.config.listener import (
     ChannelGroup,
     Listener,
-    PredictorTraining,
     Sampling,
     Sfms,
-    TokenizerTraining,
-    Training,
 )
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
+from sfms_robot.config.recipe import Baseline, Dense, Grouped, Recipe
+from sfms_robot.config.training import Phase, PredictorTraining, TokenizerTraining, Training
 
 __all__ = [
     "Arig",
+    "Baseline",
     "Bus",
     "ChannelGroup",
     "Coupling",
+    "Dense",
     "Diffusion",
     "Expression",
     "Faults",
     "FirmwareMap",
     "Fold",
     "Gaze",
+    "Grouped",
     "Head",
     "Idle",
     "Joint",
@@ -49,7 +51,9 @@ __all__ = [
     "Listener",
     "LoadRule",
     "Model",
+    "Phase",
     "PredictorTraining",
+    "Recipe",
     "Region",
     "Register",
     "Safety",

@@ -1,4 +1,4 @@
-"""A listener and how it is trained."""
+"""A listener: what its folder's config.yaml holds."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
-from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS
+from sfms_robot.config.base import Finite, Model, Name, Positive
+from sfms_robot.frames import BLENDSHAPES, FRAME_S, SPACE_CHANNELS
 
 Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
+STEP_S = 0.025  # what one plan may take at most (99th percentile, paper size, two CPU cores)
+LEAD_S = 0.080  # longest lead of a joint: the slowest servo's lag and a tick
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
+Placement = Literal["exact", "static", "static_paper", "learned_paper", "learned", "nested"]
 
 
 class ChannelGroup(Model):
@@ -30,12 +33,26 @@ class ChannelGroup(Model):
 
 
 class Sampling(Model):
-    """How tokens are drawn. `frames_per_pass`: future frames decided by one pass of the decoder."""
+    """How tokens are drawn, and over how many frames a plan fades into the motion before it."""
 
     temperature: Positive = 1.0
     nucleus: Annotated[float, Field(gt=0, le=1)] = 1.0
-    frames_per_pass: Count = 1
     seam_frames: Count = 4
+
+
+class Scores(Model):
+    """The network that ranks keyframes, of the learned placements. `sweeps`: rounds of second thoughts of `learned`."""
+
+    width: Count = 32
+    layers: Count = 2
+    heads: Count = 4
+    sweeps: Annotated[int, Field(ge=0)] = 2
+
+    @model_validator(mode="after")
+    def _heads_fit(self) -> Scores:
+        if self.width % (2 * self.heads):
+            raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        return self
 
 
 class Listener(Model):
@@ -72,18 +89,41 @@ class Sfms(Listener):
     """Sparse keyframe tokens and their predictor.
 
     `groups` are written out, or named as a whole: `{preset: one|four|all, levels: [...], keyframes: k}`.
+
+    Attributes:
+        hop: frames between plans; auto: `default_hop`.
+        audio: features of the voice: mel (4 rows of 128 per frame, aligned by convolution and max-pool), mfcc78 or
+            wav2vec2 (768), one row per frame.
+        wav2vec2: folder of a model in the layout of transformers, beside config.yaml or absolute; only streams need it.
+        phase: is the speaker's place in a phrase an input? Beyond the paper; it reaches back further than 40 frames.
+        sequential: does each frame know the keyframes drawn before it? Beyond the paper, which draws 8 in parallel.
+        placement: where keyframes go (`listeners.sfms.placement`); max_gap_frames bounds `exact`.
+        quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq); either has a group's number of
+            codes, the product of its levels.
+        inpainter: added to straight lines (residual), or all by itself (paper).
+        tokenizer_layers: transformer blocks in each of the inpainter's three parts.
     """
 
     kind: Literal["sfms"]
     past_frames: Count = 40
     future_frames: Count = 8
-    hop: Count = 4
-    placement: Literal["exact", "static", "static_paper", "learned"] = "exact"
+    hop: Literal["auto"] | Count = "auto"
+    audio: Literal["mel", "mfcc78", "wav2vec2"] = "mel"
+    wav2vec2: str | None = None
+    phase: bool = True
+    sequential: bool = True
+    placement: Placement = "exact"
     max_gap_frames: Count = 24
     groups: Annotated[dict[Name, ChannelGroup], Field(min_length=1)]
+    scores: Scores = Scores()
+    quantizer: Literal["fsq", "vq"] = "fsq"
+    code_dims: Count = 4
+    inpainter: Literal["residual", "paper"] = "residual"
     tokenizer_width: Count = 96
+    tokenizer_layers: Count = 1
     predictor_width: Count = 96
     predictor_layers: Count = 2
+    speaker_layers: Count = 1
     heads: Count = 4
     sampling: Sampling = Sampling()
 
@@ -109,7 +149,7 @@ class Sfms(Listener):
             raise ValueError(f"groups: no group holds {', '.join(missing)}")
         if len({len(group.levels) for group in self.groups.values()}) != 1:
             raise ValueError("groups: every group needs the same number of levels")
-        if self.hop > self.future_frames:
+        if self.hop_frames > self.future_frames:
             raise ValueError(f"hop {self.hop} is above future_frames {self.future_frames}")
         for key, width in (("tokenizer_width", self.tokenizer_width), ("predictor_width", self.predictor_width)):
             if width % (2 * self.heads):
@@ -117,8 +157,20 @@ class Sfms(Listener):
         return self
 
     @property
+    def hop_frames(self) -> int:
+        return default_hop(self.future_frames) if self.hop == "auto" else self.hop
+
+    @property
     def window_frames(self) -> int:
         return self.past_frames + self.future_frames
+
+
+def default_hop(horizon: int, step_s: float = STEP_S, lead_s: float = LEAD_S) -> int:
+    """The largest hop that leaves plans long enough for their making and the lead: hop T + step + lead <= (H - 1) T.
+
+    At least 1.
+    """
+    return max(1, math.floor((horizon - 1) - (step_s + lead_s) / FRAME_S + 1e-9))
 
 
 def preset_groups(space: str, wanted: dict[str, Any]) -> dict[str, Any]:
@@ -154,44 +206,3 @@ def _part(channel: str) -> str:
         .replace("brow", "brows")
         .replace("eye", "eyes")
     )
-
-
-class TokenizerTraining(Model):
-    """Phase 1: scores, quantizer, inpainter."""
-
-    steps: Count
-    batch: Count
-    learning_rate: Positive
-    score_learning_rate: Positive = 1e-3
-    weight_decay: NonNegative = 0.01
-    clip_norm: Positive = 1.0
-    mask_loss: NonNegative = 0.1
-    velocity_loss: NonNegative = 0.0
-    temperature: tuple[Positive, Positive] = (2.0, 0.1)
-
-
-class PredictorTraining(Model):
-    """Phase 2: the next-token predictor."""
-
-    steps: Count
-    batch: Count
-    learning_rate: Positive
-    weight_decay: NonNegative = 0.01
-    clip_norm: Positive = 1.0
-    transition_weight: Positive = 0.5
-    neutral_prefix: Share = 0.1
-    drop_audio: Share = 0.1
-    drop_face: Share = 0.3
-    history_noise: Share = 0.05
-    gain_db: NonNegative = 6.0
-    group_weights: dict[Name, Positive] = {}
-    calibration_rounds: Annotated[int, Field(ge=0)] = 2
-
-
-class Training(Model):
-    """How a listener is trained: `configs/training/NAME.yaml`."""
-
-    seed: int = 1
-    listener: Sfms
-    tokenizer: TokenizerTraining
-    predictor: PredictorTraining

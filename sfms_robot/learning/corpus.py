@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, Floats
+from sfms_robot.frames import BLENDSHAPES, Floats
 from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.learning.datasets.collection import usable
+from sfms_robot.listeners.sfms.hearing import Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
-from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
+from sfms_robot.signals import phase as phases
 
 STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -27,16 +35,19 @@ class Corpus:
     Attributes:
         motion: (N, C) listener, in the motion space of the model.
         face: (N, C) speaker, likewise, 0 where unknown; face_known: (N,) bool.
-        mel: (N, 4, 128) half precision, natural log.
-        heard: (N,) bool.
+        sound: (N, R, bins) half precision, features of the speaker's voice; heard: (N,) bool.
+        phase: (N, F) where he is in a phrase.
+        begins: (N,) bool, the first frame of a dyad.
         lengths: frames of each dyad.
     """
 
     motion: Tensor
     face: Tensor
     face_known: Tensor
-    mel: Tensor
+    sound: Tensor
     heard: Tensor
+    phase: Tensor
+    begins: Tensor
     lengths: tuple[int, ...]
 
     def starts(self, window: int) -> Tensor:
@@ -47,25 +58,49 @@ class Corpus:
             at += length
         return torch.cat(firsts)
 
+    def to(self, device: torch.device) -> Corpus:
+        """The same frames on another device."""
+        tensors = ("motion", "face", "face_known", "sound", "heard", "phase", "begins")
+        return replace(self, **{name: getattr(self, name).to(device) for name in tensors})
 
-def gather(dyads: Sequence[Dyad], window: int, space: MotionSpace) -> Corpus:
-    """Stack dyads in one motion space; those shorter than a window are left out.
+    def fingerprint(self) -> dict[str, Any]:
+        """What tells one corpus from another, as plain data. The corpus must be on the CPU."""
+        digest = hashlib.blake2b(digest_size=8)
+        for part in (self.motion, self.face, self.sound, self.heard, self.phase):
+            digest.update(part.contiguous().numpy().data)
+        return {"dyads": len(self.lengths), "frames": len(self.motion), "digest": digest.hexdigest()}
 
+
+def gather(dyads: Sequence[Dyad], window: int, space: MotionSpace, hearing: Hearing | None = None) -> Corpus:
+    """Stack dyads in one motion space, read one at a time; those shorter than a window are left out and counted.
+
+    `hearing` says what is taken from the sound; None: nothing, and nobody is heard, which is enough for a tokenizer.
     Raises ConfigError when none is left, or one is in a space that cannot be turned into the wanted one.
     """
-    kept = [dyad for dyad in dyads if len(dyad.listener) >= window]
-    if not kept:
+    listeners, faces, sound, phase = [], [], [], []
+    for dyad in usable(dyads):
+        if len(dyad.listener) >= window:
+            listeners.append(_in_space(dyad, dyad.listener, space))
+            faces.append(_in_space(dyad, dyad.speaker, space))
+            rows, place = _heard(dyad, hearing)
+            sound.append(rows)
+            phase.append(place)
+    if not listeners:
         raise ConfigError(f"none of {len(dyads)} dyads is as long as a window of {window} frames")
-    face = torch.cat([_in_space(dyad, dyad.speaker, space) for dyad in kept])
+    if len(listeners) < len(dyads):
+        log.warning("%d of %d dyads are learned from: the others are under %d frames or cannot be used",
+                    len(listeners), len(dyads), window)  # fmt: skip
+    face = torch.cat(faces)
     known = face.isfinite().all(-1)
-    rows = [torch.from_numpy(mel.log_mel(dyad.audio, mel.start())[0]).half() for dyad in kept]
     return Corpus(
-        motion=torch.cat([_in_space(dyad, dyad.listener, space) for dyad in kept]),
+        motion=torch.cat(listeners),
         face=torch.where(known[:, None], face, 0.0),
         face_known=known,
-        mel=torch.cat(rows).view(-1, mel.ROWS_PER_FRAME, mel.MEL_BINS),
-        heard=torch.cat([_heard(dyad) for dyad in kept]),
-        lengths=tuple(len(dyad.listener) for dyad in kept),
+        sound=torch.cat(sound),
+        heard=torch.cat([torch.full((len(rows),), bool(rows.any())) for rows in sound]),
+        phase=torch.cat(phase),
+        begins=torch.cat([torch.arange(len(listener)) == 0 for listener in listeners]),
+        lengths=tuple(len(listener) for listener in listeners),
     )
 
 
@@ -81,14 +116,30 @@ def _in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
     return torch.from_numpy(out)
 
 
-def _heard(dyad: Dyad) -> Tensor:
-    """A dyad without any sound has no voice, rather than a silent one."""
-    frames = len(dyad.audio) // FRAME_SAMPLES
-    return torch.full((frames,), bool(dyad.audio.any()))
+def _heard(dyad: Dyad, hearing: Hearing | None) -> tuple[Tensor, Tensor]:
+    """Sound (N, R, bins) in half precision and phase (N, F): zeros without sound, which then nobody hears."""
+    frames = len(dyad.listener)
+    if hearing is None:
+        return torch.zeros(frames, 0, 0, dtype=torch.half), torch.zeros(frames, 0)
+    audio = dyad.audio if dyad.audio is not None and dyad.audio.any() else None  # zeros are no voice, not a still one
+    found: Floats | None = dyad.features.get(hearing.audio)
+    if found is None and hearing.audio == "mel" and (audio is not None or dyad.mel is not None):
+        found = dyad.mel_rows()
+    elif found is None and audio is not None:
+        found = hearing.rows(audio)
+    phase = np.zeros((frames, hearing.phase_features), np.float32)
+    if hearing.phased and audio is not None:
+        phase = phases.of_audio(audio)
+    elif hearing.phased and dyad.mel is not None:
+        phase = phases.of_mel(dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
+    sound = (
+        torch.zeros(frames, *hearing.shape) if found is None else torch.from_numpy(found).view(frames, *hearing.shape)
+    )
+    return sound.half(), torch.from_numpy(phase)
 
 
 def fit_scales(model: SfmsModel, corpus: Corpus, channels: Sequence[str]) -> None:
-    """Set the model's means, deviations and speeds.
+    """Set the means, deviations and speeds of the model's motion.
 
     Deviations are kept between what an eye just sees and what nobody misses: a still channel's noise is not blown up,
     and small movements of a channel that also makes large ones (a turning head) still count.
@@ -100,9 +151,16 @@ def fit_scales(model: SfmsModel, corpus: Corpus, channels: Sequence[str]) -> Non
     model.motion_speed.copy_(
         torch.stack([one.sort().values[int(0.9995 * len(one))] for one in steps.T]).clamp(min=0.05)
     )
-    rows = corpus.mel[:: max(1, len(corpus.mel) // 20_000)].float().flatten(0, 1)
-    model.mel_mean.copy_(rows.mean(0))
-    model.mel_std.copy_(rows.std(0).clamp(min=0.5))
+
+
+def fit_hearing(model: SfmsModel, corpus: Corpus) -> None:
+    """Set the means and deviations of the sound, a bin that hardly moves not blown up; without any they stay."""
+    rows = corpus.sound[corpus.heard]
+    if len(rows):
+        rows = rows[:: max(1, len(rows) // 20_000)].float().flatten(0, 1)
+        model.sound_mean.copy_(rows.mean(0))
+        spread = rows.std(0)
+        model.sound_std.copy_(spread.clamp(min=0.2 * float(spread.median())))
 
 
 def _spread(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -148,13 +206,33 @@ def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
     return values[starts[:, None] + torch.arange(length)]
 
 
-def context(model: SfmsModel, corpus: Corpus, tokens: Tensor, starts: Tensor, past: int) -> Context:
-    """What the predictor sees before the future of each window; `tokens` (N, G)."""
-    sound = windows(corpus.mel, starts, past).float().flatten(1, 2)
+def context(
+    model: SfmsModel,
+    corpus: Corpus,
+    tokens: Tensor,
+    starts: Tensor,
+    past: int,
+    future: int,
+    louder: Tensor | None = None,
+) -> Context:
+    """What the predictor sees at the seam of each window; `tokens` (N, G), those of the future undecided.
+
+    `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms.
+    """
+    index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it
+    heard = corpus.heard[index]
+    heard[:, 0] &= ~corpus.begins[starts]
+    sound = corpus.sound[index].float()
+    if louder is not None:
+        sound = sound + louder.view(-1, 1, 1, 1)
+    sound = torch.where(heard[..., None, None], model.standardise_sound(sound), 0.0)
+    own = windows(tokens, starts, past)
+    undecided = own.new_full((len(own), future, own.shape[2]), UNDECIDED)
     return Context(
         face=model.standardise(windows(corpus.face, starts, past)),
         face_known=windows(corpus.face_known, starts, past),
-        mel=model.standardise_mel(sound),
-        heard=windows(corpus.heard, starts, past),
-        tokens=windows(tokens, starts, past),
+        voice=model.predictor.speaker.listen(sound.flatten(1, 2)),
+        heard=heard[:, 1:],
+        phase=windows(corpus.phase, starts, past),
+        tokens=torch.cat([own, undecided], dim=1),
     )

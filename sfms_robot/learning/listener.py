@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.learning.calibrate import calibrated
-from sfms_robot.learning.corpus import Corpus, context, gather, windows
-from sfms_robot.learning.datasets import clips
+from sfms_robot.learning.corpus import Corpus, context, fit_hearing, gather, windows
+from sfms_robot.learning.datasets.formats import open_dataset
+from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.losses import next_tokens
+from sfms_robot.learning.losses_dtw import keyframe_dtw
+from sfms_robot.learning.resume import digest_of
 from sfms_robot.learning.tokenizer import WEIGHTS as TOKENIZER_WEIGHTS
 from sfms_robot.learning.tokens import tokenise
 from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.sfms.hearing import Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
@@ -26,37 +31,85 @@ from sfms_robot.listeners.sfms.stream import neutral_tokens
 from sfms_robot.listeners.space import MotionSpace
 
 CALIBRATION_DYADS = 8
+HELD_OUT_BATCHES, HELD_OUT_BATCH = 20, 64
 LN_PER_DB = math.log(10) / 10  # of power
 
 
 def train_listener(
-    settings: config.Training, data: Path, out: Path, each_step: Callable[[int, float], None] | None = None
-) -> dict[str, float]:
+    settings: config.Training,
+    data: Path,
+    out: Path,
+    run: Run = Run(),  # noqa: B008
+) -> dict[str, Any]:
     """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
 
-    Returns final and held-out loss. Ctrl-C saves what there is and goes on upward.
-    `each_step(step, loss)` is called after every step.
+    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on; the weights
+    are written when the run is finished.
     """
+    listener, space = settings.listener, MotionSpace.of(settings.listener)
+    dyads = open_dataset(data, "train")
+    hearing = Hearing.of(listener)
+    corpus = gather(dyads, listener.window_frames, space, hearing)
+    held_out = gather(open_dataset(data, "validation"), listener.window_frames, space, hearing)
     torch.manual_seed(settings.seed)
-    model = SfmsModel(settings.listener)
+    model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
-    dyads = clips.load(data / "train")
-    corpus = gather(dyads, settings.listener.window_frames, MotionSpace.of(settings.listener))
-    model.train()
-    try:
-        loss = _fit(model, corpus, settings, each_step)
-    finally:
-        checkpoint.save_config(out, corrected(settings))
-        checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
-    rounds = settings.predictor.calibration_rounds
-    some = dyads[:: max(1, len(dyads) // CALIBRATION_DYADS)][
-        :CALIBRATION_DYADS
-    ]  # of the training set: held out stays so
-    checkpoint.save_config(out, calibrated(corrected(settings), model, some, rounds))
-    held_out = gather(
-        clips.load(data / "validation"), settings.listener.window_frames, MotionSpace.of(settings.listener)
+    fit_hearing(model, corpus)
+    job = listener_job(settings, model, corpus, held_out, run.device)
+    outcome = fit(job, out, run)
+    last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
+    checkpoint.save_config(out, corrected(settings))
+    checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
+    some = dyads[:: max(1, len(dyads) // CALIBRATION_DYADS)][:CALIBRATION_DYADS]  # of the training set
+    model.cpu()  # roll-outs go frame by frame, which no GPU makes faster
+    checkpoint.save_config(out, calibrated(corrected(settings), model, some, settings.predictor.calibration_rounds))
+    scores = keyframe_scores(model, held_out, listener)
+    return {**asdict(outcome), "held_out_loss": last, **scores}
+
+
+def listener_job(
+    settings: config.Training, model: SfmsModel, corpus: Corpus, held_out: Corpus, device: torch.device
+) -> Job:
+    """Phase 2 as the loop takes it, on a model whose tokenizer is trained; moves the model to `device`."""
+    phase, listener = settings.predictor, settings.listener
+    starts = corpus.starts(listener.window_frames)
+    fingerprint = corpus.fingerprint()
+    neutral = neutral_tokens(model, MotionSpace.of(listener), listener.past_frames).to(device)
+    tokenizer_digest = digest_of(model.tokenizer)
+    model.to(device)
+    corpus, held_out = corpus.to(device), held_out.to(device)
+    tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
+
+    levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
+
+    def loss_of(step: int, generator: torch.Generator) -> Tensor:
+        chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
+        gain = None
+        if listener.audio == "mel":  # microphones differ
+            gain = (torch.rand(phase.batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
+            gain = gain.to(device)
+        seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain)
+        seen = augment(seen, levels, neutral, phase, generator)
+        target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
+        return _loss(model, seen, target, settings, generator)
+
+    return Job(
+        name="listener",
+        model=model,
+        optimizers=[optimizer(model.predictor.parameters(), phase.learning_rate, phase.weight_decay)],
+        loss_of=loss_of,
+        held_out=lambda: held_out_loss(model, held_out, settings, held_out_tokens),
+        frames_per_step=phase.batch * listener.window_frames,
+        phase=phase,
+        seed=settings.seed,
+        identity={
+            "seed": settings.seed,
+            "listener": listener.model_dump(mode="json"),
+            "predictor": phase.identity(),
+            "data": fingerprint,
+            "tokenizer weights": tokenizer_digest,
+        },
     )
-    return {"loss": loss, "held_out_loss": held_out_loss(model, held_out, settings)}
 
 
 def corrected(settings: config.Training) -> config.Sfms:
@@ -69,82 +122,108 @@ def corrected(settings: config.Training) -> config.Sfms:
     return settings.listener.model_copy(update={"groups": groups})
 
 
-def _fit(
-    model: SfmsModel,
-    corpus: Corpus,
-    settings: config.Training,
-    each_step: Callable[[int, float], None] | None,
-) -> float:
-    training, listener = settings.predictor, settings.listener
-    tokens = tokenise(model, corpus)
-    starts = corpus.starts(listener.window_frames)
-    neutral = neutral_tokens(model, MotionSpace.of(listener), listener.past_frames)
+def _loss(
+    model: SfmsModel, seen: Context, target: Tensor, settings: config.Training, generator: torch.Generator
+) -> Tensor:
+    """Cross-entropy (14) and soft-DTW on the future behind a random number of frames that are drawn already.
 
-    def loss_of(step: int) -> Tensor:
-        chosen = starts[torch.randint(len(starts), (training.batch,))]
-        seen = context(model, corpus, tokens, chosen, listener.past_frames)
-        seen = augment(seen, model.predictor.levels, neutral, training)
-        return _loss(model, seen, windows(tokens, chosen + listener.past_frames, listener.future_frames), settings)
-
-    optimizers = [optimizer(model.predictor.parameters(), training.learning_rate, training.weight_decay)]
-    frames = training.batch * listener.window_frames
-    return fit("listener", training.steps, loss_of, optimizers, training.clip_norm, frames, each_step)
-
-
-def _loss(model: SfmsModel, seen: Context, target: Tensor, settings: config.Training) -> Tensor:
-    """Loss (14) on the future frames behind a random number of given ones (0: the paper's parallel prediction)."""
-    b, h, _ = target.shape
-    given = torch.arange(h) < torch.randint(h, (b, 1))  # (B, H)
-    future = torch.where(given[..., None], target, UNDECIDED)
-    logits = model.predictor.decode(model.predictor.remember(seen), seen.tokens, future)
-    training = settings.predictor
+    None of them drawn is the paper's training; a stream of hop 4 plans with 4 of them drawn.
+    """
+    training, (b, h, _) = settings.predictor, target.shape
+    drawn = (torch.arange(h) < torch.randint(h, (b, 1), generator=generator)).to(target.device)  # (B, H)
+    future = torch.where(drawn[..., None], target, UNDECIDED)
+    seen = replace(seen, tokens=torch.cat([seen.tokens[:, :-h], future], dim=1))
+    logits = model.predictor.teacher_forced(seen, target)
     weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
-    return next_tokens(logits, target, ~given, training.transition_weight, weights)
+    loss = next_tokens(logits.unbind(-2), target, ~drawn, training.transition_weight, weights)
+    if training.dtw_weight:
+        key = (target > 0).float()
+        expected = 1 - torch.softmax(logits, dim=-1)[..., 0]
+        expected = torch.where(drawn[..., None], key, expected)
+        loss = loss + training.dtw_weight * keyframe_dtw(expected, key, training.dtw_gamma)
+    return loss
 
 
-def augment(seen: Context, levels: Tensor, neutral: Tensor, training: config.PredictorTraining) -> Context:
-    """Missing modalities, louder and softer voices, a cold start, and a past that is not quite what was meant."""
-    b, p, _ = seen.tokens.shape
-    gain = (torch.rand(b, 1, 1) * 2 - 1) * training.gain_db * LN_PER_DB
-    # Standardised bins differ little in scale; one shift for all stands for the gain.
-    mel = seen.mel + gain / 2.5
-    heard = seen.heard & (torch.rand(b, 1) >= training.drop_audio)
-    known = seen.face_known & (torch.rand(b, 1) >= training.drop_face)
-    tokens = perturb(seen.tokens, levels, training.history_noise)
+def augment(
+    seen: Context,
+    levels: Tensor | None,
+    neutral: Tensor,
+    training: config.PredictorTraining,
+    generator: torch.Generator | None = None,
+) -> Context:
+    """Missing modalities, a cold start, and a past that is not quite what was meant. `neutral` (P, G)."""
+    b, p = seen.heard.shape
+    device = seen.tokens.device
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator).to(device)
+
+    heard = seen.heard & (uniform(b, 1) >= training.drop_audio)
+    known = seen.face_known & (uniform(b, 1) >= training.drop_face)
+    past = perturb(seen.tokens[:, :p], levels, training.history_noise, generator)
     # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
-    cold = torch.rand(b, 1) < training.neutral_prefix
-    cut = torch.randint(1, p + 1, (b, 1))
-    before = cold & (torch.arange(p) < cut)
-    shifted = neutral[(torch.arange(p) - cut) % p]  # (B, P, G): its end at the cut
-    tokens = torch.where(before[..., None], shifted, tokens)
-    return replace(seen, mel=mel, heard=heard & ~before, face_known=known & ~before, tokens=tokens)
+    cold = uniform(b, 1) < training.neutral_prefix
+    cut = torch.randint(1, p + 1, (b, 1), generator=generator).to(device)
+    frame = torch.arange(p, device=device)
+    before = cold & (frame < cut)
+    shifted = neutral[(frame - cut) % p]  # (B, P, G): its end at the cut
+    past = torch.where(before[..., None], shifted, past)
+    tokens = torch.cat([past, seen.tokens[:, p:]], dim=1)
+    return replace(seen, heard=heard & ~before, face_known=known & ~before, tokens=tokens)
 
 
-def perturb(tokens: Tensor, levels: Tensor, share: float) -> Tensor:
-    """A share of the keyframes one level off in one dimension: in a roll-out the past is the model's own."""
+def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator | None = None) -> Tensor:
+    """A share of the keyframes one level off in one dimension: in a roll-out the past is the model's own.
+
+    Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
+    """
+    changed = (tokens > 0) & (torch.rand(tokens.shape, generator=generator).to(tokens.device) < share)
+    if levels is None:
+        return torch.where(changed, 0, tokens)
     codes = indices_to_codes((tokens - 1).clamp(min=0), levels)
     dims = levels.shape[1]
-    moved = torch.nn.functional.one_hot(torch.randint(dims, tokens.shape), dims) * (
-        torch.randint(2, tokens.shape)[..., None] * 2 - 1
-    )
+    dimension = torch.randint(dims, tokens.shape, generator=generator)
+    sign = torch.randint(2, tokens.shape, generator=generator)[..., None] * 2 - 1
+    moved = (torch.nn.functional.one_hot(dimension, dims) * sign).to(tokens.device)
     noisy = (codes + moved * 2 / (levels - 1)).clamp(-1.0, 1.0)
-    changed = (tokens > 0) & (torch.rand(tokens.shape) < share)
     return torch.where(changed, codes_to_indices(noisy, levels) + 1, tokens)
 
 
 @torch.no_grad()
-def held_out_loss(model: SfmsModel, corpus: Corpus, settings: config.Training, batches: int = 20) -> float:
-    """Loss (14) without augmentation on windows drawn with a fixed seed."""
-    listener = settings.listener
+def held_out_loss(model: SfmsModel, corpus: Corpus, settings: config.Training, tokens: Tensor | None = None) -> float:
+    """The loss without augmentation on windows drawn with a fixed seed; `tokens` (N, G) of the corpus, if at hand."""
+    model.eval()
+    tokens = tokenise(model, corpus) if tokens is None else tokens
+    generator = torch.Generator().manual_seed(0)
+    losses = [
+        float(_loss(model, seen, target, settings, generator))
+        for seen, target in some_windows(model, corpus, tokens, settings.listener, generator)
+    ]
+    return sum(losses) / len(losses)
+
+
+def some_windows(
+    model: SfmsModel, corpus: Corpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
+) -> Iterator[tuple[Context, Tensor]]:
+    """Batches of contexts and the tokens (B, H, G) that came next."""
+    starts = corpus.starts(listener.window_frames)
+    past, future = listener.past_frames, listener.future_frames
+    for _ in range(HELD_OUT_BATCHES):
+        chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
+        yield context(model, corpus, tokens, chosen, past, future), windows(tokens, chosen + past, future)
+
+
+@torch.no_grad()
+def keyframe_scores(model: SfmsModel, corpus: Corpus, listener: config.Sfms) -> dict[str, float]:
+    """Recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
+
+    All groups and future frames pooled, on windows drawn with a fixed seed.
+    """
     model.eval()
     tokens = tokenise(model, corpus)
-    starts = corpus.starts(listener.window_frames)
-    total = 0.0
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        for _ in range(batches):
-            chosen = starts[torch.randint(len(starts), (64,))]
-            seen = context(model, corpus, tokens, chosen, listener.past_frames)
-            target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
-            total += float(_loss(model, seen, target, settings))
-    return total / batches
+    hit = said = true = 0
+    for seen, target in some_windows(model, corpus, tokens, listener, torch.Generator().manual_seed(0)):
+        expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
+        key = target > 0
+        hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())
+    return {"keyframe_recall": hit / max(1, true), "keyframe_precision": hit / max(1, said)}

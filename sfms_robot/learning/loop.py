@@ -1,19 +1,34 @@
-"""The training loop both phases share: one loss function, any number of optimizers, cosine rates, a progress bar."""
+"""The training loop every model shares: `fit` runs a `Job` to its end and survives whatever interrupts it.
+
+One step: draw data, loss, gradients, clip, AdamW with a warmed-up cosine rate. Between steps: the held-out loss with
+early stop, and checkpoints from which a run goes on bit for bit (on a CPU). How to write a trainer: `learning.job`.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Iterable, Sequence
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from torch import Tensor, nn
+from torch import nn
 
-from sfms_robot.errors import ModelError
+from sfms_robot import config
+from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.learning import resume
+from sfms_robot.learning.job import Job, Outcome, Position, Report, Run
 
-WARM_UP_STEPS = 100
 SMOOTHING = 0.98  # of the loss that is shown
+SPEED_SMOOTHING = 0.9
+
+log = logging.getLogger(__name__)
 
 
 def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> torch.optim.Optimizer:
@@ -21,62 +36,165 @@ def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> 
     return torch.optim.AdamW(parameters, lr=rate, betas=(0.9, 0.98), weight_decay=decay)
 
 
-def fit(
-    title: str,
-    steps: int,
-    loss_of: Callable[[int], Tensor],
-    optimizers: Sequence[torch.optim.Optimizer],
-    clip_norm: float,
-    frames_per_step: int,
-    each_step: Callable[[int, float], None] | None = None,
-) -> float:
-    """Run `steps` steps of `loss_of(step)`; returns the smoothed loss at the end. `each_step(step, loss)` looks on.
+def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> Outcome:  # noqa: B008
+    """Run `job` to its last step or until its patience ends; the model then holds its best weights.
 
-    Raises ModelError as soon as a loss or gradient is not finite. KeyboardInterrupt passes through: the caller saves.
+    Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` goes on from there, and a run that had finished
+    only restores its weights. Ctrl-C ends the step, writes a checkpoint and raises KeyboardInterrupt with a line for
+    the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite: the last
+    checkpoint stays. `clock` (s) decides when to write checkpoints and how fast frames go, and no weights.
     """
-    base = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
-    smooth, speed = math.nan, 0.0
-    with _progress() as progress:
-        task = progress.add_task(title, total=steps, loss=math.nan, speed=0.0)
-        for step in range(steps):
-            for one, rate in zip(optimizers, base, strict=True):
-                one.param_groups[0]["lr"] = rate * _schedule(step, steps)
-                one.zero_grad(set_to_none=True)
-            loss = loss_of(step)
-            loss.backward()  # type: ignore[no-untyped-call]
-            norms = [_clip(one, clip_norm) for one in optimizers]
-            value = loss.item()
-            if not math.isfinite(value) or not all(map(math.isfinite, norms)):
-                raise ModelError(f"{title}: loss {value:g}, gradient norm {max(norms):g} at step {step}: not finite")
-            for one in optimizers:
-                one.step()
-            smooth = value if step == 0 else SMOOTHING * smooth + (1 - SMOOTHING) * value
-            speed = frames_per_step * (progress.tasks[0].speed or 0.0)
-            if each_step is not None:
-                each_step(step, value)
-            progress.update(task, advance=1, loss=smooth, speed=speed)
-    return smooth
+    file = resume.checkpoint_file(out, job.name)
+    try:
+        out.mkdir(parents=True, exist_ok=True)  # hours before it is needed
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
+    generator = torch.Generator().manual_seed(job.seed)
+    torch.manual_seed(job.seed)  # dropout does not depend on what was drawn before
+    base = [[group["lr"] for group in one.param_groups] for one in job.optimizers]
+    position, best = Position(), None
+    if run.resume:
+        position, best = resume.load(file, job, generator)
+    elif (left := resume.peek(file)) is not None and not left.finished:
+        log.warning("%s: was at step %d, begins anew; --resume would have gone on", file, left.step)
+    began_at = position.step
 
+    saved_s = before_s = clock()
+    frames_per_s = 0.0
+    job.model.train()
+    with _interruptions() as interrupted:
+        while not position.finished:
+            rate = _set_rates(job, base, position.step)
+            loss, norm = _step(job, position.step, generator, file)
+            smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
+            position = replace(position, step=position.step + 1, loss=smooth)
+            looked = _look_is_due(job, position.step)
+            if looked:
+                position = _compared(position, _held_out(job))
+                best = resume.weights_of(job) if position.worse == 0 else best
+            position = replace(position, finished=_over(job.phase, position))
 
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("loss {task.fields[loss]:.4f}  {task.fields[speed]:,.0f} frames/s"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),  # stdout is for figures
+            now_s = clock()
+            frames_per_s = _speed(frames_per_s, job.frames_per_step, now_s - before_s)
+            before_s = now_s
+            run.watch(Report(job.name, job.phase.steps, position, loss, norm, rate, frames_per_s, looked))
+            if interrupted() or _save_is_due(job.phase, position, now_s - saved_s):
+                resume.save(file, job, position, generator, best)
+                saved_s = now_s
+            if interrupted():
+                raise KeyboardInterrupt(
+                    f"{job.name}: interrupted after step {position.step} of {job.phase.steps}, saved in {file}; "
+                    "the same command with --resume goes on"
+                )
+    if best is not None:
+        job.model.load_state_dict(best)
+    return Outcome(
+        loss=math.nan if position.loss is None else position.loss,
+        held_out=position.best,
+        steps=position.step,
+        best_step=position.best_step if best is not None else position.step,
+        stopped="steps" if position.step == job.phase.steps else "patience",
+        resumed_at=began_at if run.resume else None,
     )
 
 
-def _schedule(step: int, steps: int) -> float:
-    """Linear warm-up, then cosine to zero."""
-    warm = min(WARM_UP_STEPS, max(1, steps // 10))
+def schedule(step: int, phase: config.Phase) -> float:
+    """Share of the learning rate at `step`: linear warm-up, then cosine to zero (V-A; the warm-up is ours)."""
+    warm = min(phase.warm_up_steps, max(1, phase.steps // 10))
     if step < warm:
         return (step + 1) / warm
-    return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, steps - warm)))
+    return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, phase.steps - warm)))
+
+
+def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
+    """Rates of `step` from those the optimizers were made with; returns the first."""
+    share = schedule(step, job.phase)
+    for one, rates in zip(job.optimizers, base, strict=True):
+        for group, rate in zip(one.param_groups, rates, strict=True):
+            group["lr"] = rate * share
+    return base[0][0] * share
+
+
+def _step(job: Job, step: int, generator: torch.Generator, file: Path) -> tuple[float, float]:
+    """One update of the weights; returns loss and largest gradient norm. Nothing is updated when one is not finite."""
+    for one in job.optimizers:
+        one.zero_grad(set_to_none=True)
+    on_gpu = job.device.type == "cuda"
+    with torch.autocast(job.device.type, torch.bfloat16, enabled=on_gpu and job.phase.precision == "bf16"):
+        loss = job.loss_of(step, generator)
+    loss.backward()  # type: ignore[no-untyped-call]
+    norm = max(_clip(one, job.phase.clip_norm) for one in job.optimizers)
+    value = loss.item()
+    if not math.isfinite(value) or not math.isfinite(norm):
+        left = resume.peek(file)
+        kept = f"{file} holds step {left.step}" if left is not None else "there is no checkpoint yet"
+        raise ModelError(f"{job.name}: loss {value:g}, gradient norm {norm:g} at step {step}: not finite ({kept})")
+    for one in job.optimizers:
+        one.step()
+    return value, norm
 
 
 def _clip(one: torch.optim.Optimizer, norm: float) -> float:
     parameters = [p for group in one.param_groups for p in group["params"] if p.grad is not None]
     return float(nn.utils.clip_grad_norm_(parameters, norm)) if parameters else 0.0
+
+
+def _look_is_due(job: Job, step: int) -> bool:
+    if job.held_out is None or job.phase.evaluate_every == 0:
+        return False
+    return step % job.phase.evaluate_every == 0 or step == job.phase.steps
+
+
+def _held_out(job: Job) -> float:
+    """The held-out loss, leaving random states and the model's mode as they were. Raises ModelError if not finite."""
+    if job.held_out is None:
+        raise ValueError(f"{job.name} has nothing held out")
+    job.model.eval()
+    devices = [job.device] if job.device.type == "cuda" else []
+    with torch.random.fork_rng(devices), torch.no_grad():
+        value = float(job.held_out())
+    job.model.train()
+    if not math.isfinite(value):
+        raise ModelError(f"{job.name}: held-out loss {value:g}: not finite")
+    return value
+
+
+def _compared(position: Position, held_out: float) -> Position:
+    if position.best is None or held_out < position.best:
+        return replace(position, held_out=held_out, best=held_out, best_step=position.step, worse=0)
+    return replace(position, held_out=held_out, worse=position.worse + 1)
+
+
+def _over(phase: config.Phase, position: Position) -> bool:
+    return position.step >= phase.steps or (phase.patience is not None and position.worse >= phase.patience)
+
+
+def _save_is_due(phase: config.Phase, position: Position, since_s: float) -> bool:
+    return position.finished or position.step % phase.checkpoint_every == 0 or since_s >= 60 * phase.checkpoint_minutes
+
+
+def _speed(frames_per_s: float, frames: int, took_s: float) -> float:
+    if took_s <= 0:
+        return frames_per_s
+    now = frames / took_s
+    return now if frames_per_s == 0 else SPEED_SMOOTHING * frames_per_s + (1 - SPEED_SMOOTHING) * now
+
+
+@contextmanager
+def _interruptions() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C was pressed; inside, the first one only raises the flag. Signals reach the main thread alone."""
+    pressed = threading.Event()
+
+    def press(number: int, frame: FrameType | None) -> None:
+        pressed.set()
+        signal.signal(signal.SIGINT, before)  # the second one does what it always did
+
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed.is_set
+        return
+    before = signal.getsignal(signal.SIGINT) or signal.default_int_handler
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,87 @@
+"""Behind `train`: a configuration and a data folder in, weights and figures out, watched while it runs."""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sfms_robot import config
+from sfms_robot.config import load, parse
+from sfms_robot.errors import ConfigError
+from sfms_robot.learning import listener, tokenizer
+from sfms_robot.learning.job import Run
+from sfms_robot.learning.watch import Watch, progress_bar, tensorboard, together
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What the command line says. `steps` and `placement` replace the file's; `tensorboard` None: if installed."""
+
+    file: Path
+    data: Path
+    out: Path
+    resume: bool = False
+    device: str = "auto"
+    steps: int | None = None
+    placement: str | None = None
+    tensorboard: bool | None = None
+
+
+def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
+    """Phase 1. Returns its figures and minutes."""
+    settings = _settings(options, "tokenizer")
+    with _run(options) as run:
+        began_s = time.monotonic()
+        return _timed(tokenizer.train_tokenizer(settings, options.data, options.out, run), began_s)
+
+
+def train_listener(options: TrainOptions) -> dict[str, Any]:
+    """Phase 2, on the tokenizer in `options.out`. Returns its figures and minutes."""
+    settings = _settings(options, "predictor")
+    with _run(options) as run:
+        began_s = time.monotonic()
+        return _timed(listener.train_listener(settings, options.data, options.out, run), began_s)
+
+
+def device_of(name: str) -> torch.device:
+    """`cpu`, `cuda`, or `auto`: the GPU if there is one. Raises ConfigError."""
+    if name not in DEVICES:
+        raise ConfigError(f"--device {name!r} is not one of {', '.join(DEVICES)}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("--device cuda: torch sees no CUDA device here (auto, cpu)")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _settings(options: TrainOptions, phase: str) -> config.Training:
+    settings = load(config.Training, options.file)
+    raw = settings.model_dump(mode="json")
+    if options.placement is not None:
+        raw["listener"]["placement"] = options.placement
+    if options.steps is not None:
+        raw[phase]["steps"] = options.steps
+    return parse(config.Training, raw, options.file)
+
+
+@contextmanager
+def _run(options: TrainOptions) -> Iterator[Run]:
+    device = device_of(options.device)
+    with ExitStack() as stack:
+        watches: list[Watch] = []
+        installed = importlib.util.find_spec("tensorboard") is not None
+        if options.tensorboard or (options.tensorboard is None and installed):
+            watches.append(stack.enter_context(tensorboard(options.out / "tensorboard")))
+        watches.append(stack.enter_context(progress_bar()))
+        yield Run(options.resume, device, together(watches))
+
+
+def _timed(figures: dict[str, Any], began_s: float) -> dict[str, Any]:
+    return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)}

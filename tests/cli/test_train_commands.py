@@ -1,0 +1,236 @@
+"""`train` on a few seconds of made-up conversation: figures out, one line for whatever is wrong, Ctrl-C and back."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from sfms_robot.cli.main import main
+from sfms_robot.data import data_dir
+from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
+from sfms_robot.learning.datasets import clips
+
+FRAMES = 110
+START = "from sfms_robot.cli.main import main; main()"
+
+
+def dyad(name: str, seed: int) -> clips.Dyad:
+    rng = np.random.default_rng(seed)
+    motion = (0.2 + 0.1 * np.sin(np.arange(FRAMES)[:, None] / 6 + rng.uniform(0, 6, 58))).astype(np.float32)
+    audio = rng.normal(0, 0.05, FRAMES * FRAME_SAMPLES).astype(np.float32)
+    return clips.Dyad(name, audio, motion[::-1].copy(), motion, np.ones(FRAMES, bool))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    clips.save(folder / "train", [dyad("a", 0)])
+    clips.save(folder / "validation", [dyad("b", 1)])
+    return folder
+
+
+def tiny() -> dict:
+    phase = {"steps": 6, "batch": 4, "learning_rate": 0.005, "evaluate_every": 3}
+    return {
+        "seed": 2,
+        "listener": {
+            "kind": "sfms",
+            "placement": "static",
+            "groups": {
+                "neck": {"channels": list(POSE_CHANNELS), "levels": [3, 3], "keyframes": 6},
+                "face": {"channels": list(BLENDSHAPES), "levels": [3, 3], "keyframes": 6},
+            },
+            "tokenizer_width": 8,
+            "predictor_width": 8,
+            "predictor_layers": 1,
+            "heads": 2,
+        },
+        "tokenizer": dict(phase),
+        "predictor": phase | {"calibration_rounds": 0},
+    }
+
+
+@pytest.fixture
+def arguments(tmp_path, data):
+    """Flags of a tiny training, the changed configuration written to a file."""
+
+    def write(raw=None) -> list[str]:
+        file = tmp_path / "tiny.yaml"
+        file.write_text(yaml.safe_dump(raw or tiny(), sort_keys=False))
+        return ["--config", str(file), "--data", str(data), "--out", str(tmp_path / "out"), "--device", "cpu"]
+
+    return write
+
+
+@pytest.fixture
+def fails(capsys):
+    """Run a command line that must fail; gives exit code and the one line on stderr."""
+
+    def run(*words: str) -> tuple[object, str]:
+        with pytest.raises(SystemExit) as ended:
+            main(["train", *words])
+        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("sfms-robot:")]
+        assert len(told) == 1, told
+        return ended.value.code, told[0]
+
+    return run
+
+
+def done(capsys, *words: str) -> tuple[dict, str]:
+    """Figures and stderr of a `train` command that ends well."""
+    with pytest.raises(SystemExit) as ended:
+        main(["train", *words, "--json"])
+    assert ended.value.code == 0
+    told = capsys.readouterr()
+    return json.loads(told.out.splitlines()[-1]), told.err
+
+
+def test_both_phases_give_figures_and_a_folder_that_runs(capsys, arguments, tmp_path):
+    first, bar = done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+    assert first["steps"] == 6 and first["mse"] > 0 and first["stopped"] == "steps" and "loss" in bar
+    second, _ = done(capsys, "listener", *arguments(), "--no-tensorboard", "--steps", "4")
+    assert second["steps"] == 4 and second["held_out_loss"] > 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"config.yaml", "tokenizer.safetensors", "model.safetensors"} <= names
+    assert {"checkpoint-tokenizer.safetensors", "checkpoint-listener.safetensors"} <= names
+    assert "tensorboard" not in names
+
+
+def test_curves_go_to_tensorboard(capsys, arguments, tmp_path):
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    done(capsys, "tokenizer", *arguments(), "--tensorboard")
+    curves = events.EventAccumulator(str(tmp_path / "out" / "tensorboard" / "tokenizer"))
+    curves.Reload()
+    assert {"loss", "held_out_loss", "learning_rate", "frames_per_s"} <= set(curves.Tags()["scalars"])
+    assert [point.step for point in curves.Scalars("held_out_loss")] == [3, 6]
+
+
+def test_curves_that_were_asked_for_name_the_missing_extra(arguments):
+    without = f"import sys; sys.modules['tensorboard'] = None; {START}"
+    command = [sys.executable, "-c", without, "train", "tokenizer", *arguments(), "--tensorboard"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr == "sfms-robot: --tensorboard needs an optional part: pip install 'sfms-robot[train]'\n"
+
+
+def test_a_finished_run_says_so(capsys, arguments):
+    before, _ = done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+    after, told = done(capsys, "tokenizer", *arguments(), "--no-tensorboard", "--resume")
+    assert "had already finished at step 6" in told
+    assert after["mse"] == before["mse"] and after["resumed_at"] == 6
+
+
+def test_nothing_to_resume(fails, arguments):
+    code, told = fails("tokenizer", *arguments(), "--resume")
+    assert code == 2 and "checkpoint-tokenizer.safetensors: no checkpoint to resume from" in told
+
+
+def test_a_checkpoint_of_another_configuration(capsys, fails, arguments):
+    done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+    raw = tiny()
+    raw["listener"]["tokenizer_width"] = 16
+    code, told = fails("tokenizer", *arguments(raw), "--resume")
+    assert code == 2 and "listener.tokenizer_width = 8 there, 16 now" in told
+
+
+def test_phase_2_without_phase_1(fails, arguments):
+    code, told = fails("listener", *arguments())
+    assert code == 5 and "tokenizer.safetensors: no such weights file" in told
+
+
+def test_ctrl_c_saves_says_how_to_go_on_and_exits_130(arguments, tmp_path):
+    raw = tiny()
+    raw["tokenizer"] |= {"steps": 1_000_000, "checkpoint_every": 5}
+    command = [sys.executable, "-c", START, "train", "tokenizer", *arguments(raw), "--no-tensorboard"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
+        while not (tmp_path / "out" / "checkpoint-tokenizer.safetensors").exists():
+            with pytest.raises(subprocess.TimeoutExpired):  # it runs on
+                running.wait(timeout=0.1)
+        running.send_signal(signal.SIGINT)
+        told = running.communicate()[1]
+    assert running.returncode == 130
+    assert "tokenizer: interrupted after step" in told and "of 1000000" in told and "--resume goes on" in told
+    assert "Traceback" not in told
+    assert not (tmp_path / "out" / "tokenizer.safetensors").exists()
+
+
+WRONG = [
+    ("tokenizer.steps", 0, "tokenizer.steps = 0"),
+    ("tokenizer.steps", "many", "tokenizer.steps = 'many'"),
+    ("tokenizer.batch", 1.5, "tokenizer.batch = 1.5"),
+    ("tokenizer.learning_rate", -1, "tokenizer.learning_rate = -1"),
+    ("tokenizer.learning_rate", float("nan"), "tokenizer.learning_rate = nan"),
+    ("tokenizer.score_learning_rate", 0, "tokenizer.score_learning_rate = 0"),
+    ("tokenizer.weight_decay", -0.1, "tokenizer.weight_decay = -0.1"),
+    ("tokenizer.warm_up_steps", -1, "tokenizer.warm_up_steps = -1"),
+    ("tokenizer.clip_norm", 0, "tokenizer.clip_norm = 0"),
+    ("tokenizer.precision", "fp16", "tokenizer.precision = 'fp16': Input should be 'fp32' or 'bf16'"),
+    ("tokenizer.evaluate_every", -1, "tokenizer.evaluate_every = -1"),
+    ("tokenizer.patience", 0, "tokenizer.patience = 0"),
+    ("tokenizer.checkpoint_every", 0, "tokenizer.checkpoint_every = 0"),
+    ("tokenizer.checkpoint_minutes", 0, "tokenizer.checkpoint_minutes = 0"),
+    ("tokenizer.mask_loss", -1, "tokenizer.mask_loss = -1"),
+    ("tokenizer.velocity_loss", -1, "tokenizer.velocity_loss = -1"),
+    ("tokenizer.temperature", [2.0], "tokenizer.temperature"),
+    ("tokenizer.temperature", [2.0, 0.0], "tokenizer.temperature.1 = 0.0"),
+    ("tokenizer.stpes", 5, "'stpes' is not a known key (steps, batch,"),
+    ("predictor.transition_weight", 0, "predictor.transition_weight = 0"),
+    ("predictor.neutral_prefix", 1.1, "predictor.neutral_prefix = 1.1"),
+    ("predictor.drop_audio", -1, "predictor.drop_audio = -1"),
+    ("predictor.drop_face", 2, "predictor.drop_face = 2"),
+    ("predictor.history_noise", 2, "predictor.history_noise = 2"),
+    ("predictor.gain_db", -6, "predictor.gain_db = -6"),
+    (
+        "predictor.group_weights",
+        {"chin": 2},
+        "predictor.group_weights: 'chin' is not a group of the listener (neck, face)",
+    ),
+    ("predictor.group_weights", {"neck": 0}, "predictor.group_weights.neck = 0"),
+    ("predictor.calibration_rounds", -1, "predictor.calibration_rounds = -1"),
+    ("seed", -1, "seed = -1"),
+    ("listener.kind", "other", "listener.kind = 'other'"),
+    ("predictor", None, "predictor"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "told"), WRONG, ids=[f"{key}={value}" for key, value, _ in WRONG])
+def test_a_wrong_training_key_is_one_line(fails, arguments, key, value, told):
+    raw = tiny()
+    *path, last = key.split(".")
+    where = raw[path[0]] if path else raw
+    where[last] = value
+    code, line = fails("tokenizer", *arguments(raw))
+    assert code == 2 and told in line and "tiny.yaml" in line
+
+
+def test_patience_without_looking(fails, arguments):
+    raw = tiny()
+    raw["tokenizer"] |= {"evaluate_every": 0, "patience": 3}
+    code, line = fails("tokenizer", *arguments(raw))
+    assert code == 2 and "patience 3 needs evaluate_every above 0" in line
+
+
+def test_the_shipped_configuration_is_valid():
+    from sfms_robot import config
+
+    for file in (data_dir("configs") / "training").glob("sfms-*.yaml"):
+        assert config.load(config.Training, file).tokenizer.steps > 0
+
+
+def test_a_gpu_that_is_not_there(fails, arguments):
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    code, line = fails("tokenizer", *arguments(), "--device", "cuda")
+    assert code == 2 and "--device cuda: torch sees no CUDA device here (auto, cpu)" in line
+
+
+def test_the_interrupt_handler_survives_a_training(capsys, arguments):
+    before = signal.getsignal(signal.SIGINT)
+    done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+    assert signal.getsignal(signal.SIGINT) is before
