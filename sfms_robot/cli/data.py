@@ -1,18 +1,19 @@
-"""`sfms-robot data`: make training data."""
+"""`sfms-robot data`: make training data, and look at what somebody else made."""
 
 from __future__ import annotations
 
 import json as json_module
+from enum import StrEnum
 from pathlib import Path
 
 import typer
 
-app = typer.Typer(help="Training data: compose dyads.", no_args_is_help=True)
+app = typer.Typer(help="Training data: compose dyads, check data sets.", no_args_is_help=True)
 
 
-@app.callback()
-def _group() -> None:
-    """Keeps `compose` a subcommand while it is the only one."""
+class Order(StrEnum):
+    exp_first = "exp-first"
+    pose_first = "pose-first"
 
 
 @app.command()
@@ -29,3 +30,28 @@ def compose(
     figures = compose_dyads(data, out, minutes, seed)
     if json:
         print(json_module.dumps(figures))
+
+
+@app.command()
+def check(
+    folder: Path = typer.Argument(..., metavar="DIR", help="A data set, as its authors lay it out."),
+    layout: str = typer.Option(
+        "auto", help="composed, l2l, lm_listener, react, react2025, dualtalk, dim, vico; found by itself if not said."
+    ),
+    order: Order | None = typer.Option(None, help="Order of the channels in the files, if not the layout's own."),
+    window: int = typer.Option(0, min=0, help="Frames that a clip must have."),
+    channels: bool = typer.Option(False, "--channels", help="Show the range of every channel."),
+    json: bool = typer.Option(False, "--json", help="Print everything found as one JSON object."),
+) -> None:
+    """Read a whole data set once: what is there, and everything that is wrong with it."""
+    from sfms_robot.app.data_check import check_data
+
+    report = check_data(folder, layout, order.value if order else None, window)
+    if json:
+        print(json_module.dumps(report))
+    else:
+        from sfms_robot.cli.data_tables import print_check
+
+        print_check(report, channels)
+    if not report["usable"]:
+        raise typer.Exit(2)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +24,11 @@ WIDTHS: Final[Mapping[str, int]] = {
     "faceverse58-centred": 58,  # less a mean face: how far from it, not where
     "deep3d73": 73,  # Deep3DFaceRecon: angle 3 | expression 64 | translation 3 | crop 3
 }
+# What reading a broken file may raise; numpy parses the headers of its files as Python literals.
+UNREADABLE: Final = (
+    OSError, ValueError, KeyError, IndexError, TypeError, EOFError, NotImplementedError, SyntaxError,
+    tokenize.TokenError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 _FEATURE: Final = "feature."  # key prefix on disk
 
 
@@ -87,7 +95,8 @@ class Dyad:
             return rows
         ratio = AUDIO_HZ / log_mel.HOP / (log_mel.ROWS_PER_FRAME * self.fps)
         newest = np.floor((np.arange(wanted) + 1) * ratio + 1e-6).astype(int) - 1
-        return rows[newest.clip(0, len(rows) - 1)]
+        chosen: Floats = rows[newest.clip(0, len(rows) - 1)]
+        return chosen
 
 
 def samples_of(frames: int, fps: float) -> int:
@@ -129,7 +138,7 @@ def load(folder: Path) -> list[Dyad]:
 def read(file: Path) -> Dyad:
     """One dyad as `save` wrote it. Raises ConfigError."""
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             return Dyad(
                 file.stem,
                 arrays["audio"].astype(np.float32) / 32767 if "audio" in arrays else None,
@@ -141,5 +150,5 @@ def read(file: Path) -> Dyad:
                 arrays["mel"].astype(np.float32) if "mel" in arrays else None,
                 {key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
             )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error

@@ -117,10 +117,11 @@ def dyads(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: 
         annotated = [person for person in people[split] if person.gaze is not None]
         for stretch in choose(stretches(people[split], rng), wanted, rng):
             lender = annotated[int(rng.integers(len(annotated)))] if annotated else None
-            yield split, compose_one(stretch, lender, _cast(spoken[split], rng), moves[split], rng)
+            yield split, compose_one(stretch, lender, cast(spoken[split], rng), moves[split], rng)
 
 
-def _cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
+def cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
+    """A voice by lot, mostly one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
     return fitting[int(rng.integers(len(fitting)))]
@@ -138,11 +139,11 @@ def stretches(people: Sequence[Person], rng: np.random.Generator) -> list[Stretc
             length = FRAME_S * round(float(rng.uniform(*LENGTH_S)) * FRAME_HZ)
             piece = Stretch(person, at, at + length)
             at += length
-            own, others = (_active(spans, piece) for spans in (person.talk, person.others))
+            own, others = (active(spans, piece) for spans in (person.talk, person.others))
             listening = listening_mask(others, FRAME_HZ, own)
-            if own.mean() > 0.2 or listening.mean() < 0.6 or _active(person.unseen, piece).any():
+            if own.mean() > 0.2 or listening.mean() < 0.6 or active(person.unseen, piece).any():
                 continue
-            onsets = _within(person.nods, piece)[:, 0]
+            onsets = within(person.nods, piece)[:, 0]
             rate = nods_per_minute(onsets, listening, FRAME_HZ)
             answers = phrase_end_counts(onsets, phrase_ends(others, FRAME_HZ), listening, FRAME_HZ)[0]
             found.append(replace(piece, nods_per_minute=rate, answers=answers))
@@ -173,32 +174,33 @@ def compose_one(
 ) -> Dyad:
     """One stretch, acted and voiced. `lender` gives his looks where those of this meeting were not annotated."""
     person, frames = stretch.person, stretch.frames
-    others, own = _active(person.others, stretch), _active(person.talk, stretch)
+    others, own = active(person.others, stretch), active(person.talk, stretch)
     score = Score(
         frames,
-        nods=_within(person.nods, stretch),
-        shakes=_within(person.shakes, stretch),
-        tilts=_within(person.tilts, stretch),
-        laughs=_within(person.laughs, stretch),
-        talk=_within(person.talk, stretch),
-        backchannels=_within(person.backchannels, stretch),
+        nods=within(person.nods, stretch),
+        shakes=within(person.shakes, stretch),
+        tilts=within(person.tilts, stretch),
+        laughs=within(person.laughs, stretch),
+        talk=within(person.talk, stretch),
+        backchannels=within(person.backchannels, stretch),
         gaze=_looks(stretch, lender, rng),
-        shared_laughs=_within(person.others_laughs, stretch),
+        shared_laughs=within(person.others_laughs, stretch),
         asked=person.asked[(person.asked > stretch.start_s) & (person.asked < stretch.end_s)] - stretch.start_s,
         ends=phrase_ends(others, FRAME_HZ),
     )
-    said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
-    speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
+    audio, face = speaker_of(stretch, voice, motions, rng)
+    return Dyad(stretch.name, audio, face, listener_motion(score, motions, rng), listening_mask(others, FRAME_HZ, own))
+
+
+def speaker_of(stretch: Stretch, voice: Voice, motions: Motions, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """What is heard and seen of the others: audio (N * 640,), face (N, 58), rows of NaN for a voice without one."""
+    said = np.clip(stretch.person.others - stretch.start_s, 0, stretch.frames * FRAME_S)
+    speech, mouth = lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
     faceless = mouth is None or rng.random() < _FACELESS
-    return Dyad(
-        stretch.name,
-        _recorded(speech, voice, rng),
-        np.full((frames, MOTION_DIM), np.nan, np.float32)
-        if faceless or mouth is None
-        else speaker_motion(mouth, motions, rng),
-        listener_motion(score, motions, rng),
-        listening_mask(others, FRAME_HZ, own),
-    )
+    audio = _recorded(speech, voice, rng)
+    if mouth is None or faceless:
+        return audio, np.full((stretch.frames, MOTION_DIM), np.nan, np.float32)
+    return audio, speaker_motion(mouth, motions, rng)
 
 
 def _recorded(speech: Floats, voice: Voice, rng: np.random.Generator) -> Floats:
@@ -237,7 +239,7 @@ def _where(person: Person, start: float, end: float, target: str) -> str | None:
     return None if heard else f"side {target}"
 
 
-def _active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
+def active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
     """(N,) frames whose middle lies in a span."""
     out = np.zeros(stretch.frames, bool)
     for start, end in spans[(spans[:, 1] > stretch.start_s) & (spans[:, 0] < stretch.end_s)]:
@@ -246,7 +248,7 @@ def _active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
     return out
 
 
-def _within(spans: Doubles, stretch: Stretch) -> Doubles:
+def within(spans: Doubles, stretch: Stretch) -> Doubles:
     """Spans that begin inside, in seconds of the stretch, with room to be seen before its end."""
     inside = (spans[:, 0] >= stretch.start_s) & (spans[:, 0] < stretch.end_s - 0.5)
     return spans[inside] - stretch.start_s

@@ -1,0 +1,87 @@
+"""The 78 numbers a frame that REACT's baselines hear: Kaldi MFCCs of each 40 ms on its own, no past and no future.
+
+A frame gives two windows of 25 ms, 10 ms apart; 13 cepstra each (the first is log energy), their deltas and the deltas
+of these, flattened as (3, 13, 2). As reactmultimodalchallenge/baseline_react2023 @ c5a8ff85 has it through
+torchaudio's port of Kaldi (compute-mfcc-feats with energy, without dither), on samples within -1..1: speech is mostly
+under Kaldi's energy floor of 1, so the first cepstrum is mostly 0 there and here.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct
+
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, Doubles, Floats
+
+DIM: Final = 78
+CEPSTRA: Final = 13
+MEL_BINS: Final = 23
+LOW_HZ: Final = 20.0
+PREEMPHASIS: Final = 0.97
+LIFTER: Final = 22.0
+ENERGY_FLOOR: Final = 1.0
+EPSILON: Final = float(np.finfo(np.float32).eps)
+_DELTA_REACH: Final = 2  # frames each way, ends repeated
+
+
+def mfcc78(samples: Floats, rate_hz: int = AUDIO_HZ, fps: int = FRAME_HZ) -> Floats:
+    """(n,) mono -1..1 -> (frames, 78), one row for every whole frame. Frames share nothing: streaming is the same call.
+
+    Raises ValueError where a frame of `rate_hz` and `fps` is too short for two windows.
+    """
+    size, window, hop = rate_hz // fps, int(rate_hz * 0.025), int(rate_hz * 0.010)
+    if size < window + hop:
+        raise ValueError(f"a frame at {fps} fps holds {size} samples, two windows need {window + hop}")
+    frames = len(samples) // size
+    chunks = samples[: frames * size].reshape(frames, size).astype(np.float64)
+    cut = np.lib.stride_tricks.sliding_window_view(chunks, window, axis=1)[:, ::hop]  # snipped edges
+    static = np.moveaxis(cepstra(cut, rate_hz), 1, 2)[..., :2]  # (frames, 13, 2)
+    delta = deltas(static)
+    stacked = np.stack([static, delta, deltas(delta)], axis=1)
+    return np.asarray(stacked.reshape(frames, DIM), dtype=np.float32)
+
+
+def cepstra(windows: NDArray[np.floating], rate_hz: int) -> Doubles:
+    """(..., n) samples of windows -> (..., 13): Kaldi's defaults with energy in place of the first."""
+    centred = windows - windows.mean(axis=-1, keepdims=True)
+    energy = np.log(np.maximum(np.square(centred).sum(axis=-1), max(ENERGY_FLOOR, EPSILON)))
+    before = np.concatenate([centred[..., :1], centred[..., :-1]], axis=-1)
+    size = windows.shape[-1]
+    povey = np.hanning(size) ** 0.85
+    fft = 1 << (size - 1).bit_length()
+    power = np.abs(np.fft.rfft((centred - PREEMPHASIS * before) * povey, fft)) ** 2
+    logs = np.log(np.maximum(power[..., :-1] @ _filters(rate_hz, fft).T, EPSILON))
+    out: Doubles = dct(logs, type=2, norm="ortho", axis=-1)[..., :CEPSTRA]
+    out = out * (1.0 + 0.5 * LIFTER * np.sin(np.pi * np.arange(CEPSTRA) / LIFTER))
+    out[..., 0] = energy
+    return out
+
+
+def deltas(values: Doubles) -> Doubles:
+    """Slope over time (..., T) by regression over five frames, the ends repeated."""
+    steps = np.arange(1, _DELTA_REACH + 1)
+    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(_DELTA_REACH, _DELTA_REACH)], mode="edge")
+    length = values.shape[-1]
+    total = np.zeros_like(values)
+    for step in steps:
+        ahead = padded[..., _DELTA_REACH + step : _DELTA_REACH + step + length]
+        behind = padded[..., _DELTA_REACH - step : _DELTA_REACH - step + length]
+        total += step * (ahead - behind)
+    return total / (2.0 * float(np.square(steps).sum()))
+
+
+@lru_cache
+def _filters(rate_hz: int, fft: int) -> Doubles:
+    """(23, fft / 2) triangles equally spaced in mel from 20 Hz up; the bin at half the rate takes no part."""
+    edges = np.linspace(_mel(LOW_HZ), _mel(rate_hz / 2), MEL_BINS + 2)
+    bins = _mel(np.arange(fft // 2) * rate_hz / fft)
+    low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
+    return np.maximum(0.0, np.minimum((bins - low) / (centre - low), (high - bins) / (high - centre)))
+
+
+def _mel(hz: Doubles | float) -> Doubles:
+    return np.asarray(1127.0 * np.log(1.0 + np.asarray(hz, dtype=np.float64) / 700.0))

@@ -1,0 +1,130 @@
+"""Where the other person is in a phrase: how long it has lasted, how long it is silent, how long the last one was.
+
+This is what nods depend on, and it reaches back further than the 1.6 s that a predictor sees. `step` takes the samples
+of one frame and gives features for a predictor; the three times alone serve the table of nod rates (`learning`).
+
+A phrase goes on across silences under 0.2 s. Features are hat functions of each time on a logarithmic grid, so that a
+linear layer can already draw any curve over it, and are all 0 for a phase that has not been yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import FRAME_S, Doubles, Floats
+from sfms_robot.signals import voice_activity
+from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.voice_activity import Ear
+
+GAP_FRAMES: Final = 5  # this many silent frames, 0.2 s, end a phrase
+SPEECH_KNOTS_S: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+SILENCE_KNOTS_S: Final = (0.0, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8)
+PHRASE_KNOTS_S: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+FEATURES: Final = len(SPEECH_KNOTS_S) + len(SILENCE_KNOTS_S) + len(PHRASE_KNOTS_S)  # 21
+_SOFT_S: Final = 0.2  # the grid is logarithmic from here up
+
+
+@dataclass(frozen=True)
+class SpeechPhase:
+    """Counts of frames, up to and with the newest one.
+
+    Attributes:
+        speech: of the phrase in progress, short gaps included; 0 when there is none.
+        silence: since somebody last spoke; 0 while he does; counts from the start of a stream.
+        last: of the last whole phrase; 0 before the first one has ended.
+    """
+
+    speech: int = 0
+    silence: int = 0
+    last: int = 0
+
+    def after(self, active: bool) -> SpeechPhase:
+        """One frame later."""
+        if active:
+            return SpeechPhase(self.speech + 1, 0, self.last)
+        silence = self.silence + 1
+        if not self.speech:
+            return SpeechPhase(0, silence, self.last)
+        if silence < GAP_FRAMES:
+            return SpeechPhase(self.speech + 1, silence, self.last)
+        return SpeechPhase(0, silence, self.speech + 1 - silence)
+
+    @property
+    def times_s(self) -> tuple[float, float, float]:
+        """Speech so far, silence so far, length of the last phrase."""
+        return self.speech * FRAME_S, self.silence * FRAME_S, self.last * FRAME_S
+
+
+@dataclass(frozen=True)
+class State:
+    """What a stream remembers of the other's voice."""
+
+    ear: Ear
+    phase: SpeechPhase
+
+
+def start() -> State:
+    """Nobody has spoken yet."""
+    return State(voice_activity.start(), SpeechPhase())
+
+
+def step(samples: Floats, state: State) -> tuple[Floats, State]:
+    """Samples of one frame (640,), or none when there is no microphone -> features (21,), and the next state."""
+    return step_level(energy_db(samples), state)
+
+
+def step_level(level_db: float, state: State) -> tuple[Floats, State]:
+    """The same from the level of the frame (`voice_activity.levels_db`, `mel_levels_db`)."""
+    ear = voice_activity.step(level_db, state.ear)
+    phase = state.phase.after(ear.active)
+    return features(np.array([phase.times_s]))[0], State(ear, phase)
+
+
+def of_audio(audio: Floats) -> Floats:
+    """(N * 640,) samples -> features (N, 21), frame by frame what `step` gives; samples left over are not used."""
+    return features(times(hear(voice_activity.levels_db(audio))))
+
+
+def of_mel(rows: Floats) -> Floats:
+    """(N, 4, 128) natural log-mel -> features (N, 21), for data that comes without samples."""
+    return features(times(hear(voice_activity.mel_levels_db(rows))))
+
+
+def hear(levels_db: Doubles) -> list[bool]:
+    """Levels (N,) from the start of a stream -> is this frame speech."""
+    ear, heard = voice_activity.start(), []
+    for level in levels_db.tolist():
+        ear = voice_activity.step(level, ear)
+        heard.append(ear.active)
+    return heard
+
+
+def times(active: Sequence[bool]) -> Doubles:
+    """Speech (N,) -> seconds (N, 3): speech so far, silence so far, length of the last phrase."""
+    phase, rows = SpeechPhase(), []
+    for frame in active:
+        phase = phase.after(bool(frame))
+        rows.append(phase.times_s)
+    return np.array(rows, np.float64).reshape(-1, 3)
+
+
+def features(times_s: Doubles) -> Floats:
+    """Seconds (N, 3) -> (N, 21): hats of speech (none in silence), silence, last phrase (none before it)."""
+    speech, silence, last = times_s.T
+    parts = [
+        _hats(speech, SPEECH_KNOTS_S) * (speech > 0)[:, None],
+        _hats(silence, SILENCE_KNOTS_S),
+        _hats(last, PHRASE_KNOTS_S) * (last > 0)[:, None],
+    ]
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def _hats(values: Doubles, knots_s: Sequence[float]) -> Doubles:
+    """(N,) -> (N, K): weights of the two neighbouring knots, adding up to 1; beyond the last knot that one alone."""
+    at = np.log1p(np.minimum(values, knots_s[-1]) / _SOFT_S)
+    knots = np.log1p(np.array(knots_s) / _SOFT_S)
+    return np.stack([np.interp(at, knots, row) for row in np.eye(len(knots))], axis=1)

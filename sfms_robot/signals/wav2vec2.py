@@ -1,0 +1,156 @@
+"""wav2vec2 of each 40 ms frame, from a model folder on disk; one path offline and streaming.
+
+The transformer sees a whole recording at once, future and all. A listener hears a stream, so each frame gets a window
+of its own: the last 50 frames (2 s) and 80 samples, which makes the last two latents end with the frame; their mean is
+the frame's feature. That is a pass over 2 s a frame: on a GPU it streams, on a processor it does not.
+
+With a hop of h frames one pass gives h rows, when the last of them is complete, for an h-th of the cost: a listener
+that plans every h frames loses nothing by it. Its windows are h - 1 frames longer, so that every row has its 2 s.
+
+Deviation: REACT's baselines run whole recordings and stretch 50 latents a second to 25; those rows know the future.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from sfms_robot.errors import MissingExtra, ModelError
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats
+from sfms_robot.signals.features import Feature
+
+CONTEXT_FRAMES: Final = 50
+STRIDE: Final = 320  # samples a latent
+FIELD: Final = 400  # samples the last latent sees
+WINDOW: Final = CONTEXT_FRAMES * FRAME_SAMPLES + FIELD - STRIDE  # 32,080, at a hop of one frame
+LATENTS_PER_FRAME: Final = FRAME_SAMPLES // STRIDE
+BATCH: Final = 16
+_CONFIG, _PREPROCESSOR = "config.json", "preprocessor_config.json"
+_WEIGHTS: Final = ("model.safetensors", "pytorch_model.bin")
+
+
+class Wav2Vec2:
+    """A wav2vec2 model of a local folder. Holds weights; what a stream has heard is a value of the caller's."""
+
+    def __init__(self, folder: Path | str, device: str = "cpu", hop_frames: int = 1) -> None:
+        """Raises MissingExtra without transformers, ModelError for a folder that holds no such model."""
+        try:
+            import transformers
+        except ImportError as error:
+            raise MissingExtra.of("wav2vec2", "wav2vec2") from error
+        self.folder = Path(folder)
+        settings = _json(self.folder / _CONFIG)
+        if settings.get("model_type") != "wav2vec2":
+            raise ModelError(f"{self.folder / _CONFIG}: model_type = {settings.get('model_type')!r} is not wav2vec2")
+        try:
+            model: Any = transformers.Wav2Vec2Model.from_pretrained(str(self.folder), local_files_only=True)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ModelError(f"{self.folder}: no wav2vec2 weights that can be read: {error}".splitlines()[0]) from error
+        kernels, strides = model.config.conv_kernel, model.config.conv_stride
+        if _reach(kernels, strides) != (FIELD, STRIDE):
+            raise ModelError(f"{self.folder / _CONFIG}: conv_stride = {list(strides)} is not a latent every 20 ms")
+        self._model = model.eval().to(device)
+        self._device = device
+        self.hop_frames = hop_frames
+        self._hop = hop_frames * FRAME_SAMPLES
+        self._window = WINDOW + self._hop - FRAME_SAMPLES
+        preprocessor = self.folder / _PREPROCESSOR
+        self._normalise = bool(_json(preprocessor).get("do_normalize", True)) if preprocessor.is_file() else True
+        self.dim = int(model.config.hidden_size)
+
+    def start(self) -> Floats:
+        """Past of a stream that has heard nothing: (31440,) zeros."""
+        return np.zeros(self._window - self._hop, dtype=np.float32)
+
+    def step(self, samples: Floats, past: Floats) -> tuple[Floats, Floats]:
+        """Rows of the hops that `samples` complete, and the past of the next call.
+
+        Args:
+            samples: (n,) mono 16 kHz, -1..1; any n.
+            past: what the last call returned, or `start()`; not changed.
+
+        Returns:
+            (frames, dim), a multiple of `hop_frames`, and the samples to hand in next time: 31440 and those of a hop
+            that is not complete.
+        """
+        seen = np.concatenate([past, samples]).astype(np.float32)
+        hops = max(0, (len(seen) - self._window) // self._hop + 1)
+        if not hops:
+            return np.zeros((0, self.dim), np.float32), seen
+        windows = np.lib.stride_tricks.sliding_window_view(seen, self._window)[:: self._hop][:hops]
+        return self._rows(windows), seen[hops * self._hop :].copy()
+
+    def of_recording(self, samples: Floats, fps: float = FRAME_HZ) -> Floats:
+        """(frames, dim) of a whole recording.
+
+        At 25 fps what a stream gives; a last hop that is not complete ends in silence. At other rates windows end with
+        their frame, which takes a hop of one: raises ValueError for others.
+        """
+        frames = int(len(samples) * fps / AUDIO_HZ + 1e-6)
+        if fps == FRAME_HZ:
+            whole = -(-frames // self.hop_frames) * self._hop
+            return self.step(np.pad(samples, (0, max(0, whole - len(samples))))[:whole], self.start())[0][:frames]
+        if self.hop_frames != 1:
+            raise ValueError(f"a hop of {self.hop_frames} frames needs data at {FRAME_HZ} fps, not {fps:g}")
+        if not frames:
+            return np.zeros((0, self.dim), np.float32)
+        ends = np.round(np.arange(1, frames + 1) * AUDIO_HZ / fps).astype(int)
+        seen = np.concatenate([np.zeros(self._window, np.float32), samples])
+        return self._rows(np.lib.stride_tricks.sliding_window_view(seen, self._window)[ends])
+
+    @torch.no_grad()
+    def _rows(self, windows: Floats) -> Floats:
+        """(hops, window) -> (hops * hop_frames, dim)."""
+        rows = []
+        for at in range(0, len(windows), BATCH):
+            sound = torch.from_numpy(windows[at : at + BATCH].copy()).to(self._device)
+            if self._normalise:
+                mean = sound.mean(dim=1, keepdim=True)
+                sound = (sound - mean) / (sound.var(dim=1, correction=0, keepdim=True) + 1e-7).sqrt()
+            latents = self._model(sound).last_hidden_state
+            newest = latents[:, -LATENTS_PER_FRAME * self.hop_frames :].unflatten(1, (-1, LATENTS_PER_FRAME))
+            rows.append(newest.mean(dim=2).flatten(0, 1).float().cpu().numpy())
+        return np.concatenate(rows)
+
+
+def feature(folder: Path | str, fps: float = FRAME_HZ, device: str = "cpu", hop_frames: int = 1) -> Feature:
+    """To be kept by `signals.features.cached`; its version tells the hop and a hash of the model's files."""
+    model = Wav2Vec2(folder, device, hop_frames)
+    compute = partial(model.of_recording, fps=fps)
+    return Feature("wav2vec2", f"1 hop {hop_frames} {_digest(model.folder)}", model.dim, fps, compute)
+
+
+def _reach(kernels: list[int], strides: list[int]) -> tuple[int, int]:
+    """Samples that a latent sees, and samples from one to the next."""
+    field, stride = 1, 1
+    for kernel, step in zip(kernels, strides, strict=True):
+        field += (kernel - 1) * stride
+        stride *= step
+    return field, stride
+
+
+def _digest(folder: Path) -> str:
+    found = hashlib.sha256()
+    for name in (_CONFIG, _PREPROCESSOR, *_WEIGHTS):
+        if (folder / name).is_file():
+            with (folder / name).open("rb") as stream:
+                found.update(hashlib.file_digest(stream, "sha256").digest())
+    return found.hexdigest()[:16]
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ModelError(f"{file}: no such file: a model folder holds {_CONFIG} and {_WEIGHTS[0]}") from error
+    except ValueError as error:
+        raise ModelError(f"{file}: not JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise ModelError(f"{file}: not a table of settings")
+    return found

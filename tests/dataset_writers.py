@@ -1,0 +1,145 @@
+"""Tiny data sets in the formats that other projects write, with motion that has their statistics."""
+
+import csv
+import pickle
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import torch
+
+RNG = np.random.default_rng(0)
+
+
+def deca(frames: int, pose_first: bool = False) -> np.ndarray:
+    """(frames, 56): lively expressions, a head that turns a little, a jaw that opens and hardly does anything else."""
+    expression = RNG.normal(0, np.linspace(0.9, 0.15, 50), (frames, 50))
+    head = RNG.normal(0, 0.12, (frames, 3))
+    jaw = np.abs(RNG.normal(0, [0.08, 0.005, 0.004], (frames, 3)))
+    parts = [head, jaw, expression] if pose_first else [expression, head, jaw]
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def faceverse(frames: int, pose_first: bool = False) -> np.ndarray:
+    """(frames, 58): expressions 0..1, a head about (pi, 0, 0), about 1.8 away."""
+    expression = RNG.uniform(0, 0.6, (frames, 52))
+    rotation = RNG.normal([np.pi, 0, 0], 0.1, (frames, 3))
+    place = RNG.normal([0, 0, 1.84], 0.05, (frames, 3))
+    parts = [rotation, place, expression] if pose_first else [expression, rotation, place]
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def wav(file: Path, seconds: float, rate_hz: int = 16_000, channels: int = 1) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    soundfile.write(file, RNG.normal(0, 0.1, (round(seconds * rate_hz), channels)), rate_hz)
+
+
+def npy(file: Path, values: np.ndarray) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.save(file, values)
+
+
+def l2l(root: Path, subject: str = "conan", train: int = 10, test: int = 2, pose_first: bool = False) -> Path:
+    """Both directions of one subject; the second has one clip more."""
+    for split, count in (("train", train), ("test", test)):
+        for person in (0, 1):
+            for role in ("list", "speak"):
+                clips = count + (person if role == "list" else 1 - person)
+                faces = np.stack([deca(64, pose_first) for _ in range(clips)])
+                detail = np.zeros((clips, 64, 128), np.float32)
+                stem = root / subject / split / f"p{person}_{role}"
+                npy(Path(f"{stem}_faces_clean_deca.npy"), np.concatenate([faces, detail], axis=2))
+                if role == "speak":
+                    power = RNG.exponential(1.0, (clips, 256, 128)).astype(np.float32)
+                    npy(Path(f"{stem}_audio_clean_deca.npy"), power)
+                    npy(Path(f"{stem}_files_clean_deca.npy"), np.full((clips, 64, 3), "video", dtype="<U64"))
+    return root
+
+
+def lm_listener(root: Path, subject: str = "trevor", lengths: tuple[int, ...] = (70, 90), **more) -> Path:
+    folder = root / subject
+    folder.mkdir(parents=True, exist_ok=True)
+    for split in ("train", "val", "test"):
+        segments = []
+        for number, frames in enumerate(lengths):
+            segment = {"fname": f"video{number}", "split_start_frame": 0, "split_end_frame": frames,
+                       "during_words": [{"text": "so", "end": 1.5}]}  # fmt: skip
+            for person in ("p0", "p1"):
+                motion = torch.from_numpy(deca(frames))
+                segment |= {f"{person}_exp": motion[:, :50], f"{person}_pose": motion[:, 50:],
+                            f"{person}_shape": torch.zeros(frames, 100)}  # fmt: skip
+            segments.append(segment | more)
+        torch.save(segments, folder / f"segments_{split}.pth")
+    return root
+
+
+def react(root: Path, pairs: int = 2, split: str = "val", frames: int = 751, pose_first: bool = False) -> Path:
+    """NoXI clips of 30 s: an expert and a novice each; the Emotion tree with the names of the cleaned release."""
+    rows = []
+    for number in range(pairs):
+        people = [f"NoXI/00{number}_Paris/{person}/1" for person in ("Expert_video", "Novice_video")]
+        rows.append(people)
+        for person, plain in zip(people, ("P1", "P2"), strict=True):
+            npy(root / split / "3D_FV_files" / f"{person}.npy", faceverse(frames, pose_first)[:, None])
+            wav(root / split / "Audio_files" / f"{person}.wav", frames / 25, 44_100, 2)
+            emotion = root / split / "Emotion" / f"NoXI/00{number}_Paris/{plain}/1.csv"
+            emotion.parent.mkdir(parents=True, exist_ok=True)
+            header = ",".join(f"AU{i}" for i in range(25))
+            np.savetxt(emotion, RNG.uniform(0, 1, (frames, 25)), delimiter=",", header=header, comments="")
+    with (root / f"{split}.csv").open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["", "speaker_path", "listener_path"])
+        writer.writerows([index, *row] for index, row in enumerate(rows))
+    return root
+
+
+def react2025(root: Path, lengths: tuple[int, ...] = (60, 75), split: str = "train") -> Path:
+    for number, frames in enumerate(lengths):
+        path = f"session{number}/take_{number}"
+        for role in ("speaker", "listener"):
+            folder = root / "data" / split
+            npy(folder / "coefficients" / role / f"{path}.npy", faceverse(frames)[:, None])
+            npy(folder / "facial-attributes" / role / f"{path}.npy", RNG.uniform(0, 1, (frames, 25)))
+            npy(folder / "audio-features" / role / f"{path}.npy", RNG.normal(0, 1, (frames - 1, 768)))
+            wav(folder / "audio" / role / f"{path}.wav", frames / 30)
+    return root
+
+
+def dualtalk(root: Path, chats: int = 2, frames: int = 100, split: str = "train") -> Path:
+    for number in range(chats):
+        for person in (1, 2):
+            stem = root / split / f"{number:04d}_speaker{person}"
+            wav(stem.with_suffix(".wav"), frames / 25)
+            motion = deca(frames)
+            np.savez(stem.with_suffix(".npz"), exp=motion[:, :50], pose=motion[:, 50:])
+    return root
+
+
+def dim(root: Path, lengths: tuple[int, ...] = (80, 90, 100), pose_first: bool = True) -> Path:
+    folder = root / "vico_processed_30fps"
+    folder.mkdir(parents=True, exist_ok=True)
+    splits = ["train", "train", "test"]
+    with (root / "RLD_data.csv").open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["attitude", "audio", "listener", "speaker", "speaker_id", "listener_id", "data_split"])
+        for number, (frames, split) in enumerate(zip(lengths, splits, strict=True)):
+            writer.writerow(["positive", f"id{number}", f"l{number}", f"s{number}", 1, 2, split])
+            arrays = {"audio": RNG.normal(0, 1, (frames, 768)), "video_speaker": deca(frames, pose_first),
+                      "video_listener": deca(frames, pose_first)}  # fmt: skip
+            (folder / f"id{number}.pkl").write_bytes(pickle.dumps(arrays))
+    return root
+
+
+def vico(root: Path, lengths: tuple[int, ...] = (60, 70)) -> Path:
+    (root / "metadata").mkdir(parents=True)
+    lines = ["uuid,attitude"]
+    for number, frames in enumerate(lengths):
+        lines.append(f"u{number},neutral")
+        npy(root / "features" / "audio_feats" / f"u{number}.npy", RNG.normal(0, 1, (frames, 45)))
+        for role in ("speaker", "listener"):
+            file = root / "features" / "video_feats" / f"u{number}.{role}.bin"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            motion = RNG.normal(0, 1, (frames, 73)).astype(np.float32)
+            torch.save({"id.gamma.tex": np.zeros((frames, 187), np.float32), "angle.exp.trans": motion}, file)
+    (root / "metadata" / "data.csv").write_text("\n".join(lines) + "\n")
+    return root

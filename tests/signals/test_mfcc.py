@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.signals import l2l_mel, mfcc
+
+RNG = np.random.default_rng(0)
+NOISE = RNG.normal(0, 0.1, 6400).astype(np.float32)
+TIME = np.arange(640) / 16_000
+TONES = (0.3 * np.sin(2 * np.pi * 440 * TIME) + 0.1 * np.sin(2 * np.pi * 1900 * TIME)).astype(np.float32)
+# kaldi.mfcc(TONES[None], sample_frequency=16000, use_energy=True) of torchaudio 2.11, a port of Kaldi's.
+KALDI = [
+    [2.9957, 52.5790, -32.8162, 7.5539, 42.1616, -107.1823, -162.4332, -14.9887, 43.5725, -34.2258, -28.5497, 59.3065,
+     57.7354],
+    [3.0005, 52.9226, -31.4894, 9.4360, 43.8629, -106.5214, -162.3474, -13.4141, 46.3876, -32.0276, -27.2184, 59.8589,
+     58.1110],
+]  # fmt: skip
+
+
+def test_two_windows_of_a_frame_are_kaldis():
+    row = mfcc.mfcc78(TONES).reshape(3, 13, 2)
+    np.testing.assert_allclose(row[0].T, KALDI, atol=1e-3)
+
+
+def test_delta_of_two_windows_is_three_tenths_of_their_difference():
+    """Regression over five points of a, b with repeated ends: (a, a, a, b, b) and (a, a, b, b, b)."""
+    row = mfcc.mfcc78(NOISE)[0].reshape(3, 13, 2).astype(float)
+    step = row[0, :, 1] - row[0, :, 0]
+    np.testing.assert_allclose(row[1], np.stack([0.3 * step, 0.3 * step], axis=1), atol=1e-4)
+    np.testing.assert_allclose(row[2], 0, atol=1e-4)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 9), st.integers(1, 5))
+def test_frames_share_nothing(first: int, count: int):
+    part = mfcc.mfcc78(NOISE[640 * first : 640 * (first + count)])
+    np.testing.assert_array_equal(part, mfcc.mfcc78(NOISE)[first : first + count])
+
+
+def test_first_cepstrum_is_log_energy_with_a_floor_of_one():
+    assert (mfcc.mfcc78(0.001 * NOISE).reshape(-1, 3, 13, 2)[:, 0, 0] == 0).all()
+    quiet, loud = (mfcc.mfcc78(gain * NOISE).reshape(-1, 3, 13, 2)[:, 0, 0] for gain in (1, 4))
+    np.testing.assert_allclose(loud - quiet, 2 * np.log(4), atol=1e-4)
+
+
+def test_part_frames_are_left_out_and_silence_is_finite():
+    assert mfcc.mfcc78(NOISE[:1000]).shape == (1, 78) and mfcc.mfcc78(NOISE[:100]).shape == (0, 78)
+    assert np.isfinite(mfcc.mfcc78(np.zeros(640, np.float32))).all()
+    with pytest.raises(ValueError, match="two windows need 560"):
+        mfcc.mfcc78(NOISE, fps=50)
+
+
+@pytest.mark.parametrize("rate_hz", [16_000, 44_100])
+def test_a_frame_is_a_25th_of_a_second_at_any_rate(rate_hz):
+    assert mfcc.mfcc78(np.zeros(2 * rate_hz, np.float32), rate_hz).shape == (50, 78)
+
+
+# --- the mel of L2L -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rows", "wanted"), [(50, 120), (120, 50), (101, 101), (7, 3)])
+def test_lanczos_is_pillows(rows: int, wanted: int):
+    image = pytest.importorskip("PIL.Image")
+    values = RNG.uniform(0, 1, (rows, 6)).astype(np.float32)
+    resized = image.fromarray(values).resize((6, wanted), image.Resampling.LANCZOS)
+    np.testing.assert_allclose(l2l_mel.lanczos(values.astype(float), wanted), np.array(resized), atol=1e-5)
+
+
+def test_l2l_rows_are_four_a_frame_of_power():
+    frames = 12
+    rows = l2l_mel.l2l_mel(NOISE, frames)
+    assert rows.shape == (48, 128)
+    np.testing.assert_allclose(l2l_mel.l2l_mel(3 * NOISE, frames), 9 * rows, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("hz", [300.0, 1000.0, 4000.0])
+def test_l2l_tone_is_loudest_in_the_bin_of_its_pitch(hz: float):
+    tone = np.sin(2 * np.pi * hz * np.arange(16_000) / 16_000).astype(np.float32)
+    edges = l2l_mel._hz(np.linspace(0, float(l2l_mel._mel(8000.0)), 130))
+    loudest = int(l2l_mel.l2l_mel(tone, 30)[60].argmax())
+    assert edges[loudest] - 32 <= hz <= edges[loudest + 2] + 32  # an FFT bin is 31 Hz wide

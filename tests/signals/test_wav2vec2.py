@@ -1,0 +1,164 @@
+"""On a random model of the real architecture, three hundred times smaller."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sfms_robot.errors import MissingExtra, ModelError
+from sfms_robot.signals import wav2vec2
+from sfms_robot.signals.features import MFCC78, Feature, cached, entry
+
+NOISE = np.random.default_rng(0).normal(0, 0.1, 16_000).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    transformers = pytest.importorskip("transformers")
+    place = tmp_path_factory.mktemp("tiny")
+    tiny = transformers.Wav2Vec2Config(
+        hidden_size=16, num_hidden_layers=2, num_attention_heads=2, intermediate_size=32, conv_dim=(8,) * 7,
+        num_conv_pos_embeddings=16, num_conv_pos_embedding_groups=2,
+    )  # fmt: skip
+    transformers.Wav2Vec2Model(tiny).save_pretrained(place)
+    (place / "preprocessor_config.json").write_text(json.dumps({"do_normalize": True}))
+    return place
+
+
+@pytest.fixture(scope="module")
+def model(folder):
+    return wav2vec2.Wav2Vec2(folder)
+
+
+@pytest.mark.parametrize("cuts", [[640] * 25, [100, 5000, 640, 1], [16_000], []])
+def test_stream_equals_offline_for_any_chunking(model, cuts):
+    whole = model.of_recording(NOISE)
+    past, rows, at = model.start(), [], 0
+    for size in [*cuts, len(NOISE)]:
+        new, past = model.step(NOISE[at : at + size], past)
+        rows.append(new)
+        at += size
+    np.testing.assert_allclose(np.concatenate(rows), whole, atol=1e-5)
+    assert whole.shape == (25, 16) and len(past) >= len(model.start())
+
+
+@pytest.mark.parametrize("hop", [2, 8])
+def test_a_hop_of_frames_streams_as_it_is_offline(folder, hop):
+    hopping = wav2vec2.Wav2Vec2(folder, hop_frames=hop)
+    whole = hopping.of_recording(NOISE)
+    past, rows = hopping.start(), []
+    for at in range(0, len(NOISE), 1000):
+        new, past = hopping.step(NOISE[at : at + 1000], past)
+        assert len(new) % hop == 0
+        rows.append(new)
+    streamed = np.concatenate(rows)
+    assert whole.shape == (25, 16) and len(streamed) == 25 // hop * hop
+    np.testing.assert_allclose(streamed, whole[: len(streamed)], atol=1e-5)
+    with pytest.raises(ValueError, match="needs data at 25 fps, not 30"):
+        hopping.of_recording(NOISE, fps=30)
+
+
+def test_later_sound_never_changes_earlier_rows_and_2_s_are_forgotten(model):
+    changed = NOISE.copy()
+    changed[6400:] = 0
+    whole, other = model.of_recording(NOISE), model.of_recording(changed)
+    np.testing.assert_allclose(whole[:10], other[:10], atol=1e-5)
+    assert np.abs(whole[10:] - other[10:]).max() > 1e-3
+    long = np.concatenate([NOISE, NOISE, NOISE, NOISE])
+    np.testing.assert_allclose(model.of_recording(long)[60:75], model.of_recording(long[640 * 9 :])[51:66], atol=1e-5)
+
+
+def test_past_is_not_changed(model):
+    past = model.start()
+    model.step(NOISE[:640], past)
+    assert not past.any()
+
+
+@pytest.mark.parametrize(("fps", "rows"), [(25, 25), (30, 30)])
+def test_rows_per_second_are_those_of_the_data(model, fps, rows):
+    assert model.of_recording(NOISE, fps).shape == (rows, 16)
+
+
+def test_loudness_does_not_matter_when_the_model_normalises(model):
+    np.testing.assert_allclose(model.of_recording(NOISE)[-1], model.of_recording(0.2 * NOISE)[-1], atol=1e-2)
+
+
+def test_window_ends_with_the_frame():
+    assert (wav2vec2.WINDOW - wav2vec2.FIELD) % wav2vec2.STRIDE == 0
+    assert wav2vec2._reach([10, 3, 3, 3, 3, 2, 2], [5, 2, 2, 2, 2, 2, 2]) == (wav2vec2.FIELD, wav2vec2.STRIDE)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (None, "config.json: no such file: a model folder holds config.json and model.safetensors"),
+        ("{", "config.json: not JSON"),
+        ("[]", "config.json: not a table"),
+        ('{"model_type": "bert"}', "model_type = 'bert' is not wav2vec2"),
+        ('{"model_type": "wav2vec2"}', "no wav2vec2 weights that can be read"),
+    ],
+)
+def test_folder_that_is_no_model_is_one_clear_line(tmp_path, config, message):
+    pytest.importorskip("transformers")
+    if config is not None:
+        (tmp_path / "config.json").write_text(config)
+    with pytest.raises(ModelError, match=message):
+        wav2vec2.Wav2Vec2(tmp_path)
+
+
+def test_missing_extra_names_the_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "transformers", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'sfms-robot\[wav2vec2\]'"):
+        wav2vec2.Wav2Vec2(tmp_path)
+
+
+# --- the cache ------------------------------------------------------------------------------------------------
+
+
+def counting(calls: list[int], version: str = "1") -> Feature:
+    def compute(samples):
+        calls.append(len(samples))
+        return samples[: len(samples) // 640 * 640].reshape(-1, 640)[:, :3]
+
+    return Feature("three", version, 3, 25, compute)
+
+
+def test_same_sound_is_computed_once_and_read_back_exactly(tmp_path):
+    calls: list[int] = []
+    first, again = (cached(NOISE, counting(calls), tmp_path) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(calls) == 1 and not list(tmp_path.rglob("*.part"))
+
+
+def test_other_sound_and_other_versions_are_other_entries(tmp_path):
+    calls: list[int] = []
+    for samples, version in ((NOISE, "1"), (NOISE[1:], "1"), (NOISE, "2"), (NOISE, "1")):
+        cached(samples, counting(calls, version), tmp_path)
+    assert len(calls) == 3 and len(list(tmp_path.rglob("*.npz"))) == 3
+
+
+@pytest.mark.parametrize("at", [0, 200, -100, None])
+def test_broken_entry_is_computed_again_and_mended(tmp_path, at):
+    calls: list[int] = []
+    whole = cached(NOISE, counting(calls), tmp_path)
+    file = entry(NOISE, counting(calls), tmp_path)
+    content = bytearray(file.read_bytes())
+    if at is None:
+        content = content[:50]
+    else:
+        content[at] ^= 0xFF
+    file.write_bytes(content)
+    np.testing.assert_array_equal(cached(NOISE, counting(calls), tmp_path), whole)
+    cached(NOISE, counting(calls), tmp_path)
+    assert len(calls) <= 2 and (at not in (200, None) or len(calls) == 2)
+
+
+def test_wav2vec2_version_is_that_of_the_weights(folder, tmp_path):
+    one = wav2vec2.feature(folder)
+    rows = cached(NOISE, one, tmp_path)
+    np.testing.assert_array_equal(cached(NOISE, wav2vec2.feature(folder), tmp_path), rows)
+    assert one.version != wav2vec2.Wav2Vec2(folder).folder.name and one.dim == 16
+
+
+def test_mfcc_is_a_feature_that_can_be_kept(tmp_path):
+    assert cached(NOISE, MFCC78, tmp_path).shape == (25, 78)
