@@ -1,0 +1,77 @@
+"""A listener of kind `arig`: its sizes, its sampler, and the ablations of the paper's tables 1 and 4 as switches."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from sfms_robot.config.base import Model, NonNegative
+from sfms_robot.config.listener import Count, Listener
+
+
+class Diffusion(Model):
+    """The DiffusionMLP and how it is sampled.
+
+    Attributes:
+        width: of its condition and blocks; the paper takes that of its motion, 262.
+        train_steps: noise levels in training.
+        steps: of them used to sample one frame, spread evenly.
+        sampler: `ddpm` is the paper's (4); `ddim` adds no noise between steps, which suits few of them.
+        temperature: factor on the noise that is added between steps.
+    """
+
+    width: Annotated[int, Field(ge=2, multiple_of=2)] = 262
+    blocks: Count = 3
+    train_steps: Annotated[int, Field(ge=2)] = 1000
+    steps: Count = 15
+    sampler: Literal["ddpm", "ddim"] = "ddpm"
+    temperature: NonNegative = 1.0
+
+    @model_validator(mode="after")
+    def _fits(self) -> Diffusion:
+        if self.steps > self.train_steps:
+            raise ValueError(f"steps {self.steps} is above train_steps {self.train_steps}")
+        return self
+
+
+class Arig(Listener):
+    """Frame-wise autoregression with a diffusion head.
+
+    Attributes:
+        sound: `mel` (4 rows of 128 per frame) or `wav2vec2` (768 per frame, brought with the data: trains, never runs).
+        width, feedforward: of every block; heads: of every attention.
+        chunk_frames: c of the paper; context_chunks: w (4: ablation "w/o long-range context").
+        bidirectional_layers: 2 in the paper; integrated_layers, context_layers: the paper leaves them open.
+        sound_frames: of the agent, that the coarse motion looks at; motion_frames: that the temporal layer looks at.
+        state_guidance: false leaves the conversational states out; visual: false leaves motion out of the behaviours;
+            interaction: `linear` puts plain layers in place of bidirectional-integrated learning;
+            discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4).
+        precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
+    """
+
+    kind: Literal["arig"]
+    sound: Literal["mel", "wav2vec2"] = "mel"
+    width: Count = 512
+    feedforward: Count = 2048
+    heads: Count = 8
+    chunk_frames: Count = 6
+    context_chunks: Annotated[int, Field(ge=2)] = 512
+    bidirectional_layers: Count = 2
+    integrated_layers: Count = 1
+    context_layers: Count = 4
+    sound_frames: Count = 3
+    motion_frames: Count = 5
+    state_guidance: bool = True
+    visual: bool = True
+    interaction: Literal["bidirectional", "linear"] = "bidirectional"
+    discrete: bool = False
+    code_levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] = (8, 5, 5, 5)
+    diffusion: Diffusion = Diffusion()
+    precision: Literal["auto", "fp32", "int8"] = "auto"
+
+    @model_validator(mode="after")
+    def _heads_fit(self) -> Arig:
+        if self.width % (2 * self.heads):
+            raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        return self
