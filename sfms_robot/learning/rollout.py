@@ -4,10 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, SpeakerFrame
+from sfms_robot.frames import (
+    CHANNEL_INDEX,
+    FRAME_HZ,
+    FRAME_S,
+    FRAME_SAMPLES,
+    MOTION_DIM,
+    FaceFrame,
+    Floats,
+    Plan,
+    SpeakerFrame,
+)
 from sfms_robot.learning.datasets.clips import Dyad
 from sfms_robot.metrics import timing
 from sfms_robot.ports import Listener
@@ -41,26 +52,51 @@ class Behaviour:
 
 
 def speaker_frames(dyad: Dyad) -> list[SpeakerFrame]:
-    """The speaker of a dyad as a source would give it; a face of NaN is None, no sound at all is no microphone."""
-    silent = not dyad.audio.any()
+    """The speaker of a dyad as a source would give it."""
+    return frames_of(dyad.audio, dyad.speaker)
+
+
+def frames_of(audio: Floats | None, face: Floats) -> list[SpeakerFrame]:
+    """Sound (N * 640,) and face (N, 58) by frame; a face of NaN is None, no sound at all is no microphone."""
+    heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
     frames = []
-    for index, row in enumerate(dyad.speaker):
+    for index, row in enumerate(face):
         time_s = (index + 1) * FRAME_S
-        sound = dyad.audio[index * FRAME_SAMPLES : (index + 1) * FRAME_SAMPLES]
-        face = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
-        frames.append(SpeakerFrame(time_s, sound[:0] if silent else sound, face))
+        sound = heard[index * FRAME_SAMPLES : (index + 1) * FRAME_SAMPLES]
+        frames.append(SpeakerFrame(time_s, sound, FaceFrame.of(time_s, row) if np.isfinite(row).all() else None))
     return frames
 
 
 def roll_out(listener: Listener, speaker: Sequence[SpeakerFrame], seed: int) -> Floats:
     """(N, 58) what the listener's face did while `speaker` (N frames) was heard: each plan until the next one."""
     memory = listener.start(seed)
-    motion = np.zeros((len(speaker) + listener.horizon, 58), dtype=np.float32)
+    motion = np.zeros((len(speaker) + listener.horizon, MOTION_DIM), dtype=np.float32)
     for index, frame in enumerate(speaker):
         plan, memory = listener.step(frame, memory)
         if plan is not None:
             motion[index + 1 : index + 1 + listener.horizon] = plan.frames
     return motion[: len(speaker)]
+
+
+@runtime_checkable
+class ManyStreams(Protocol):
+    """A listener that steps several streams of one speaker at once."""
+
+    def step_many(self, speaker: SpeakerFrame, memories: Sequence[Any]) -> tuple[Sequence[Plan], Sequence[Any]]:
+        """`Listener.step` of streams that have heard the same from the start; no plans between hops."""
+
+
+def roll_out_many(listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence[int]) -> Floats:
+    """(S, N, 58) `roll_out` of every seed, side by side where the listener offers it."""
+    if not isinstance(listener, ManyStreams):
+        return np.stack([roll_out(listener, speaker, seed) for seed in seeds])
+    memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
+    motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), dtype=np.float32)
+    for index, frame in enumerate(speaker):
+        plans, memories = listener.step_many(frame, memories)
+        for row, plan in enumerate(plans):
+            motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
+    return motion[:, : len(speaker)]
 
 
 def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> Behaviour:
@@ -75,7 +111,8 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> Behaviour:
         onsets += sum(bool(dyad.listening[int(start * FRAME_HZ)]) for start in starts)
         minutes += listened
         sizes += [size for _, _, size in nods]
-        ends = timing.phrase_ends(timing.voice_activity(dyad.audio), FRAME_HZ)
+        spoke = np.zeros(len(motion), bool) if dyad.audio is None else timing.voice_activity(dyad.audio)
+        ends = timing.phrase_ends(spoke, FRAME_HZ)
         counts += timing.phrase_end_counts(starts, ends, dyad.listening, FRAME_HZ)
         blinks += len(timing.find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ))
         smiles += len(timing.find_smiles(motion[:, CHANNEL_INDEX["mouthSmileLeft"]], FRAME_HZ))

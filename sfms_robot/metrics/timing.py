@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, signal
+from scipy import ndimage, signal, stats
 
 Event = tuple[float, float, float]
 Bools = NDArray[np.bool_]
@@ -160,14 +160,15 @@ def phrase_end_counts(
     An instant that lies in both (of two phrase ends) counts in both; within one window it counts once.
     """
     listened = np.asarray(listening, bool)
-    after = _window(ends_s, AFTER_S, len(listened), rate_hz) & listened
-    later = _window(ends_s, LATER_S, len(listened), rate_hz) & listened
+    after = window_after(ends_s, AFTER_S, len(listened), rate_hz) & listened
+    later = window_after(ends_s, LATER_S, len(listened), rate_hz) & listened
     return (*_inside(onsets_s, after, rate_hz), *_inside(onsets_s, later, rate_hz))
 
 
-def _window(
+def window_after(
     ends_s: Sequence[float] | NDArray[np.float64], span_s: tuple[float, float], size: int, rate: float
 ) -> Bools:
+    """(size,) True in the window `span_s` after each instant of `ends_s`."""
     mask = np.zeros(size, bool)
     for end in ends_s:
         mask[max(0, int(round((end + span_s[0]) * rate))) : max(0, int(round((end + span_s[1]) * rate)))] = True
@@ -190,3 +191,41 @@ def ratio_of(counts: Sequence[float]) -> float:
     if not later or not after_min or not later_min:
         return float("nan")
     return (after / after_min) / (later / later_min)
+
+
+def near(spans_s: ArrayLike, frames: int, rate_hz: float, within_s: float) -> Bools:
+    """(frames,) True at instants that are at most `within_s` away from one of the spans (K, 2)."""
+    mask = np.zeros(frames, bool)
+    for start, end in np.asarray(spans_s, np.float64).reshape(-1, 2):
+        first, last = np.ceil((start - within_s) * rate_hz - 1e-6), np.floor((end + within_s) * rate_hz + 1e-6)
+        mask[max(0, int(first)) : max(0, int(last) + 1)] = True
+    return mask
+
+
+def rank_auc(scores: ArrayLike, positive: ArrayLike, negative: ArrayLike) -> float:
+    """Chance that a positive instant scores higher than a negative one, ties half; NaN when either kind is missing.
+
+    scores (N,); positive and negative are (N,) masks or indices.
+    """
+    values = np.asarray(scores, np.float64)
+    high, low = values[np.asarray(positive)], values[np.asarray(negative)]
+    if not len(high) or not len(low):
+        return float("nan")
+    ranks = stats.rankdata(np.concatenate([high, low]))[: len(high)]
+    return float((ranks.sum() - len(high) * (len(high) + 1) / 2) / (len(high) * len(low)))
+
+
+def find_gaze_shifts(yaw_rad: ArrayLike, pitch_rad: ArrayLike, rate_hz: float, least_rad: float = 0.14) -> list[float]:
+    """Seconds at which the direction of gaze (head and eyes together), (N,) each, jumps by 8 degrees or more.
+
+    A jump is a change within 0.2 s from one quarter second of rest to the next; those closer than 0.3 s are one.
+    """
+    gaze = np.stack([np.asarray(yaw_rad, np.float64), np.asarray(pitch_rad, np.float64)], axis=1)
+    rest, jump = max(1, round(0.24 * rate_hz)), max(1, round(0.2 * rate_hz))
+    if len(gaze) < 2 * rest + jump:
+        return []
+    windows = np.lib.stride_tricks.sliding_window_view(gaze, rest, axis=0)
+    settled = np.median(windows, axis=-1)  # [i]: frames i to i + rest
+    size = np.hypot(*(settled[rest + jump :] - settled[: -rest - jump]).T)
+    peaks, _ = signal.find_peaks(np.r_[0.0, size, 0.0], height=least_rad, distance=max(1, round(0.3 * rate_hz)))
+    return [float((peak - 1 + rest + jump / 2) / rate_hz) for peak in peaks]

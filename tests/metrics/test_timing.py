@@ -7,12 +7,15 @@ from hypothesis import strategies as st
 
 from sfms_robot.metrics.timing import (
     find_blinks,
+    find_gaze_shifts,
     find_nods,
     find_smiles,
     listening_mask,
+    near,
     nods_per_minute,
     phrase_end_ratio,
     phrase_ends,
+    rank_auc,
     runs,
     voice_activity,
 )
@@ -176,3 +179,42 @@ def test_speech_is_told_from_noise_at_any_gain(gain, noise_db):
 def test_digital_silence_and_nothing_are_not_speech():
     assert not voice_activity(np.zeros(16_000)).any()
     assert len(voice_activity(np.zeros(100))) == 0
+
+
+@given(
+    st.lists(st.integers(0, 5), min_size=1, max_size=20),
+    st.lists(st.integers(0, 5), min_size=1, max_size=20),
+)
+def test_auc_is_the_chance_that_a_positive_scores_higher(positive, negative):
+    scores = np.array(positive + negative, float)
+    index = np.arange(len(scores))
+    pairs = [(p > n) + 0.5 * (p == n) for p in positive for n in negative]
+    found = rank_auc(scores, index[: len(positive)], index[len(positive) :])
+    assert found == pytest.approx(np.mean(pairs))
+    assert rank_auc(-scores, index[: len(positive)], index[len(positive) :]) == pytest.approx(1 - found)
+
+
+def test_auc_of_one_kind_alone_is_nan():
+    assert np.isnan(rank_auc([1.0, 2.0], [True, True], [False, False]))
+
+
+def test_near_is_as_wide_as_it_is_told():
+    assert np.flatnonzero(near([(2.0, 3.0)], 200, RATE, 0.2)).tolist() == list(range(45, 81))
+    assert np.flatnonzero(near([(0.0, 0.1), (7.9, 9.0)], 200, RATE, 0.04)).tolist() == [0, 1, 2, 3, *range(197, 200)]
+    assert not near(np.zeros((0, 2)), 200, RATE, 1.0).any()
+
+
+@given(start=st.floats(1, 7), size=st.floats(0.2, 0.7), angle=st.floats(0, 6.28))
+def test_a_glance_is_two_shifts_where_it_begins_and_ends(start, size, angle):
+    away = np.zeros(10 * RATE)
+    away[round(start * RATE) : round((start + 1.5) * RATE)] = size
+    found = find_gaze_shifts(np.cos(angle) * away, np.sin(angle) * away, RATE)
+    assert found == pytest.approx([start, start + 1.5], abs=0.2)
+
+
+def test_small_wandering_and_slow_turns_are_no_gaze_shifts():
+    rng = np.random.default_rng(0)
+    wander = np.repeat(rng.normal(0, np.deg2rad(0.7), 40), RATE // 2)
+    turn = np.deg2rad(60) * np.linspace(0, 1, len(wander))
+    assert find_gaze_shifts(wander + turn, wander, RATE) == []
+    assert find_gaze_shifts(np.zeros(5), np.zeros(5), RATE) == []

@@ -40,6 +40,7 @@ class Score:
         gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away".
         shared_laughs: laughs of the others.
         asked, ends: instants at which the others asked something, and at which their phrases ended.
+        mouth: (frames, 52) that belongs to his own recorded voice, or None: a recorded mouth that fits none.
     """
 
     frames: int
@@ -53,6 +54,7 @@ class Score:
     shared_laughs: Doubles
     asked: Doubles
     ends: Doubles
+    mouth: Floats | None = None
 
 
 def listener_motion(score: Score, motions: Motions, rng: np.random.Generator) -> Floats:
@@ -282,7 +284,10 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.
 
 
 def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> None:
-    """His own words: a recorded mouth over them, small for an "mm-hm"."""
+    """His own words: the mouth of his voice, or else some recorded mouth over them, small for an "mm-hm"."""
+    if score.mouth is not None:
+        np.copyto(shapes, _over(shapes, score.mouth))
+        return
     source = motions.talk[0]
     short = {float(start) for start, _ in score.backchannels}
     for start, end in score.talk:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -45,6 +45,7 @@ class Person:
         floor: (start, end, agent) phrases of each of the others.
         others_laughs: laughs of the others.
         asked: ends of the others' acts that ask for something.
+        others_backchannels: of the others.
     """
 
     meeting: str
@@ -63,6 +64,7 @@ class Person:
     floor: tuple[tuple[float, float, str], ...]
     others_laughs: Doubles
     asked: Doubles
+    others_backchannels: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def read_people(folder: Path) -> list[Person]:
@@ -103,6 +105,7 @@ def read_people(folder: Path) -> list[Person]:
                 ),
                 others_laughs=phrases((a, b) for o in others for a, b, what in words[o] if what == "vocalsound laugh"),
                 asked=np.sort([b for o in others for _, b, what in acts[o] if what.startswith("el.")]),
+                others_backchannels=phrases((a, b) for o in others for a, b, what in acts[o] if what == "bck"),
             )
         )
     if not people:

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,8 @@ class Dyad:
         fps: frames a second.
         mel: (4N, 128) natural log of the speaker's mel power, for data that ships this in place of a waveform.
         features: more about each frame by name, (N, F): "hubert", "attributes", ...
+        agent_audio: (samples_of(N, fps),) the listener's own voice, or None: the data ships none.
+        states: (N,) int8, his conversational state (`learning.arig.labels`), -1 where not known; None: nowhere.
     """
 
     name: str
@@ -57,6 +59,8 @@ class Dyad:
     fps: float = float(FRAME_HZ)
     mel: Floats | None = None
     features: Mapping[str, Floats] = field(default_factory=dict)
+    agent_audio: Floats | None = None
+    states: NDArray[np.int8] | None = None
 
     def __post_init__(self) -> None:
         if self.space not in WIDTHS:
@@ -64,12 +68,14 @@ class Dyad:
         if not self.fps > 0:
             raise ValueError(f"{self.name}: fps {self.fps:g} must be above 0")
         frames, width = len(self.listener), WIDTHS[self.space]
-        expected: dict[str, tuple[Floats | NDArray[np.bool_] | None, tuple[int, ...]]] = {
+        expected: dict[str, tuple[NDArray[Any] | None, tuple[int, ...]]] = {
             "audio": (self.audio, (samples_of(frames, self.fps),)),
             "speaker": (self.speaker, (frames, width)),
             "listener": (self.listener, (frames, width)),
             "listening": (self.listening, (frames,)),
             "mel": (self.mel, (log_mel.ROWS_PER_FRAME * frames, log_mel.MEL_BINS)),
+            "agent_audio": (self.agent_audio, (samples_of(frames, self.fps),)),
+            "states": (self.states, (frames,)),
         }
         for key, (values, shape) in expected.items():
             if values is not None and values.shape != shape:
@@ -77,7 +83,7 @@ class Dyad:
         for key, rows in self.features.items():
             if rows.ndim != 2 or len(rows) != frames:
                 raise ValueError(f"{self.name}: feature {key} has shape {rows.shape}, expected ({frames}, F)")
-        for key in ("listener", "audio", "mel"):
+        for key in ("listener", "audio", "mel", "agent_audio"):
             values = getattr(self, key)
             if values is not None and not np.isfinite(values).all():
                 raise ValueError(f"{self.name}: {key} must be finite")
@@ -117,8 +123,11 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
             "listener": dyad.listener.astype(kind),
             "listening": dyad.listening,
         }
-        if dyad.audio is not None:
-            arrays["audio"] = np.round(dyad.audio * 32767).astype(np.int16)
+        for key, voice in (("audio", dyad.audio), ("agent_audio", dyad.agent_audio)):
+            if voice is not None:
+                arrays[key] = np.round(voice * 32767).astype(np.int16)
+        if dyad.states is not None:
+            arrays["states"] = dyad.states
         if dyad.mel is not None:
             arrays["mel"] = dyad.mel
         if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
@@ -141,7 +150,7 @@ def read(file: Path) -> Dyad:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             return Dyad(
                 file.stem,
-                arrays["audio"].astype(np.float32) / 32767 if "audio" in arrays else None,
+                _voice(arrays, "audio"),
                 arrays["speaker"].astype(np.float32),
                 arrays["listener"].astype(np.float32),
                 arrays["listening"].astype(bool),
@@ -149,6 +158,12 @@ def read(file: Path) -> Dyad:
                 float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
                 arrays["mel"].astype(np.float32) if "mel" in arrays else None,
                 {key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
+                _voice(arrays, "agent_audio"),
+                arrays["states"].astype(np.int8) if "states" in arrays else None,
             )
     except UNREADABLE as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error
+
+
+def _voice(arrays: Mapping[str, NDArray[Any]], key: str) -> Floats | None:
+    return arrays[key].astype(np.float32) / 32767 if key in arrays else None

@@ -5,14 +5,18 @@ meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`);
 belong together is ours: the voice says other words than the meeting did, only its phrases begin and end when they did.
 Whoever holds the floor sits straight ahead. Stretches with nods, above all those with nods at the end of a phrase, are
 drawn more often than they are in the meetings. Meetings, people, takes and voices kept for validation are whole ones.
+
+A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
+serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
+the filmed recordings themselves (`speaking.py`). Each is a data set of its own in a folder of that name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +24,8 @@ from numpy.typing import NDArray
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, Doubles, Floats
+from sfms_robot.learning.arig import labels
+from sfms_robot.learning.datasets import speaking
 from sfms_robot.learning.datasets.acting import Score, listener_motion, speaker_motion
 from sfms_robot.learning.datasets.ami import Person, read_people, split_series
 from sfms_robot.learning.datasets.clips import Dyad, save
@@ -30,13 +36,15 @@ from sfms_robot.metrics.timing import listening_mask, nods_per_minute, phrase_en
 
 LENGTH_S: Final = (30.0, 60.0)
 VALIDATION_SHARE: Final = 1 / 6  # of the training minutes
+SHARES: Final = {"interaction": 0.5, "speaking": 0.25}  # minutes of the sets that speak, per minute of listening
+Scene = Literal["listening", "interaction"]
 _FILMED: Final = 0.65  # share of dyads with a voice whose mouth was recorded
 _FACELESS: Final = 0.3  # share of those in which the speaker is heard only
 _LOOKS: Final = 0.6  # share of the looks away that is kept: across a table with papers people look away a lot
 _LONGEST_LOOK_S: Final = (1.5, 4.0)  # a look away ends after this: in meetings people watch slides for minutes
 _WEIGHTS: Final = (4.0, 3.0, 2.0, 3)  # of a stretch: base + nods a minute, up to + a nod after a phrase, up to
 
-_FILES: Final = "*_[A-Z]_[0-9][0-9][0-9][0-9].npz"  # Stretch.name
+_FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # Stretch.name
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,8 @@ def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes
 def compose_folder(data: Path, out: Path, seed: int, minutes: float, voices: Sequence[Path] = ()) -> dict[str, float]:
     """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train and out/validation.
 
+    Beside them, out/interaction and out/speaking are sets of the same form. No filmed voice, no speaking.
+
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, the AMI clips) and
     those of further folders. Dyads of an earlier run are removed from `out` once the new ones are written, so that two
     sets never mix. Returns the minutes written per split. Raises ConfigError.
@@ -92,19 +102,36 @@ def compose_folder(data: Path, out: Path, seed: int, minutes: float, voices: Seq
     brought = [folder for folder in (data / "facegood_audio_mouth", data / "speech_audio", ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
     motions = data_dir("sim") / "listeners" / "motions.npz"
-    written = dict.fromkeys(SPLITS, 0.0)
-    fresh = set()
-    for split, dyad in dyads(ami, [*bundled, *brought, *voices], motions, seed, minutes):
+    sounds = [*bundled, *brought, *voices]
+    spoken = speaking.dyads(find_voices(sounds), motions, seed, SHARES["speaking"] * minutes)
+    conversation = dyads(ami, sounds, motions, seed, SHARES["interaction"] * minutes, "interaction")
+    return {
+        **_write(dyads(ami, sounds, motions, seed, minutes), out),
+        **_named("interaction", _write(conversation, out / "interaction")),
+        **_named("speaking", _write(spoken, out / "speaking")),
+    }
+
+
+def _write(made: Iterator[tuple[str, Dyad]], out: Path) -> dict[str, float]:
+    """Write a set and remove what an earlier one left; minutes per split."""
+    written, fresh = dict.fromkeys(SPLITS, 0.0), set()
+    for split, dyad in made:
         save(out / split, [dyad])
         fresh.add(out / split / f"{dyad.name}.npz")
         written[split] += len(dyad.listener) * FRAME_S / 60
     for split in SPLITS:
-        for stale in set((out / split).glob(_FILES)) - fresh:
+        for stale in {file for pattern in _FILES for file in (out / split).glob(pattern)} - fresh:
             stale.unlink()
     return written
 
 
-def dyads(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> Iterator[tuple[str, Dyad]]:
+def _named(scene: str, minutes: Mapping[str, float]) -> dict[str, float]:
+    return {f"{scene}_{split}": value for split, value in minutes.items()}
+
+
+def dyads(
+    ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float, scene: Scene = "listening"
+) -> Iterator[tuple[str, Dyad]]:
     """The same one by one, as (split, dyad): for sets that need not lie in memory."""
     if not minutes > 0:
         raise ConfigError(f"--minutes {minutes:g}: must be above 0")
@@ -112,12 +139,13 @@ def dyads(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: 
     spoken = split_voices(find_voices(voices))
     moves = load_motions(motions)
     for number, split in enumerate(SPLITS):
-        rng = np.random.default_rng([seed, number])
+        rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
         wanted = minutes * (1 if split == "train" else VALIDATION_SHARE)
         annotated = [person for person in people[split] if person.gaze is not None]
-        for stretch in choose(stretches(people[split], rng), wanted, rng):
+        for stretch in choose(stretches(people[split], rng, scene), wanted, rng):
             lender = annotated[int(rng.integers(len(annotated)))] if annotated else None
-            yield split, compose_one(stretch, lender, cast(spoken[split], rng), moves[split], rng)
+            voice = cast(spoken[split], rng)
+            yield split, compose_one(stretch, lender, voice, own_voice(spoken[split], voice, rng), moves[split], rng)
 
 
 def cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
@@ -127,11 +155,21 @@ def cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
     return fitting[int(rng.integers(len(fitting)))]
 
 
+def own_voice(voices: Sequence[Voice], other: Voice, rng: np.random.Generator) -> Voice | None:
+    """A filmed voice for the listener himself, another one than the speaker's if there is one; None: none was filmed."""
+    filmed = [voice for voice in voices if voice.mouth is not None]
+    fitting = [voice for voice in filmed if voice.name != other.name] or filmed
+    return fitting[int(rng.integers(len(fitting)))] if fitting else None
+
+
 # --- which stretches --------------------------------------------------------------------------------------------
 
 
-def stretches(people: Sequence[Person], rng: np.random.Generator) -> list[Stretch]:
-    """Cut everybody's time into pieces of 30 to 60 s; keep those he was seen in and mostly listened in."""
+def stretches(people: Sequence[Person], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
+    """Cut everybody's time into pieces of 30 to 60 s; keep those he was seen in and that make the scene.
+
+    Listening: he mostly listens. Interaction: he talks a fifth of the time or more, and so do the others together.
+    """
     found = []
     for person in people:
         at = float(rng.uniform(0, LENGTH_S[0]))
@@ -141,7 +179,9 @@ def stretches(people: Sequence[Person], rng: np.random.Generator) -> list[Stretc
             at += length
             own, others = (active(spans, piece) for spans in (person.talk, person.others))
             listening = listening_mask(others, FRAME_HZ, own)
-            if own.mean() > 0.2 or listening.mean() < 0.6 or active(person.unseen, piece).any():
+            listens = own.mean() <= 0.2 and listening.mean() >= 0.6
+            converses = own.mean() > 0.2 and others.mean() > 0.2
+            if active(person.unseen, piece).any() or not (listens if scene == "listening" else converses):
                 continue
             onsets = within(person.nods, piece)[:, 0]
             rate = nods_per_minute(onsets, listening, FRAME_HZ)
@@ -170,11 +210,17 @@ def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -
 
 
 def compose_one(
-    stretch: Stretch, lender: Person | None, voice: Voice, motions: Motions, rng: np.random.Generator
+    stretch: Stretch,
+    lender: Person | None,
+    voice: Voice,
+    own_voice: Voice | None,
+    motions: Motions,
+    rng: np.random.Generator,
 ) -> Dyad:
     """One stretch, acted and voiced. `lender` gives his looks where those of this meeting were not annotated."""
     person, frames = stretch.person, stretch.frames
     others, own = active(person.others, stretch), active(person.talk, stretch)
+    said, mouth = _own_words(stretch, own_voice, rng.spawn(1)[0])
     score = Score(
         frames,
         nods=within(person.nods, stretch),
@@ -187,9 +233,36 @@ def compose_one(
         shared_laughs=within(person.others_laughs, stretch),
         asked=person.asked[(person.asked > stretch.start_s) & (person.asked < stretch.end_s)] - stretch.start_s,
         ends=phrase_ends(others, FRAME_HZ),
+        mouth=mouth,
+    )
+    heard = labels.Voices(
+        own,
+        others,
+        active(person.backchannels, stretch),
+        active(person.others_backchannels, stretch),
+        active(person.nods, stretch),
     )
     audio, face = speaker_of(stretch, voice, motions, rng)
-    return Dyad(stretch.name, audio, face, listener_motion(score, motions, rng), listening_mask(others, FRAME_HZ, own))
+    return Dyad(
+        stretch.name,
+        audio,
+        face,
+        listener_motion(score, motions, rng),
+        listening_mask(others, FRAME_HZ, own),
+        agent_audio=said,
+        states=labels.label(heard),
+    )
+
+
+def _own_words(
+    stretch: Stretch, voice: Voice | None, rng: np.random.Generator
+) -> tuple[Floats | None, Floats | None]:
+    """The listener's own voice (N * 640,), as a program would send it to a loudspeaker, and its mouth (N, 52)."""
+    if voice is None:
+        return None, None
+    said = np.clip(stretch.person.talk - stretch.start_s, 0, stretch.frames * FRAME_S)
+    speech, mouth = lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
+    return speaking.sent(speech, rng), mouth
 
 
 def speaker_of(stretch: Stretch, voice: Voice, motions: Motions, rng: np.random.Generator) -> tuple[Floats, Floats]:

@@ -43,6 +43,7 @@ class Voice:
         ends: (P,) samples of `audio` at which a phrase ends.
         mouth: (F, 52) by frame of the recording, or None.
         noise: (m,) magnitude spectrum of its pauses, flat where it has none.
+        recording: (r,) 16 kHz, the recording as it is, RMS of its speech 0.06.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Voice:
     ends: NDArray[np.int64]
     mouth: Floats | None
     noise: NDArray[np.float64]
+    recording: Floats
 
 
 def find_voices(folders: Sequence[Path]) -> list[Voice]:
@@ -93,7 +95,9 @@ def read_voice(file: Path) -> Voice:
     joined = joined.reshape(-1, _GRAIN)[keep].reshape(-1)
     origin = np.concatenate([np.arange(start, end, _GRAIN) for start, end in speech])[keep]
     name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
-    return Voice(name, joined, origin, ends, _mouth(file), _pause_spectrum(audio, active))
+    loudness = np.sqrt(np.mean(np.concatenate([audio[start:end] for start, end in speech]) ** 2))
+    whole = np.asarray(np.clip(audio * (_LEVEL / loudness), -1, 1), np.float32)
+    return Voice(name, joined, origin, ends, _mouth(file), _pause_spectrum(audio, active), whole)
 
 
 def _levelled(speech: Floats) -> Floats:
