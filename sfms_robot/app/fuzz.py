@@ -135,12 +135,13 @@ def _bus(head: Head, chain: Chain, clock: VirtualClock, noise: Noise) -> Bus:
     turns = np.array([maps[joint.model].ticks_per_revolution for joint in head.joints.values()])
     wire = partial(VirtualTimePort, chain.device, chain.control, config.baud, clock)
     board = config.family in heads.BOARDS
-    more: dict[str, Any] = {"confirmed": True} if board else {"config": config, "faults": head.faults}
+    more: dict[str, Any] = {"confirmed": True} if board else {"faults": head.faults}
     module, kind = heads.FAMILIES[config.family].split(":")
     build = getattr(import_module(module), kind)
     bus: Bus = build(
-        "main", servos, Calibration(head.joints, turns), lambda: NoisyPort(wire(), noise), config.baud, 0.003, **more
-    )
+        "main", servos, Calibration(head.joints, turns), lambda: NoisyPort(wire(), noise), config.baud, 0.003,
+        config=config, **more,
+    )  # fmt: skip
     return bus
 
 

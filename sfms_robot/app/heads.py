@@ -167,14 +167,21 @@ def _build_one(
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])
         more: dict[str, Any] = {"confirmed": confirmed or isinstance(where, Chain), "rest_rad": rest_rad}
     else:
-        more = {"config": config, "faults": head.faults}
+        more = {"faults": head.faults}
     module, kind = FAMILIES[config.family].split(":")
     build = getattr(import_module(module), kind)
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, SIM_READ_DEADLINE_S)
     bus: Bus = build(
-        name, servos, _calibration(joints), _port(where, config.baud, clock), config.baud, deadline_s, **more
+        name,
+        servos,
+        _calibration(joints),
+        _port(where, config.baud, clock),
+        config.baud,
+        deadline_s,
+        config=config,
+        **more,
     )
     return bus
 

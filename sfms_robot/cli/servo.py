@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json as json_module
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sfms_robot.cli import servo_maps
+from sfms_robot.cli.servo_wiring import Wiring, on_wire
 from sfms_robot.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
@@ -21,12 +21,6 @@ app = typer.Typer(help="Servos: find them, read and write their registers, set i
 app.command("maps")(servo_maps.maps)
 
 
-class Family(StrEnum):
-    dynamixel2 = "dynamixel2"
-    dynamixel1 = "dynamixel1"
-    feetech = "feetech"
-
-
 class Keep(StrEnum):
     all = "all"
     id = "keep-id"
@@ -34,74 +28,52 @@ class Keep(StrEnum):
 
 
 Ids = Annotated[str, typer.Argument(metavar="ID", help="One id, or several: 1-9,12.")]
-PortOption = Annotated[
-    str | None, typer.Option("--port", help="Serial device, or 'sim'. Default: the only one there is.")
-]
-BaudOption = Annotated[int | None, typer.Option("--baud", min=1, help="Look at this rate only. Default: at all.")]
-FamilyOption = Annotated[Family, typer.Option("--family", help="How the servos speak.")]
-HeadOption = Annotated[str, typer.Option("--head", help="Which head's servos --port sim emulates.")]
-ModelOption = Annotated[
-    str | None, typer.Option("--model", help="Take the servos for this model. Default: by their model number.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, last line of stdout.")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before EEPROM is written.")]
 
 
 @app.command()
+@on_wire
 def scan(
+    on: Wiring,
     ids: Annotated[str | None, typer.Option("--ids", help="Ask these one by one, as 1-9,12. Default: all.")] = None,
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
-    json: JsonOption = False,
 ) -> None:
     """Who is there, at which rate."""
     from sfms_robot.app.servo_tools import parse_ids
     from sfms_robot.app.servo_tools import scan as look
 
     asked = parse_ids(ids) if ids is not None else None
-    with _wire(port, baud, family, head, model) as wire, _bar("scanning", hidden=json) as progress:
+    with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
         rows = [seen.row() for seen in look(wire, asked, progress)]
         where = wire.port.name
-    _show(rows, {"port": where, "servos": rows}, json, f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}")
+    _show(rows, {"port": where, "servos": rows}, on.json, f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}")
 
 
 @app.command()
+@on_wire
 def ping(
+    on: Wiring,
     ids: Ids,
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
-    json: JsonOption = False,
 ) -> None:
     """Whether servos answer, and who they are."""
     rows: list[dict[str, Any]] = []
-    with _wire(port, baud, family, head, model) as wire:
+    with on.open() as wire:
         for servo in _parsed(ids):
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except BusError:
                 rows.append({"id": servo, "model": None, "model_number": None, "firmware": None, "baud": None,
                              "note": "", "answers": False})  # fmt: skip
-    _show(rows, {"servos": rows}, json)
+    _show(rows, {"servos": rows}, on.json)
     if not all(row["answers"] for row in rows):
         sys.exit(BusError.exit_code)
 
 
 @app.command()
+@on_wire
 def read(
+    on: Wiring,
     ids: Ids,
     registers: Annotated[list[str], typer.Argument(metavar="REGISTER...", help="Names, or 'all'.")],
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
-    json: JsonOption = False,
 ) -> None:
     """Registers by name: raw and in their unit."""
     from sfms_robot.app.servo_tools import read_registers
@@ -109,21 +81,17 @@ def read(
     def look(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
         return [{"id": seen.id, **value.row()} for value in read_registers(wire, seen, registers)]
 
-    _each(ids, _wire(port, baud, family, head, model), look, json, "registers")
+    _each(ids, on, look, "registers")
 
 
 @app.command(context_settings={"ignore_unknown_options": True})
+@on_wire
 def write(
+    on: Wiring,
     ids: Ids,
     register: Annotated[str, typer.Argument(help="Its name in the firmware map.")],
     value: Annotated[str, typer.Argument(help="Raw number, or one with the register's unit: 90deg.")],
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
     yes: YesOption = False,
-    json: JsonOption = False,
 ) -> None:
     """Write a register and read it back. What lasts (EEPROM) is asked about first, and refused while torque is on."""
     from sfms_robot.app.servo_tools import write_register
@@ -136,45 +104,36 @@ def write(
         return [{"id": seen.id, "register": row["register"], "before": before.raw if before else None,
                  "raw": row["raw"], "value": row["value"], "unit": row["unit"]}]  # fmt: skip
 
-    _each(ids, _wire(port, baud, family, head, model), change, json, "written")
+    _each(ids, on, change, "written")
 
 
 @app.command("set-id")
+@on_wire
 def set_id(
+    on: Wiring,
     old: Annotated[int, typer.Argument(help="The id it has.")],
     new: Annotated[int, typer.Argument(help="The id it gets.")],
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
     in_chain: Annotated[bool, typer.Option("--in-chain", help="Other servos may be on the wire meanwhile.")] = False,
     yes: YesOption = False,
-    json: JsonOption = False,
 ) -> None:
     """Give a servo another id. Best with that one servo on the wire."""
     from sfms_robot.app.servo_tools import set_id as change
 
     _each(
         str(old),
-        _wire(port, baud, family, head, model),
+        on,
         lambda wire, seen: [change(wire, seen, new, _confirm(yes), in_chain).row()],
-        json,
         "servos",
     )
 
 
 @app.command("set-baud")
+@on_wire
 def set_baud(
+    on: Wiring,
     ids: Ids,
     rate: Annotated[int, typer.Argument(metavar="BAUD", help="The rate it gets, bits per second.")],
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
     yes: YesOption = False,
-    json: JsonOption = False,
 ) -> None:
     """Give servos another rate, and check that they answer at it."""
     from sfms_robot.app.servo_tools import set_baud as change
@@ -182,23 +141,18 @@ def set_baud(
     confirm = _confirm(yes, ids)
     _each(
         ids,
-        _wire(port, baud, family, head, model),
+        on,
         lambda wire, seen: [change(wire, seen, rate, confirm).row()],
-        json,
         "servos",
     )
 
 
 @app.command()
+@on_wire
 def reboot(
+    on: Wiring,
     ids: Ids,
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
     yes: YesOption = False,
-    json: JsonOption = False,
 ) -> None:
     """Start servos over: torque goes off, latched hardware errors go away."""
     from sfms_robot.app.servo_tools import reboot as restart
@@ -206,62 +160,52 @@ def reboot(
     confirm = _confirm(yes, ids)
     _each(
         ids,
-        _wire(port, baud, family, head, model),
+        on,
         lambda wire, seen: [restart(wire, seen, confirm).row()],
-        json,
         "servos",
     )
 
 
 @app.command("factory-reset")
+@on_wire
 def factory_reset(
+    on: Wiring,
     servo: Annotated[int, typer.Argument(metavar="ID")],
     keep: Annotated[Keep, typer.Option("--reset", help="What goes back to its factory value.")] = Keep.id_and_baud,
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
     yes: YesOption = False,
-    json: JsonOption = False,
 ) -> None:
     """Put a servo's settings back to what they were when it was new."""
     from sfms_robot.app.servo_tools import factory_reset as reset
 
     _each(
         str(servo),
-        _wire(port, baud, family, head, model),
+        on,
         lambda wire, seen: [reset(wire, seen, keep.value, _confirm(yes)).row()],
-        json,
         "servos",
     )
 
 
 @app.command()
+@on_wire
 def monitor(
+    on: Wiring,
     ids: Annotated[str | None, typer.Argument(metavar="ID", help="1-9,12. Default: everybody.")] = None,
-    port: PortOption = None,
-    baud: BaudOption = None,
-    family: FamilyOption = Family.dynamixel2,
-    head: HeadOption = "face28",
-    model: ModelOption = None,
     samples: Annotated[int | None, typer.Option(min=1, help="End after so many looks. Default: Ctrl-C ends.")] = None,
     rate: Annotated[float, typer.Option("--rate", min=0.1, max=50.0, help="Looks per second.")] = 5.0,
-    json: JsonOption = False,
 ) -> None:
     """Position, load, voltage, temperature and faults, live. Reads only."""
     from sfms_robot.app.servo_state import samples as looks
     from sfms_robot.app.servo_tools import scan as look
 
     taken: list[list[dict[str, Any]]] = []
-    with _wire(port, baud, family, head, model) as wire:
+    with on.open() as wire:
         asked = _parsed(ids) if ids is not None else None
-        with _bar("looking for servos", hidden=json) as progress:
+        with _bar("looking for servos", hidden=on.json) as progress:
             servos = [wire.find(servo) for servo in asked] if asked is not None else look(wire, None, progress)
         if not servos:
             raise BusError(f"{wire.port.name}: nobody answers")
-        count = samples if samples is not None else 1 if json else None
-        if json:
+        count = samples if samples is not None else 1 if on.json else None
+        if on.json:
             taken = list(looks(wire, servos, 1.0 / rate, count))
         else:
             from sfms_robot.cli.servo_tables import live
@@ -270,7 +214,7 @@ def monitor(
                 looks(wire, servos, 1.0 / rate, count),
                 f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends",
             )
-    if json:
+    if on.json:
         print(json_module.dumps({"samples": taken}))
 
 
@@ -280,33 +224,24 @@ def _parsed(ids: str) -> list[int]:
     return parse_ids(ids)
 
 
-@contextmanager
-def _wire(port: str | None, baud: int | None, family: Family, head: str, model: str | None) -> Iterator[Wire]:
-    from sfms_robot.app.servo_wire import open_wire, real_clock
-
-    with open_wire(port, family.value, baud, head, real_clock(), model) as wire:
-        yield wire
-
-
 def _each(
     ids: str,
-    opened: Any,
+    on: Wiring,
     work: Callable[[Wire, Seen], list[dict[str, Any]]],
-    json: bool,
     key: str,
 ) -> None:
     """Do `work` for every id; what was done is shown even when a later one fails."""
     rows: list[dict[str, Any]] = []
     servos = _parsed(ids)
     try:
-        with opened as wire:
+        with on.open() as wire:
             for servo in servos:
                 rows += work(wire, wire.find(servo))
     except Exception:
-        if rows and not json:
-            _show(rows, {}, json)
+        if rows and not on.json:
+            _show(rows, {}, on.json)
         raise
-    _show(rows, {key: rows}, json)
+    _show(rows, {key: rows}, on.json)
 
 
 def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, title: str | None = None) -> None:

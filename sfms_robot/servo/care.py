@@ -12,16 +12,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.config import Faults
 from sfms_robot.errors import BusError
-from sfms_robot.servo.dxl2_link import Dxl2Link
-from sfms_robot.servo.handshake import Handshake
-from sfms_robot.servo.policy import BusServo, LoadWatch, Voice, torque_register
+from sfms_robot.servo.contact import Contact
+from sfms_robot.servo.link import RegisterLink
+from sfms_robot.servo.policy import BusServo, LoadWatch, Measured, Voice, torque_register
 from sfms_robot.servo.recovery import AGAIN_S, ATTEMPTS, Recovery
 from sfms_robot.servo.registers import Table
-from sfms_robot.servo.telemetry import Telemetry
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +37,22 @@ FORGET_S: Final = 60.0  # attempts older than this do not count any more
 NEAR: Final = 1 / 500  # of a turn: a goal this close to where a joint stands continues from there
 
 
+class Told(Protocol):
+    """What the servos of a bus last said, as far as it matters here; arrays (J,) in bus order.
+
+    Attributes:
+        ticks: positions.
+        seen_s: when they came.
+        current_mA: NaN where it is not known.
+    """
+
+    ticks: NDArray[np.int64]
+    seen_s: NDArray[np.float64]
+    current_mA: NDArray[np.float64]
+
+    def measured(self, index: int) -> Measured: ...
+
+
 class Care:
     """Troubles of the servos of one bus, by index in bus order.
 
@@ -45,17 +63,15 @@ class Care:
         rejoined: who came to hold a position in this tick.
     """
 
-    def __init__(
-        self, servos: Sequence[BusServo], tables: Sequence[Table], faults: Faults, telemetry: Telemetry
-    ) -> None:
+    def __init__(self, servos: Sequence[BusServo], tables: Sequence[Table], faults: Faults, telemetry: Told) -> None:
         self._servos = servos
         self._tables = tables
         self._voice = Voice(servos, faults)
         self._telemetry = telemetry
         self._loads = LoadWatch(servos)
         self._recovery = Recovery()
-        self._shake: Handshake | None = None
-        self._link: Dxl2Link | None = None
+        self._shake: Contact[Any] | None = None
+        self._link: RegisterLink | None = None
         self._bits = [0] * len(servos)
         self._faulty: list[list[str]] = [[] for _ in servos]  # faults that count
         self._attempts_s: list[list[float]] = [[] for _ in servos]
@@ -70,7 +86,7 @@ class Care:
         """Every fault so far, `joint: fault`, in the order of appearance."""
         return self._voice.said
 
-    def attach(self, link: Dxl2Link, shake: Handshake) -> None:
+    def attach(self, link: RegisterLink, shake: Contact[Any]) -> None:
         """The wire in use from now on."""
         self._link, self._shake = link, shake
 
@@ -94,7 +110,7 @@ class Care:
     # --- what is noticed ----------------------------------------------------------------------------------------
 
     def take_bits(self, index: int, bits: int, now_s: float) -> None:
-        """Hardware error bits as read from the servo; acted upon when a fault is new, or begins to count."""
+        """Fault bits as told by the servo; acted upon when a fault is new, or begins to count."""
         if not bits and not self._bits[index]:
             return
         self._bits[index] = bits
@@ -104,7 +120,8 @@ class Care:
             if self._voice.counts(index, name, self._telemetry.measured(index))
         ]
         new, self._faulty[index] = set(names) - set(self._faulty[index]), names
-        self.fault[index] = ", ".join(names) or None
+        if names or not self._stays(index):  # who stays out says why, also when the cause has passed
+            self.fault[index] = ", ".join(names) or None
         if new:
             self._voice.say(index, ", ".join(names))
             if index in self.wanted and index not in self._recovery:
@@ -141,7 +158,9 @@ class Care:
     def gone(self, index: int, why: str) -> None:
         """It does not answer, and not because of one lost packet."""
         if index in self.wanted and self.away.get(index) != REBOOT:
-            self._recovery.drop(index)
+            if index in self._recovery:
+                self._recovery.drop(index)
+                self.away[index] = why  # it was to come back, and still is
             self.rejoining.pop(index, None)
             self.away.setdefault(index, why)
 
@@ -183,7 +202,7 @@ class Care:
     def _act(self, index: int, policy: str, now_s: float) -> None:
         if policy == "limp":
             self.away[index] = "limp"
-            self._write(index, "torque_enable", lambda raw: 0)
+            self._switch_off(index)
         elif policy == "hold":
             self.away[index] = "hold"
         elif policy == "reduce":
@@ -191,9 +210,17 @@ class Care:
             current = self._servos[index].safety.current_limit_mA is not None and "goal_current" in table.fields
             strength = "goal_current" if current else torque_register(self._servos[index].map)
             self._write(index, strength or "", lambda raw: raw // 2)
-        else:
+        elif self._shake is not None and self._shake.can_reboot:
             self.away[index] = REBOOT
             self._again(index, now_s, now_s, reboot=True)
+        else:
+            self.away[index] = "limp"
+            self._switch_off(index)
+            self._again(index, now_s + REST_S, now_s)
+
+    def _switch_off(self, index: int) -> None:
+        torque = self._tables[index].role("torque_enable")
+        self._write(index, torque.name if torque is not None else "", lambda raw: 0)
 
     def _write(self, index: int, name: str, change: Callable[[int], int]) -> None:
         """One register, changed; once more where nobody says that it was taken."""
@@ -226,8 +253,9 @@ class Care:
         self._recovery.begin(index, self._shake, due_s, reboot)
 
     def _stays(self, index: int) -> bool:
-        return self.away[index] in ("limp", "hold")
+        return self.away.get(index) in ("limp", "hold")
 
     def _names(self, index: int, bits: int) -> list[str]:
-        faults = self._tables[index].faults
+        table = self._tables[index]
+        faults = table.faults if table.protocol == 2 else table.status_faults
         return [faults.get(bit, f"hardware error bit {bit}") for bit in range(8) if bits >> bit & 1]

@@ -10,9 +10,7 @@ the byte stream: by id and length, so that a late or foreign reply can never be 
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -22,16 +20,9 @@ from numpy.typing import NDArray
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, Packet, maybe_packet
-from sfms_robot.servo.link import Answer, Found
+from sfms_robot.servo.link import CHUNK, NO_PATIENCE, Answer, Found, RegisterLink
 from sfms_robot.servo.port import Port
 
-log = logging.getLogger(__name__)
-
-_CHUNK: Final = 4096
-_ADAPTER_S: Final = 0.05  # the longest that an adapter may hold an answer back
-_SAMPLES: Final = 3
-_MARGIN: Final = 1.25
-_NO_PATIENCE: Final = 10  # read deadlines that rubbish on the wire may cost before a request is given up
 _REQUESTS_KEPT: Final = 512
 _WRITES_KEPT: Final = 16  # each has a table of 0.5 KiB per byte of data
 _PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
@@ -57,57 +48,15 @@ class _Draft:
         """The SDK sets it after each request; we have our own deadlines."""
 
 
-class Dxl2Link:
-    """One wire of Protocol 2.0 servos; a `RegisterLink`.
-
-    Args:
-        port: owned by the link from now on.
-        baud: bits per second, to tell how long bytes take.
-        silence_s: how long to wait for the next byte before the servo counts as silent.
-    """
+class Dxl2Link(RegisterLink):
+    """One wire of Protocol 2.0 servos."""
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
-        self.port = port
-        self.silence_s = silence_s
-        self._byte_s = 10.0 / baud
+        super().__init__(port, baud, silence_s)
         self._sdk = Protocol2PacketHandler()
         self._requests: dict[tuple[object, ...], bytes] = {}
         self._writes: dict[tuple[int, int, tuple[int, ...]], _SyncWrite] = {}
         self._sent = 0
-
-    @contextmanager
-    def patient(self, silence_s: float) -> Iterator[None]:
-        """Wait at least `silence_s` for answers inside the block."""
-        usual, self.silence_s = self.silence_s, max(self.silence_s, silence_s)
-        try:
-            yield
-        finally:
-            self.silence_s = usual
-
-    def rest(self, duration_s: float) -> None:
-        """Leave the wire alone for so long; in virtual time that is no time. What comes meanwhile is dropped."""
-        end_s = self.port.now_s() + duration_s
-        while self.port.read(_CHUNK, end_s):
-            pass
-
-    def adapt(self, servo: int, address: int, length: int) -> float:
-        """Wait longer from now on where the adapter holds answers back: it would make every servo silent.
-
-        Seconds of silence that are waited for now.
-        """
-        took_s = 0.0
-        with self.patient(_ADAPTER_S):
-            for _ in range(_SAMPLES):
-                asked_s = self.port.now_s()
-                if self.read(servo, address, length) is not None:
-                    took_s = max(took_s, self.port.now_s() - asked_s)
-        if took_s > self.silence_s:
-            self.silence_s = _MARGIN * took_s
-            log.warning(
-                "%s: an answer takes %.1f ms, so a silent servo costs %.1f ms; `sfms-robot doctor` says what to do",
-                self.port.name, took_s * 1e3, self.silence_s * 1e3,
-            )  # fmt: skip
-        return self.silence_s
 
     # --- one servo ----------------------------------------------------------------------------------------------
 
@@ -190,15 +139,15 @@ class Dxl2Link:
         size = 8 + len(servos) * (length + 4)
         buffer, start = bytearray(), -1
         deadline_s = self.port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
-        last_s = deadline_s + size * self._byte_s + _NO_PATIENCE * self.silence_s
+        last_s = deadline_s + size * self._byte_s + NO_PATIENCE * self.silence_s
         while len(buffer) < max(start, 0) + size and self.port.now_s() < last_s:
-            data = self.port.read(_CHUNK, deadline_s)
+            data = self.port.read(CHUNK, deadline_s)
             if not data:
                 break
             buffer += data
             if start < 0:
                 start = buffer.find(_HEADER + b"\x00\xfe")
-            if len(buffer) > dxl2.MAX_PACKET + _CHUNK:
+            if len(buffer) > dxl2.MAX_PACKET + CHUNK:
                 break
             deadline_s = self.port.now_s() + self.silence_s
         answers: dict[int, Packet] = {}
@@ -248,9 +197,9 @@ class Dxl2Link:
         pending = set(servos)
         size = STATUS_OVERHEAD + length
         deadline_s = port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
-        last_s = deadline_s + 2 * len(servos) * size * self._byte_s + _NO_PATIENCE * self.silence_s
+        last_s = deadline_s + 2 * len(servos) * size * self._byte_s + NO_PATIENCE * self.silence_s
         while pending and port.now_s() < last_s:
-            data = port.read(_CHUNK, deadline_s)
+            data = port.read(CHUNK, deadline_s)
             if not data:
                 break
             buffer += data

@@ -6,90 +6,46 @@ torque on by themselves when a goal is written, so the first goal anybody writes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Final
 
-from sfms_robot.errors import BusError, ServoError
 from sfms_robot.servo.codecs import dxl1, feetech
+from sfms_robot.servo.contact import PATIENCE_S, Contact, Steps, finish
 from sfms_robot.servo.frame1_link import Frame1Link
 from sfms_robot.servo.link import Answer, Found
-from sfms_robot.servo.policy import BusServo, torque_limit
+from sfms_robot.servo.policy import torque_limit
 from sfms_robot.servo.registers import Field, Table
 
-_TRIES: Final = 3
-_PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms
 _UNLIMITED: Final = ("moving_speed", "goal_velocity", "acceleration", "goal_acceleration", "goal_time")  # 0 = none
 
 
-class Silent(ServoError):
-    """It did not answer."""
+class Frame1Handshake(Contact[Frame1Link]):
+    """`Contact` with servos that have no reboot, and tell their faults in every answer."""
 
+    can_reboot = False
 
-class Frame1Handshake:
-    """Checked requests to one servo after the other. `index` counts servos in bus order.
-
-    `patient`: ask again, and wait as long as a slow adapter may take; not beside a running bus.
-    """
-
-    def __init__(
-        self,
-        bus: str,
-        link: Frame1Link,
-        servos: Sequence[BusServo],
-        tables: Sequence[Table],
-        baud: int,
-        patient: bool = True,
-    ) -> None:
-        self._bus = bus
-        self._link = link
-        self._servos = servos
-        self._tables = tables
-        self._baud = baud
-        self._tries = _TRIES if patient else 1
-        self._patience_s = _PATIENCE_S if patient else 0.0
-
-    def run(self) -> None:
-        """Identify and prepare every servo.
-
-        Raises BusError listing the ids that do not answer, ServoError for one that is not what it should be.
-        """
-        with self._link.patient(self._patience_s):
+    def run(self) -> list[int]:
+        with self._link.patient(PATIENCE_S):
             self._identify()
             for index in range(len(self._servos)):
-                self.prepare(index)
+                finish(self.prepare(index))
+        return [0] * len(self._servos)
 
-    def _identify(self) -> None:
-        found: dict[int, Found] = {}
-        for _ in range(self._tries):
-            for index, servo in enumerate(self._servos):
-                if index not in found and (who := self._link.ping(servo.id)) is not None:
-                    if who.model_number is None:
-                        self._make_talk(index)
-                    else:
-                        found[index] = who
-        absent = [f"{s.id} ({s.joint})" for i, s in enumerate(self._servos) if i not in found]
-        if absent:
-            there = ", ".join(str(self._servos[i].id) for i in sorted(found)) or "none"
-            raise BusError(
-                f"bus {self._bus!r} on {self._link.port.name} at {self._baud} baud: "
-                f"no answer from id {', '.join(absent)}; ids that answer: {there}"
-            )
-        for index, who in found.items():
-            self._check_model(index, who.model_number)
+    def _meet(self, index: int) -> Found | None:
+        who = super()._meet(index)
+        if who is not None and who.model_number is None:
+            self._make_talk(index)
+            return None
+        return who
 
-    def _check_model(self, index: int, number: int | None) -> None:
-        table = self._tables[index]
-        if table.model_number is not None and number != table.model_number:
-            raise self._error(index, f"is model number {number}, the head says {table.model} ({table.model_number})")
-
-    def prepare_again(self, index: int) -> None:
-        """As at start-up, for a servo that was away; what its EEPROM holds is still there."""
-        self._check_model(index, self._value(index, self._tables[index]["model_number"]))
-        self.prepare(index, anew=True)
+    def bring_back(self, index: int, reboot: bool) -> Steps[int]:
+        self._recognise(index, Found(self._value(index, self.tables[index]["model_number"]), None))
+        yield 0.0
+        yield from self.prepare(index, anew=True)
+        return (yield from self.torque_on(index))
 
     def _make_talk(self, index: int) -> None:
         """Raise its status level; while that is low, it does not acknowledge."""
-        servo, lock = self._servos[index].id, self._tables[index].role("lock")
+        servo, lock = self._servos[index].id, self.tables[index].role("lock")
         level = self._field(index, "status_level")
         if lock is not None:
             self._link.write(servo, lock.address, lock.to_bytes(0))
@@ -97,17 +53,19 @@ class Frame1Handshake:
         if lock is not None:
             self._link.write(servo, lock.address, lock.to_bytes(1))
 
-    def prepare(self, index: int, anew: bool = False) -> None:
+    def prepare(self, index: int, anew: bool = False) -> Steps[None]:
         """Position mode, all answers, no delay, no speed limit of its own. Torque is left as it is.
 
         `anew`: its EEPROM was seen to before.
         """
-        table = self._tables[index]
+        table = self.tables[index]
         level = self._field(index, "status_level")
         if self._value(index, level) != level.high:
             self._make_talk(index)
         torque = self._value(index, self._field(index, "torque_enable"))
+        yield 0.0
         for field, wanted in self._settings(index, table):
+            yield 0.0
             if anew and field.eeprom:
                 continue
             value = self._value(index, field)
@@ -136,7 +94,7 @@ class Frame1Handshake:
 
     def _strength(self, index: int) -> dict[str, int]:
         """Register and value of the torque limit: what the head says, else all: an earlier run may have left less."""
-        table = self._tables[index]
+        table = self.tables[index]
         strength = table.role("torque_limit")
         if strength is None or "max_torque" not in table.fields:
             return torque_limit(self._servos[index])
@@ -151,18 +109,17 @@ class Frame1Handshake:
             return []
         return [(low, 0), (high, high.high)]
 
-    def torque_on_without_a_jump(self, index: int) -> int:
-        """Goal := present, read back, torque on; the position held, in ticks."""
-        table = self._tables[index]
+    def torque_on(self, index: int) -> Steps[int]:
+        yield 0.0
+        table = self.tables[index]
         goal, torque = self._field(index, "goal_position"), self._field(index, "torque_enable")
-        with self._link.patient(self._patience_s):
-            present = self._value(index, self._field(index, "present_position"))
-            self._refuse_outside(index, present)
-            self._set(index, goal, present)
-            for name, value in self._strength(index).items():
-                if not self._value(index, table[name]):  # since it shut down
-                    self._set(index, table[name], value)
-            self._set(index, torque, 1)
+        present = self._value(index, self._field(index, "present_position"))  # from here on without a pause
+        self._refuse_outside(index, present)
+        self._set(index, goal, present)
+        for name, value in self._strength(index).items():
+            if not self._value(index, table[name]):  # since it shut down
+                self._set(index, table[name], value)
+        self._set(index, torque, 1)
         return present
 
     def _refuse_outside(self, index: int, present: int) -> None:
@@ -176,7 +133,7 @@ class Frame1Handshake:
 
     def own_limits(self, index: int) -> tuple[int, int] | None:
         """The position limits in the servo itself, ticks; None when there are none."""
-        table = self._tables[index]
+        table = self.tables[index]
         for names in (("cw_angle_limit", "ccw_angle_limit"), ("min_position_limit", "max_position_limit")):
             if names[0] in table.fields:
                 low, high = (self._value(index, table[name]) for name in names)
@@ -188,11 +145,11 @@ class Frame1Handshake:
 
         Raises ServoError for a model that cannot.
         """
-        table, servo = self._tables[index], self._servos[index]
+        table, servo = self.tables[index], self._servos[index]
         torque = self._field(index, "torque_enable")
         if "homing_offset" not in table.fields or torque.high < feetech.CALIBRATE_HERE:
             raise self._error(index, f"is a {table.model}, which cannot be calibrated where it stands")
-        with self._link.patient(self._patience_s):
+        with self._link.patient(PATIENCE_S):
             self._set(index, torque, 0)
             lock = table.role("lock")
             if lock is not None:
@@ -207,18 +164,10 @@ class Frame1Handshake:
 
     # --- registers ----------------------------------------------------------------------------------------------
 
-    def get(self, index: int, role: str) -> int:
-        """Value of a role's register. Raises ServoError when the servo refuses or stays silent."""
-        return self._value(index, self._field(index, role))
-
-    def put(self, index: int, role: str, value: int) -> None:
-        """Write a role's register, unlocking the EEPROM for it where that is needed, and read it back."""
-        self._set(index, self._field(index, role), value)
-
     def _field(self, index: int, role: str) -> Field:
-        field = self._tables[index].role(role)
+        field = self.tables[index].role(role)
         if field is None:
-            raise self._error(index, f"is a {self._tables[index].model}, which has no register for {role}")
+            raise self._error(index, f"is a {self.tables[index].model}, which has no register for {role}")
         return field
 
     def _value(self, index: int, field: Field) -> int:
@@ -229,7 +178,7 @@ class Frame1Handshake:
         return field.from_bytes(answer.data)
 
     def _set(self, index: int, field: Field, value: int) -> None:
-        lock = self._tables[index].role("lock")
+        lock = self.tables[index].role("lock")
         if field.eeprom and lock is not None:
             self._write(index, lock, 0)
             try:
@@ -250,25 +199,12 @@ class Frame1Handshake:
         if (now := self._value(index, field)) != value:
             raise self._error(index, f"{field.name} was set to {value} and reads {now}{self._trouble(index)}")
 
-    def _repeat(self, index: int, what: str, request: Callable[[], Answer | None]) -> Answer:
-        for _ in range(self._tries):
-            answer = request()
-            if answer is not None:
-                break
-        else:
-            raise Silent(str(self._error(index, f"does not answer to {what}")))
-        refusal = dxl1.refusal_text(answer.error) if self._link.family == "dynamixel" else ""
-        if refusal:
-            raise self._error(index, f"refuses {what}: {refusal}")
-        return answer
+    def _refusal(self, answer: Answer) -> str:
+        return dxl1.refusal_text(answer.error) if self._link.family == "dynamixel" else ""
 
     def _trouble(self, index: int) -> str:
         """What the servo reports beside, to add to a message."""
         torque = self._field(index, "torque_enable")
         answer = self._link.read(self._servos[index].id, torque.address, torque.size)
-        fault = "" if answer is None else self._tables[index].status_fault_names(answer.error)
+        fault = "" if answer is None else self.tables[index].status_fault_names(answer.error)
         return f", and it reports a hardware error ({fault})" if fault else ""
-
-    def _error(self, index: int, problem: str) -> ServoError:
-        servo = self._servos[index]
-        return ServoError(f"{servo.joint} (id {servo.id}) {problem}")

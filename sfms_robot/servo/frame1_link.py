@@ -11,8 +11,7 @@ once it has answered that, nothing older can come.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Literal
 
 from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler
@@ -20,13 +19,11 @@ from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.codecs import dxl1, feetech, frame1
 from sfms_robot.servo.codecs.frame1 import BROADCAST, MAX_FRAME, OVERHEAD, Frame, encode, maybe_frame, salvage
-from sfms_robot.servo.link import Answer, Found
+from sfms_robot.servo.link import CHUNK, NO_PATIENCE, Answer, Found, RegisterLink
 from sfms_robot.servo.port import Port
 
 Family = Literal["dynamixel", "feetech"]
 
-_CHUNK: Final = 4096
-_NO_PATIENCE: Final = 10  # read deadlines that rubbish on the wire may cost before a request is given up
 _OWED_S: Final = 1.0  # an answer that has not come by then never will
 _FENCES: Final = 2  # of a group at most: answers share one wire, so those behind cannot overtake
 _STAGGER_S: Final = 0.003  # lerobot @7427f31, motors/feetech/feetech.py: what a broadcast ping may take per id
@@ -47,45 +44,17 @@ class _SdkPort:
         return len(packet)
 
 
-class Frame1Link:
-    """One wire, as `RegisterLink`.
-
-    Args:
-        port: owned by the link from now on.
-        baud: bits per second, to tell how long bytes take.
-        silence_s: how long to wait for the next byte before the servo counts as silent.
-        family: whose instructions are spoken.
-    """
+class Frame1Link(RegisterLink):
+    """One wire; `family` is whose instructions are spoken."""
 
     def __init__(self, port: Port, baud: int, silence_s: float, family: Family) -> None:
-        self._port = port
-        self.silence_s = silence_s
+        super().__init__(port, baud, silence_s)
         self.family = family
-        self._byte_s = 10.0 / baud
         self._sdk = Protocol1PacketHandler()
         self._sdk_port = _SdkPort(self._write)
         self._sent = b""
         self._owed: dict[int, dict[int, float]] = {}
         self._echoed = False
-
-    @property
-    def port(self) -> Port:
-        return self._port
-
-    @contextmanager
-    def patient(self, silence_s: float) -> Iterator[None]:
-        """Wait at least `silence_s` for answers inside the block."""
-        usual, self.silence_s = self.silence_s, max(self.silence_s, silence_s)
-        try:
-            yield
-        finally:
-            self.silence_s = usual
-
-    def rest(self, duration_s: float) -> None:
-        """Leave the wire alone for so long; in virtual time that is no time. What comes meanwhile is dropped."""
-        end_s = self._port.now_s() + duration_s
-        while self._port.read(_CHUNK, end_s):
-            pass
 
     # --- one servo ----------------------------------------------------------------------------------------------
 
@@ -127,14 +96,14 @@ class Frame1Link:
     def reboot(self, servo: int) -> Answer | None:
         """Raises PacketError: there is no such instruction in these protocols."""
         raise PacketError(
-            f"{self._port.name}: servo {servo} speaks {self.family} and has no reboot instruction: "
+            f"{self.port.name}: servo {servo} speaks {self.family} and has no reboot instruction: "
             "switch its supply off and on"
         )
 
     def factory_reset(self, servo: int, option: int) -> Answer | None:
         """Everything, id and baud included. Raises PacketError when `option` asks to keep something."""
         if option != 0xFF:
-            raise PacketError(f"{self._port.name}: a {self.family} servo resets everything (255), not option {option}")
+            raise PacketError(f"{self.port.name}: a {self.family} servo resets everything (255), not option {option}")
         return self._ask(servo, frame1.FACTORY_RESET, b"", 0)
 
     def _who(self, servo: int) -> Found:
@@ -196,7 +165,7 @@ class Frame1Link:
         owed = self._owed.get(servo)
         if owed is None:
             return False
-        now_s = self._port.now_s()
+        now_s = self.port.now_s()
         for size in [size for size, asked_s in owed.items() if now_s - asked_s > _OWED_S]:
             del owed[size]
         return length in owed
@@ -211,7 +180,7 @@ class Frame1Link:
         return servo in self._answers([servo], size)
 
     def _send(self, servo: int, code: int, params: bytes) -> None:
-        self._port.discard_input()
+        self.port.discard_input()
         if self.family == "feetech":
             self._write(encode(servo, code, params))
             return
@@ -219,10 +188,10 @@ class Frame1Link:
         result = self._sdk.txPacket(self._sdk_port, packet)
         self._sdk_port.is_using = False
         if result != COMM_SUCCESS:
-            raise PacketError(f"{self._port.name}: the request was not sent: {self._sdk.getTxRxResult(result)}")
+            raise PacketError(f"{self.port.name}: the request was not sent: {self._sdk.getTxRxResult(result)}")
 
     def _write(self, packet: bytes) -> None:
-        self._port.write(packet)
+        self.port.write(packet)
         self._sent = packet
 
     def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
@@ -230,14 +199,14 @@ class Frame1Link:
 
         Waits until all are there, or nothing came for `silence_s` beyond the time that the bytes take.
         """
-        port, buffer, answers, echo = self._port, bytearray(), dict[int, Answer](), self._sent
+        port, buffer, answers, echo = self.port, bytearray(), dict[int, Answer](), self._sent
         pending = set(servos)
         self._echoed = False
         deadline_s = port.now_s() + len(echo) * self._byte_s + self.silence_s
         answer_s = 2 * len(servos) * (OVERHEAD + length) * self._byte_s
-        last_s = deadline_s + answer_s + _NO_PATIENCE * self.silence_s
+        last_s = deadline_s + answer_s + NO_PATIENCE * self.silence_s
         while pending and port.now_s() < last_s:
-            data = port.read(_CHUNK, deadline_s)
+            data = port.read(CHUNK, deadline_s)
             if not data:
                 break
             buffer += data

@@ -30,7 +30,11 @@ class Frame1Telemetry:
         fields: registers of every tick by role, alike for all servos of the bus.
         block: (address, length) of what is read in every poll.
         currents: of each servo the register of its present current; None where it has none that tells milliamperes.
+        position: the same block: the position comes with the rest.
+        torque: the register of torque enable.
         ticks: (J,) last position.
+        seen_s: (J,) when it came, -inf before the first.
+        current_mA: (J,) NaN where it is not known.
 
     Raises ConfigError for servos of another family, or whose registers lie at different places.
     """
@@ -40,6 +44,8 @@ class Frame1Telemetry:
         polled = [self.fields[role] for role in POLLED]
         first = min(each.address for each in polled)
         self.block = first, max(each.address + each.size for each in polled) - first
+        self.position = self.block
+        self.torque = self.fields["torque_enable"]
         currents = [table.role("present_current") for table in tables]
         self.currents = [each if each is not None and each.unit == "mA" else None for each in currents]
         self._at = {role: self.fields[role].address - first for role in POLLED}
@@ -49,7 +55,8 @@ class Frame1Telemetry:
             np.zeros(len(tables), np.int64)
         )
         self.ticks = np.zeros(len(tables), np.int64)
-        self._seen_s = [-math.inf] * len(tables)
+        self.seen_s = np.full(len(tables), -np.inf)
+        self.current_mA = np.full(len(tables), np.nan)
         self._extra: list[dict[str, float]] = [{} for _ in tables]
 
     def capabilities(self, index: int) -> frozenset[str]:
@@ -61,7 +68,7 @@ class Frame1Telemetry:
         fields, extra = self.fields, self._extra[index]
         value = {role: fields[role].from_bytes(data[at : at + fields[role].size]) for role, at in self._at.items()}
         self.ticks[index] = value["present_position"]
-        self._seen_s[index] = now_s
+        self.seen_s[index] = now_s
         speed = fields["present_speed"]
         per_turn = 60.0 if speed.unit == "rpm" else 360.0
         ticks_s = speed.to_unit(value["present_speed"]) * self._turns[index] / per_turn
@@ -69,22 +76,15 @@ class Frame1Telemetry:
         for role, key in _PLAIN.items():
             extra[key] = fields[role].to_unit(value[role])
 
-    def take_current(self, index: int, field: Field, data: bytes) -> float:
-        """The present current, mA."""
-        current_mA = field.to_unit(field.from_bytes(data))
-        self._extra[index]["current_mA"] = current_mA
-        return current_mA
+    def take_current(self, index: int, field: Field, data: bytes) -> None:
+        self.current_mA[index] = self._extra[index]["current_mA"] = field.to_unit(field.from_bytes(data))
 
     def measured(self, index: int) -> Measured:
         return Measured(self._extra[index].get("voltage_V"), self._extra[index].get("temperature_C"))
 
-    def angle(self, index: int) -> float:
-        """Last position, rad."""
-        return float(self._conversion.to_rad(self.ticks)[index])
-
     def supply_mA(self) -> float:
         """Sum of the motor currents that are known."""
-        return sum(abs(extra.get("current_mA", 0.0)) for extra in self._extra)
+        return float(np.nansum(np.abs(self.current_mA)))
 
     def readings(
         self, joints: Sequence[str], faults: Sequence[str | None], rejoined: set[int], now_s: float
@@ -92,7 +92,7 @@ class Frame1Telemetry:
         angles = self._conversion.to_rad(self.ticks).tolist()
         out: dict[str, Reading] = {}
         for index, (joint, fault) in enumerate(zip(joints, faults, strict=True)):
-            age_s = now_s - self._seen_s[index]
+            age_s = now_s - float(self.seen_s[index])
             if age_s == math.inf:
                 out[joint] = Reading(None, math.inf, fault)
             else:

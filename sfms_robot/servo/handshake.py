@@ -1,28 +1,19 @@
-"""First contact with the servos of a bus: who is there, is it what the head says, and torque on without a jump.
-
-Each job is a generator of *steps*: between two exchanges on the wire it yields how long it would like to wait. At
-start-up a job is run through at once; when a servo comes back while the bus is running, a tick takes a few steps and
-goes on with its own work. Whatever is written is read back.
-"""
+"""First contact with Dynamixel 2.0: who is there, is it what the head says, and torque on without a jump."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import Final, TypeVar
+from collections.abc import Mapping
+from typing import Final
 
 from sfms_robot.config import variant
-from sfms_robot.errors import BusError, ConfigError, ServoError
+from sfms_robot.errors import ConfigError
 from sfms_robot.servo.codecs.dxl2 import ALERT, error_text
+from sfms_robot.servo.contact import PATIENCE_S, Contact, Silent, Steps, finish
 from sfms_robot.servo.dxl2_link import Dxl2Link
 from sfms_robot.servo.link import Answer, Found
-from sfms_robot.servo.policy import BusServo, torque_limit
+from sfms_robot.servo.policy import torque_limit
 from sfms_robot.servo.registers import Table
 
-T = TypeVar("T")
-Steps = Generator[float, None, T]  # yields seconds to wait before it is asked to go on
-
-_TRIES: Final = 3
-_PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms
 _POSITION_MODE: Final = 3
 _CURRENT_POSITION_MODE: Final = 5
 _TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
@@ -30,68 +21,24 @@ _REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
 _LONGEST_READ: Final = 128
 
 
-class Silent(ServoError):
-    """A servo did not answer, as opposed to one that refuses."""
+class Handshake(Contact[Dxl2Link]):
+    """`Contact` with servos that tell their firmware, which decides where their registers lie."""
 
-
-class Handshake:
-    """Checked, repeated requests to the servos of a bus. `index` counts servos in bus order.
-
-    Attributes:
-        tables: of each servo, in the layout of the firmware that it turned out to have.
-    """
-
-    def __init__(
-        self, bus: str, link: Dxl2Link, servos: Sequence[BusServo], tables: list[Table], baud: int, tries: int = _TRIES
-    ) -> None:
-        self._bus = bus
-        self._link = link
-        self._servos = servos
-        self.tables = tables
-        self._baud = baud
-        self._tries = tries
+    can_reboot = True
 
     # --- start-up -----------------------------------------------------------------------------------------------
 
     def run(self) -> list[int]:
-        """Identify and prepare every servo; the latched hardware errors, as bits, in bus order.
-
-        Raises BusError listing the ids that do not answer, ServoError for one that is not what it should be.
-        """
-        with self._link.patient(_PATIENCE_S):
+        with self._link.patient(PATIENCE_S):
             self._identify()
             for index in range(len(self._servos)):
                 self._speak_up(index)
             return [finish(self.prepare(index)) for index in range(len(self._servos))]
 
-    def switch_on(self, index: int) -> int:
-        """Torque on without a jump; the position held, in ticks."""
-        with self._link.patient(_PATIENCE_S):
-            return finish(self.torque_on(index))
-
-    def _identify(self) -> None:
-        found: dict[int, Found] = {}
-        for _ in range(self._tries):
-            for servo in self._servos:
-                if servo.id not in found and (answer := self._link.ping(servo.id)) is not None:
-                    found[servo.id] = answer
-        absent = [f"{servo.id} ({servo.joint})" for servo in self._servos if servo.id not in found]
-        if absent:
-            there = ", ".join(str(i) for i in found) or "none"
-            raise BusError(
-                f"bus {self._bus!r} on {self._link.port.name} at {self._baud} baud: "
-                f"no answer from id {', '.join(absent)}; ids that answer: {there}"
-            )
-        for index, servo in enumerate(self._servos):
-            self._recognise(index, found[servo.id])
-
     def _recognise(self, index: int, found: Found) -> None:
         """Refuse another model; take the table of the firmware that answers."""
+        super()._recognise(index, found)
         table = self.tables[index]
-        if found.model_number != table.model_number:
-            raise self._error(
-                index, f"is model number {found.model_number}, the head says {table.model} ({table.model_number})"
-            )
         low, high = table.firmware
         if found.firmware is not None and not low <= found.firmware <= high:
             try:
@@ -126,7 +73,6 @@ class Handshake:
         return now[error.name] if error is not None else 0
 
     def torque_on(self, index: int) -> Steps[int]:
-        """Goal := present, read back, torque on, read back; the position held, in ticks."""
         present = self.get(index, self._name(index, "present_position"))
         yield 0.0
         yield from self._put(index, self._name(index, "goal_position"), present)
@@ -134,14 +80,13 @@ class Handshake:
         return present
 
     def bring_back(self, index: int, reboot: bool) -> Steps[int]:
-        """A servo that was away, from the beginning: is it still the same, settings, torque on; the position held."""
         servo = self._servos[index].id
         if reboot:
             self._repeat(index, "reboot", lambda: self._link.reboot(servo))
             yield _REBOOT_S
         found = self._link.ping(servo)
         if found is None:
-            raise self._silent(index, "a ping")
+            raise Silent(self._about(index, "does not answer to a ping"))
         self._recognise(index, found)
         self._speak_up(index)
         yield 0.0
@@ -206,39 +151,12 @@ class Handshake:
         servo = self._servos[index].id
         return self._repeat(index, what, lambda: self._link.read(servo, address, length))
 
-    def _repeat(self, index: int, what: str, request: Callable[[], Answer | None]) -> Answer:
-        for _ in range(self._tries):
-            answer = request()
-            if answer is not None:
-                break
-        else:
-            raise self._silent(index, what)
-        if answer.error & ~ALERT:
-            alert = ", and reports a hardware error" if answer.error & ALERT else ""
-            raise self._error(index, f"refuses {what}: {error_text(answer.error)}{alert}")
-        return answer
+    def _refusal(self, answer: Answer) -> str:
+        if not answer.error & ~ALERT:
+            return ""
+        return error_text(answer.error) + (", and reports a hardware error" if answer.error & ALERT else "")
 
     def _name(self, index: int, role: str) -> str:
         """Name of the register of a role; the role itself where the model has none."""
         field = self.tables[index].role(role)
         return role if field is None else field.name
-
-    def _error(self, index: int, problem: str) -> ServoError:
-        return ServoError(self._about(index, problem))
-
-    def _silent(self, index: int, what: str) -> Silent:
-        return Silent(self._about(index, f"does not answer to {what}"))
-
-    def _about(self, index: int, problem: str) -> str:
-        servo = self._servos[index]
-        return f"{servo.joint} (id {servo.id}) {problem}"
-
-
-def finish(steps: Steps[T]) -> T:
-    """Run a job through, without the pauses it would like."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result

@@ -18,21 +18,21 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.errors import BusError, ConfigError, PortError, RobotError
+from sfms_robot.config import Bus as BusConfig
+from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import StopPolicy, TickConversion
 from sfms_robot.servo.board import Dialect, Health, board_of, pulses_beyond
-from sfms_robot.servo.goals import Goals
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.slow_wire import SlowWire
+from sfms_robot.servo.wire_bus import RECONNECT_S, WireBus
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 _CAPABILITIES: Final = frozenset({"torque"})  # pulses can be switched off, nothing more
@@ -41,25 +41,23 @@ _ASK_EVERY_S: Final = 1.0
 _SILENT_AFTER: Final = 3  # questions without an answer
 _LEAST_PATIENCE_S: Final = 0.02  # an SSC-32 thinks for up to 5 ms, an adapter holds its bytes for up to 16
 _TRIES: Final = 3
-RECONNECT_S: Final = 30.0  # a port that is gone for longer has failed
-_REOPEN_S: Final = 0.25
+_LEAST_RECONNECT_S: Final = 5.0  # a board that is asked once a second has to have a few chances
 _NO_ANSWER: Final = "no answer"
 _TORQUE_LOST: Final = "torque lost"
 
 
-class HobbyBus:
+class HobbyBus(WireBus[SlowWire]):
     """One board, as `ports.Bus`.
 
     Args:
-        name: of the bus, for messages.
+        name, open_port, baud: see `WireBus`.
         servos: in joint order; `id` is the channel.
         conversion: joint angles (J,) <-> ticks (J,) of pulse width.
-        open_port: opens the port at `baud`; the bus owns what it returns.
-        baud: bits per second, to tell how long the wire is busy.
         read_deadline_s: silence after which a question counts as unanswered; at least 20 ms is granted.
         dialect: of the board.
         confirmed: somebody knows that servos jump when their pulses come on.
         rest_rad: (J,) where a joint goes first when nobody knows better; 0 rad, inside the limits, unless told.
+        config: what the head says of this bus.
 
     Raises ConfigError for a channel or a pulse that the board does not have.
     """
@@ -76,16 +74,12 @@ class HobbyBus:
         dialect: Dialect,
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
+        config: BusConfig | None = None,
     ) -> None:
-        self.name = name
-        self.joints = tuple(servo.joint for servo in servos)
-        self._servos = tuple(servos)
+        reconnect_s = config.reconnect_s if config is not None else RECONNECT_S
+        patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
+        super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
         self._channels = [servo.id for servo in servos]
-        self._conversion = conversion
-        self._goals = Goals(name, servos, conversion)
-        self._open_port = open_port
-        self._baud = baud
-        self._patience_s = max(read_deadline_s, _LEAST_PATIENCE_S)
         self._dialect = dialect
         self._confirmed = confirmed
         self._lowest = np.array([servo.min_rad for servo in servos])
@@ -96,9 +90,8 @@ class HobbyBus:
             raise ConfigError(f"bus {name!r}: a {table.model} does not make the pulses of {', '.join(beyond)}")
         rest = np.zeros(len(servos)) if rest_rad is None else np.asarray(rest_rad, np.float64)
         self._ticks = conversion.to_ticks(np.clip(rest, self._lowest, self._highest))  # goals; before any, the rest
-        self._wire: SlowWire | None = None
         self._said = False
-        self._counts = {"writes": 0, "reads": 0, "errors": 0, "retries": 0, "reconnects": 0, "deferred": 0}
+        self._counts["deferred"] = 0
         self._fault_log: dict[str, None] = {}
         self._forget()
 
@@ -114,8 +107,6 @@ class HobbyBus:
         self._unanswered = 0
         self._dark: list[int] = []  # enabled, but the board has switched them off
         self._light_at_s = float("-inf")  # when the next of them may come on
-        self._lost_s: float | None = None
-        self._reopen_s = float("inf")
         self._faults: dict[int, str] = {}
 
     @property
@@ -129,16 +120,23 @@ class HobbyBus:
         wire = self._open()
         self._forget()
         try:
-            if not any(self._found(wire, lost) for _ in range(_TRIES) for lost in (False, True)):
-                raise BusError(f"bus {self.name!r} on {wire.port.name} at {self._baud} baud: no {self.model} answers")
+            if not self._there(wire):
+                raise self._absent(wire)
             self._lit = self._dialect.pulses(wire.ask, self._channels) or {}
         except BaseException:
-            wire.close()
+            wire.port.close()
             raise
-        self._wire = wire
+        self._forget_silence()
+        self._link = wire
 
     def _open(self) -> SlowWire:
-        return SlowWire(self._open_port(), self._baud, self._patience_s)
+        return SlowWire(self._open_port(), self._baud, self._read_deadline_s)
+
+    def _absent(self, wire: SlowWire) -> BusError:
+        return BusError(f"bus {self.name!r} on {wire.port.name} at {self._baud} baud: no {self.model} answers")
+
+    def _there(self, wire: SlowWire) -> bool:
+        return any(self._found(wire, lost) for _ in range(_TRIES) for lost in (False, True))
 
     def _found(self, wire: SlowWire, lost: bool) -> bool:
         answer = wire.ask(self._dialect.question(lost), self._dialect.answer_length)
@@ -147,7 +145,8 @@ class HobbyBus:
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """Pulses on for `joints`, one after the other; angles they were sent to, rad, in the order of `joints`.
 
-        Raises ConfigError unless the bus was told that this is understood.
+        Raises ConfigError unless the bus was told that this is understood, BusError when the board does not answer
+        before or after: nothing else tells that it heard.
         """
         wire = self._connected()
         if not self._confirmed:
@@ -161,6 +160,8 @@ class HobbyBus:
                 self.name, self.model,
             )  # fmt: skip
             self._said = True
+        if not self._there(wire):
+            raise self._absent(wire)
         held = []
         for joint in joints:
             index = self.joints.index(joint)
@@ -175,6 +176,8 @@ class HobbyBus:
                 self._dark.remove(index)
             self._faults.pop(index, None)
             held.append(float(self._conversion.to_rad(self._ticks)[index]))
+        if not self._there(wire):
+            raise self._absent(wire)
         return np.array(held)
 
     def _take_over(self, index: int) -> None:
@@ -190,7 +193,7 @@ class HobbyBus:
     def stop(self, policy: StopPolicy) -> None:
         """End the pulses, but of joints whose safety says hold; refuse goals from now on. Never raises."""
         self._enabled, self._dark, self._pending = [], [], False
-        wire = self._wire
+        wire = self._link
         limp = [servo.id for servo in self._servos if policy == "release" and servo.safety.stop == "release"]
         if wire is None or not limp:
             return
@@ -201,24 +204,9 @@ class HobbyBus:
         self._attempt(lambda: wire.wait(wire.busy_until_s))
 
     def close(self) -> None:
-        self._lost_s = None
+        """Give the port back. Idempotent."""
         self._enabled = []
-        if self._wire is not None:
-            self._wire.close()
-            self._wire = None
-
-    def _connected(self) -> SlowWire:
-        if self._wire is None:
-            raise BusError(f"bus {self.name!r} is not connected")
-        return self._wire
-
-    def _attempt(self, request: Callable[[], T]) -> T | None:
-        try:
-            return request()
-        except RobotError as error:
-            self._counts["errors"] += 1
-            log.warning("bus %r: %s", self.name, error)
-            return None
+        super().close()
 
     # --- every tick ---------------------------------------------------------------------------------------------
 
@@ -228,40 +216,26 @@ class HobbyBus:
         Raises ValueError, with nothing sent, before `enable`, for a goal that is not finite, or one out of range.
         While the port is gone nothing is sent and nothing is raised.
         """
-        if self._lost_s is None:
-            self._connected()
-        if not self._enabled:
-            raise ValueError(f"bus {self.name!r}: no joint is enabled, goals are refused")
-        self._goals.check(goals_rad)
+        self._check(goals_rad, bool(self._enabled))
         self._ticks = self._conversion.to_ticks(goals_rad)
         self._pending = True
         try:
             self._counts["deferred"] += not self._flush()
         except BusError as error:
-            self._gone(error, now_s)
+            self._lose(error, now_s)
 
-    def poll(self, now_s: float) -> Mapping[str, Reading]:
-        """No positions; faults of the board, asked for once a second when the wire is free.
-
-        Raises BusError when the port is gone for longer than `RECONNECT_S`.
-        """
-        if self._lost_s is not None:
-            self._reopen(now_s)
-        else:
-            self._connected()
-        if self._wire is not None:
-            try:
-                self._look(self._wire, now_s)
-            except BusError as error:
-                self._gone(error, now_s)
+    def _readings(self, now_s: float) -> Mapping[str, Reading]:
+        """No positions; faults of the board."""
         return {joint: Reading(None, float("inf"), self._faults.get(index)) for index, joint in enumerate(self.joints)}
 
-    def _look(self, wire: SlowWire, now_s: float) -> None:
+    def _ask(self, wire: SlowWire, now_s: float) -> bool:
+        """Ask for faults once a second when the wire is free; whether there was an answer to that."""
+        heard = False
         if self._ask_at_s is None:
             self._ask_at_s = now_s + _ASK_EVERY_S
         if wire.listening:
             if (answer := wire.heard()) is not None:
-                self._judge(wire, answer, now_s)
+                heard = self._judge(wire, answer, now_s)
         elif now_s >= self._ask_at_s:
             self._ask_at_s = now_s + _ASK_EVERY_S
             self._counts["retries"] += self._unanswered > 0
@@ -271,6 +245,7 @@ class HobbyBus:
             self._light(self._dark.pop(0), now_s)
         if self._pending:
             self._flush()
+        return heard
 
     def statistics(self) -> Mapping[str, Any]:
         return {
@@ -283,7 +258,7 @@ class HobbyBus:
 
     def _flush(self) -> bool:
         """Send the newest goals, unless the wire is busy or nobody listens."""
-        wire = self._wire
+        wire = self._link
         if wire is None or self._silent or not wire.free:
             return False
         self._pending = False
@@ -304,28 +279,11 @@ class HobbyBus:
 
     # --- the port ----------------------------------------------------------------------------------------------
 
-    def _gone(self, error: BusError, now_s: float) -> None:
-        """The port failed: let it go, and try to get it back from now on."""
-        self._counts["errors"] += 1
-        log.warning("bus %r: %s; waiting for it to come back", self.name, error)
-        if self._wire is not None:
-            self._wire.close()
-            self._wire = None
-        self._lost_s, self._reopen_s = now_s, now_s + _REOPEN_S
+    def _left(self) -> None:
         self._unanswered = _SILENT_AFTER
         self._blame(range(len(self.joints)), _NO_ANSWER)
 
-    def _reopen(self, now_s: float) -> None:
-        if self._lost_s is None or now_s < self._reopen_s:
-            return
-        self._reopen_s = now_s + _REOPEN_S
-        try:
-            self._wire = self._open()
-        except (PortError, BusError) as error:
-            if now_s - self._lost_s > RECONNECT_S:
-                raise BusError(f"bus {self.name!r}: the port is gone for {RECONNECT_S:g} s: {error}") from error
-            return
-        self._lost_s = None
+    def _returned(self, wire: SlowWire, now_s: float) -> None:
         self._ask_at_s = now_s  # the board is asked before it gets any goal
 
     # --- the board ----------------------------------------------------------------------------------------------
@@ -334,17 +292,18 @@ class HobbyBus:
     def _silent(self) -> bool:
         return self._unanswered >= _SILENT_AFTER
 
-    def _judge(self, wire: SlowWire, answer: bytes, now_s: float) -> None:
-        """Take an answer to the question how it is, empty when there was none."""
+    def _judge(self, wire: SlowWire, answer: bytes, now_s: float) -> bool:
+        """Take an answer to the question how it is, empty when there was none; whether it is one."""
         health = self._dialect.health(answer) if answer else None
         if health is not None:
             self._answered(wire, health, now_s)
-            return
+            return True
         self._counts["errors"] += 1
         self._unanswered += 1
         if self._unanswered == _SILENT_AFTER:
             log.warning("bus %r: the %s is silent", self.name, self.model)
             self._blame(range(len(self.joints)), _NO_ANSWER)
+        return False
 
     def _answered(self, wire: SlowWire, health: Health, now_s: float) -> None:
         lost, self._unanswered = self._silent, 0

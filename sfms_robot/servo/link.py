@@ -1,15 +1,26 @@
-"""Registers over a wire, whatever the protocol: what tools and handshakes need of a link.
+"""Registers over a wire, whatever the protocol: what buses, tools and handshakes need of a link.
 
 A link asks one servo at a time and says None where nobody answered; the error byte of an answer is the protocol's own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
-from typing import NamedTuple, Protocol
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Final, NamedTuple
 
 from sfms_robot.servo.port import Port
+
+log = logging.getLogger(__name__)
+
+CHUNK: Final = 4096
+NO_PATIENCE: Final = 10  # read deadlines that rubbish on the wire may cost before a request is given up
+_ADAPTER_S: Final = 0.05  # the longest that an adapter may hold an answer back
+_SAMPLES: Final = 3
+_MARGIN: Final = 1.25
+_FRAMES: Final = 25  # bytes of a request and its answer beside the data, at most
 
 
 class Found(NamedTuple):
@@ -26,29 +37,76 @@ class Answer(NamedTuple):
     data: bytes
 
 
-class RegisterLink(Protocol):
-    """One wire of servos that have registers. Raises BusError when the port is gone, never for a silent servo."""
+class RegisterLink(ABC):
+    """One wire of servos that have registers. Raises BusError when the port is gone, never for a silent servo.
 
-    @property
-    def port(self) -> Port: ...
+    Args:
+        port: owned by the link from now on.
+        baud: bits per second, to tell how long bytes take.
+        silence_s: how long to wait for the next byte before the servo counts as silent.
+    """
 
+    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
+        self.port = port
+        self.silence_s = silence_s
+        self._byte_s = 10.0 / baud
+
+    @abstractmethod
     def ping(self, servo: int) -> Found | None: ...
 
+    @abstractmethod
     def broadcast_ping(self) -> dict[int, Found]:
         """Everybody who answers at this baud, by id; waits the whole window that 253 answers may take."""
 
+    @abstractmethod
     def read(self, servo: int, address: int, length: int) -> Answer | None: ...
 
+    @abstractmethod
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """The acknowledgement, or None when there was none: the servo may have taken it all the same."""
 
+    @abstractmethod
     def reboot(self, servo: int) -> Answer | None: ...
 
+    @abstractmethod
     def factory_reset(self, servo: int, option: int) -> Answer | None:
-        """Protocol 2.0: 0xFF everything, 1 all but the id, 2 all but id and baud. Others ignore `option`."""
+        """0xFF everything; Protocol 2.0 also 1 all but the id, 2 all but id and baud."""
 
+    @abstractmethod
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
         """One packet for all; values have one length. Nothing answers."""
 
-    def patient(self, silence_s: float) -> AbstractContextManager[None]:
+    @contextmanager
+    def patient(self, silence_s: float) -> Iterator[None]:
         """Wait at least `silence_s` for answers inside the block."""
+        usual, self.silence_s = self.silence_s, max(self.silence_s, silence_s)
+        try:
+            yield
+        finally:
+            self.silence_s = usual
+
+    def rest(self, duration_s: float) -> None:
+        """Leave the wire alone for so long; in virtual time that is no time. What comes meanwhile is dropped."""
+        end_s = self.port.now_s() + duration_s
+        while self.port.read(CHUNK, end_s):
+            pass
+
+    def adapt(self, servo: int, address: int, length: int) -> float:
+        """Wait longer from now on where the adapter holds answers back: it would make every servo silent.
+
+        Seconds of silence that are waited for now.
+        """
+        held_s = 0.0
+        with self.patient(_ADAPTER_S):
+            for _ in range(_SAMPLES):
+                asked_s = self.port.now_s()
+                if self.read(servo, address, length) is not None:
+                    held_s = max(held_s, self.port.now_s() - asked_s - (_FRAMES + length) * self._byte_s)
+        if held_s > self.silence_s:
+            self.silence_s = _MARGIN * held_s
+            log.warning(
+                "%s: an answer is held back for %.1f ms, so a silent servo costs %.1f ms; `sfms-robot doctor` says "
+                "what to do",
+                self.port.name, held_s * 1e3, self.silence_s * 1e3,
+            )  # fmt: skip
+        return self.silence_s

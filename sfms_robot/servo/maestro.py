@@ -13,6 +13,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+from sfms_robot.config import Bus as BusConfig
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.board import Ask, Health, pulses_beyond
@@ -90,11 +91,12 @@ class MaestroBus(HobbyBus):
         *,
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
+        config: BusConfig | None = None,
     ) -> None:
         table = Table.of(servos[0].map)
         super().__init__(
             name, servos, conversion, open_port, baud, read_deadline_s,
-            dialect=_Maestro(table), confirmed=confirmed, rest_rad=rest_rad,
+            dialect=_Maestro(table), confirmed=confirmed, rest_rad=rest_rad, config=config,
         )  # fmt: skip
         if wide := pulses_beyond(servos, conversion, table, maestro.FACTORY_PULSE_US):
             log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, ", ".join(wide))

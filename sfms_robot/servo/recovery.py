@@ -7,10 +7,10 @@ settings, goal := present, torque. Where somebody is silent the tick ends for al
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from sfms_robot.errors import ServoError
-from sfms_robot.servo.handshake import Handshake, Silent, Steps
+from sfms_robot.servo.contact import Contact, Silent, Steps
 
 EXCHANGES: Final = 6  # in one tick, all jobs together
 ATTEMPTS: Final = 3  # that may fail in a row before a servo is left alone
@@ -40,7 +40,7 @@ class Recovery:
     def __contains__(self, index: int) -> bool:
         return index in self._jobs
 
-    def begin(self, index: int, shake: Handshake, due_s: float, reboot: bool = False) -> None:
+    def begin(self, index: int, shake: Contact[Any], due_s: float, reboot: bool = False) -> None:
         """From the beginning, not before `due_s`."""
         self._jobs[index] = _Job(shake.bring_back(index, reboot), due_s)
 

@@ -71,6 +71,3 @@ class SlowWire:
         """Question and answer in one; None when there is none."""
         self.question(request, length)
         return self.heard(block=True) or None
-
-    def close(self) -> None:
-        self.port.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+from sfms_robot.config import Bus as BusConfig
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.board import Ask, Health
@@ -60,8 +61,9 @@ class Ssc32Bus(HobbyBus):
         *,
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
+        config: BusConfig | None = None,
     ) -> None:
         super().__init__(
             name, servos, conversion, open_port, baud, read_deadline_s,
-            dialect=_Ssc32(), confirmed=confirmed, rest_rad=rest_rad,
+            dialect=_Ssc32(), confirmed=confirmed, rest_rad=rest_rad, config=config,
         )  # fmt: skip

@@ -136,6 +136,8 @@ class Chain:
             self._process.terminate()
         _reap(self._process)
         shutil.rmtree(self._folder, ignore_errors=True)
+        if os.path.islink(self.device) and not os.path.exists(self.device):
+            os.unlink(self.device)  # it was killed, and left its link behind
 
     def __enter__(self) -> Self:
         return self
@@ -247,8 +249,8 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
         bauds = sorted(table.baud_codes.values())
         if bauds and servo.baud not in bauds:
             raise ConfigError.at("emulated chain", "baud", servo.baud, f"is no rate of {servo.model}", bauds)
-        if table.protocol != 2 and (servo.registers or servo.supply_v is not None):
-            problem = "has no registers or supply to set beforehand: only Protocol 2.0 servos do"
+        if table.channels is not None and (servo.registers or servo.supply_v is not None):
+            problem = "is a board of hobby servos: it has no registers, and does not know its supply"
             raise ConfigError.at("emulated chain", "model", servo.model, problem)
         for name, value in servo.registers.items():
             register = table.registers.get(name)

@@ -209,8 +209,8 @@ class Wire:
                 servo.dead = began
                 if not began and hasattr(servo, "power_cycle"):
                     servo.power_cycle(now_s)
-            if not began and hasattr(device, "restart"):
-                device.restart(now_s)
+            if hasattr(device, "restart"):
+                device.restart(now_s)  # without a supply there are no pulses either
 
 
 def _feed(servo: Any, before: dict[int, float], volts: float, began: bool, now_s: float) -> None:

@@ -106,7 +106,7 @@ def test_channels_come_on_one_at_a_time_at_rest(bench):
     bench.bus.connect()
     mark = len(bench.port.sent)
     assert bench.bus.enable(bench.bus.joints) == pytest.approx(rest, abs=0.001)
-    assert len(bench.port.sent) - mark == 4
+    assert len(bench.port.sent) - mark == 4 + 2  # and the board is asked whether it hears, before and after
     waited = np.array(bench.port.waits[-4:])
     assert (waited >= 2 * LIMIT_RAD / 3.5).all()
 

@@ -204,9 +204,9 @@ def test_stale_link_of_a_killed_emulator_is_replaced(tmp_path):
         (EmulatedServo(1, registers={"homing": 3}), {}, "register = 'homing' is none of xl330-m288"),
         (EmulatedServo(1, registers={"shutdown": 300}), {}, r"shutdown = 300 is out of range of xl330-m288 \(0..255\)"),
         (
-            EmulatedServo(1, "ax-12a", supply_v=11.0),
+            EmulatedServo(1, "maestro-24", supply_v=11.0),
             {},
-            "model = 'ax-12a' has no registers or supply to set beforehand",
+            "model = 'maestro-24' is a board of hobby servos: it has no registers",
         ),
         (EmulatedServo(24, "maestro-24"), {}, r"id = 24 is not a servo id \(0..23\)"),
         (EmulatedServo(1), {"faults": ["bang"]}, "has no such kind as 'bang'"),

@@ -1,4 +1,5 @@
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -6,8 +7,13 @@ from pathlib import Path
 import pytest
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PortHandler, Protocol2PacketHandler
 
+from sfms_robot.config import load_firmware_map
 from sfms_robot.errors import BusError, ConfigError
-from sfms_robot.simulator.launch import EmulatedServo, launch
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.servo.frame1_link import Frame1Link
+from sfms_robot.servo.port import VirtualTimePort
+from sfms_robot.servo.registers import Table
+from sfms_robot.simulator.launch import EmulatedServo, launch, wait
 
 
 def test_vendor_sdk_works_unchanged():
@@ -78,3 +84,29 @@ def test_impossible_chain_is_refused(servos, message):
 def test_request_that_the_emulator_does_not_know_is_refused():
     with launch([EmulatedServo(1)]) as chain, pytest.raises(BusError, match="no such servo"):
         chain.kill(9)
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "value"),
+    [("ax-12a", "return_delay_time", 7), ("mx-28-1.0", "ccw_angle_limit", 3000), ("sts3215", "homing_offset", -30),
+     ("scs0009", "max_position_limit", 900)],
+)  # fmt: skip
+def test_what_somebody_stored_is_there_in_the_older_families_too(model, name, value):
+    table = Table.of(load_firmware_map(model))
+    servo = EmulatedServo(1, model, start_ticks=table.center_ticks, registers={name: value}, supply_v=20.0)
+    with launch([servo], virtual=True) as chain:
+        link = Frame1Link(VirtualTimePort(chain.device, chain.control, servo.baud, VirtualClock()), servo.baud, 0.003,
+                          table.family)  # fmt: skip
+        answer = link.read(1, table[name].address, table[name].size)
+        link.port.close()
+        assert table[name].from_bytes(answer.data) == value
+        assert "voltage" in table.status_fault_names(answer.error)
+        assert round(chain.state(1)["position"]) == table.center_ticks
+
+
+def test_link_of_an_emulator_that_was_killed_is_taken_away(tmp_path):
+    link = tmp_path / "servos"
+    with launch([EmulatedServo(1)], link=str(link)) as chain:
+        os.kill(chain.pid, signal.SIGKILL)
+        assert wait([chain]) is chain
+    assert not link.is_symlink()

@@ -288,6 +288,34 @@ def test_no_goal_outside_the_limits_reaches_a_servo(rig):
         assert all(lowest <= goal <= highest for goal in told)
 
 
+@pytest.mark.emulated
+@pytest.mark.parametrize("already", [0, 2])
+def test_supply_that_fails_while_torque_comes_on_is_an_error_and_no_lasting_one(rig, already):
+    rig.bus.connect()
+    if already:
+        rig.bus.enable(rig.bus.joints[:already])
+    rig.chain.inject("brownout")
+    with pytest.raises(BusError, match="answer"):
+        rig.bus.enable(rig.bus.joints[already:])
+    rig.bus.stop("release")
+    assert rig.torques() == [False] * len(rig.ids)
+    rig.clock.wait_until(rig.now_s + 2.0)
+    rig.bus.enable(rig.bus.joints)
+    assert rig.torques() == [True] * len(rig.ids)
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("trouble", ["silent", "hangup"])
+def test_bus_on_which_nobody_answers_any_more_has_failed(rig, trouble):
+    goals = rig.hold()
+    rig.ticks(goals, 2)
+    rig.chain.inject(f"{trouble}@{rig.now_s}-{rig.now_s + 1000}")
+    with pytest.raises(BusError, match="nobody has answered for 30 s"):
+        rig.ticks(goals, 330, period_s=0.1)
+    assert rig.now_s < 1000
+    rig.bus.stop("release")
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_same_goals_make_the_same_bytes(family):
     def sent():
