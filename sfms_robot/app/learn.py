@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from sfms_robot.config import find
 from sfms_robot.learning.datasets import clips, composed
 from sfms_robot.listeners.sfms.placement import Strategy
+from sfms_robot.ports import Listener
 
 PLACEMENTS: tuple[Strategy, ...] = ("exact", "static", "static_paper", "learned")
 
@@ -44,20 +47,61 @@ def evaluate_tokenizer(name: str, data: Path) -> dict[str, Any]:
     }
 
 
-def evaluate_listener(name: str, data: Path, seed: int) -> dict[str, Any]:
-    """Stream the held-out speakers of `data` through a listener: its behaviour beside that of the dyads."""
+def evaluate_listener(names: Sequence[str], data: Path, seed: int) -> dict[str, Any]:
+    """Stream the held-out speakers of `data` through listeners: their behaviour beside that of the dyads.
+
+    An SFMS listener also says how many keyframes it would have foreseen.
+    """
     from sfms_robot.learning.rollout import evaluate_rollout
     from sfms_robot.listeners.registry import load_listener
 
-    listener = load_listener(find("listeners", name, "config.yaml"))
     dyads = clips.load(data / "validation")
+    rows: list[dict[str, Any]] = []
     with Progress(console=_stderr()) as progress:
-        task = progress.add_task("listening", total=len(dyads))
-        ours, theirs, _ = evaluate_rollout(
-            listener, dyads, seed, lambda done, of: progress.update(task, completed=done)
+        for name in names:
+            listener = load_listener(find("listeners", name, "config.yaml"))
+            task = progress.add_task(name, total=len(dyads))
+            done = partial(_move, progress, task)
+            ours, theirs, _ = evaluate_rollout(listener, dyads, seed, done)
+            rows.append({"name": name, **asdict(ours), **_keyframe_scores(listener, dyads)})
+    rows.append({"name": "dyads", **asdict(theirs)})
+    return {"listeners": list(names), "dyads": len(dyads), "rows": rows}
+
+
+def _move(progress: Progress, task: TaskID, done: int, of: int) -> None:
+    progress.update(task, completed=done, total=of)
+
+
+def _keyframe_scores(listener: Listener, dyads: Sequence[clips.Dyad]) -> dict[str, float]:
+    from sfms_robot.learning.corpus import gather
+    from sfms_robot.learning.listener import keyframe_scores
+    from sfms_robot.listeners.sfms.stream import SfmsListener
+
+    if not isinstance(listener, SfmsListener):
+        return {}
+    corpus = gather(dyads, listener.settings.window_frames, listener.space, listener.hearing)
+    return keyframe_scores(listener.model, corpus, listener.settings)
+
+
+def listener_table(
+    number: int, names: Sequence[str], data: Path, samples: int, limit: int | None, seed: int
+) -> dict[str, Any]:
+    """Table 1 or 2 of the paper for listeners and heuristics, on the validation split of any data set known.
+
+    At most `limit` dyads, spread evenly. Raises ConfigError when the listeners do not share a motion space.
+    """
+    from sfms_robot.learning.datasets.formats import open_dataset
+    from sfms_robot.learning.tables import answers
+    from sfms_robot.learning.tables.listeners import table
+    from sfms_robot.listeners.registry import load_listener
+
+    listeners = {name: load_listener(find("listeners", name, "config.yaml")) for name in names}
+    space = answers.shared_space(listeners)
+    train, held_out = (answers.spread(open_dataset(data, split), most) for split, most in
+                       (("train", answers.TRAIN_DYADS), ("validation", limit)))  # fmt: skip
+    with Progress(console=_stderr()) as progress:
+        task = progress.add_task("listening", total=len(held_out) * len(listeners))
+        found, given = answers.collect(
+            number, listeners, space, train, held_out, range(seed, seed + samples), lambda: progress.advance(task)
         )
-    return {
-        "listener": name,
-        "dyads": len(dyads),
-        "rows": [{"name": name, **asdict(ours)}, {"name": "dyads", **asdict(theirs)}],
-    }
+    return table(number, found, given, samples, seed)

@@ -50,6 +50,7 @@ class RunOptions:
     listener: str = "sfms-small"
     audio: str = "default"
     face: str = "auto"
+    agent_audio: str = "none"
     duration_s: float | None = None
     fast: bool = False
     seed: int = 0
@@ -78,7 +79,7 @@ def run_head(options: RunOptions, progress: Callable[[float | None], Observer] |
     limited = limitation(options.listener)
     if limited is not None:
         logger.warning("%s: %s", weights.name, limited)
-    source = open_source(options.audio, options.face, options.duration_s)
+    source = open_source(options.audio, options.face, options.duration_s, agent_audio=options.agent_audio)
     if options.fast and source.duration_s is None:
         raise ConfigError("--fast without a recording never ends: give it a --duration")
     clock = VirtualClock() if options.fast else RealClock()

@@ -13,9 +13,10 @@ from typing import Any
 import torch
 
 from sfms_robot import config
-from sfms_robot.config import load, parse
+from sfms_robot.config import load_training, parse_training
 from sfms_robot.errors import ConfigError
 from sfms_robot.learning import listener, tokenizer
+from sfms_robot.learning.arig.trainer import train_arig
 from sfms_robot.learning.job import Run
 from sfms_robot.learning.watch import Watch, progress_bar, tensorboard, together
 
@@ -38,17 +39,21 @@ class TrainOptions:
 
 def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
     """Phase 1. Returns its figures and minutes."""
-    settings = _settings(options, "tokenizer")
-    with _run(options) as run:
+    settings = train_settings(options, "tokenizer")
+    if isinstance(settings, config.ArigTraining):
+        raise ConfigError(f"{options.file}: listener.kind = 'arig' has no tokenizer; `train listener` is all of it")
+    with run_of(options) as run:
         began_s = time.monotonic()
         return _timed(tokenizer.train_tokenizer(settings, options.data, options.out, run), began_s)
 
 
 def train_listener(options: TrainOptions) -> dict[str, Any]:
-    """Phase 2, on the tokenizer in `options.out`. Returns its figures and minutes."""
-    settings = _settings(options, "predictor")
-    with _run(options) as run:
+    """SFMS: phase 2, on the tokenizer in `options.out`. ARIG: all of it. Returns its figures and minutes."""
+    settings = train_settings(options, "predictor")
+    with run_of(options) as run:
         began_s = time.monotonic()
+        if isinstance(settings, config.ArigTraining):
+            return _timed(train_arig(settings, options.data, options.out, run), began_s)
         return _timed(listener.train_listener(settings, options.data, options.out, run), began_s)
 
 
@@ -61,18 +66,22 @@ def device_of(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def _settings(options: TrainOptions, phase: str) -> config.Training:
-    settings = load(config.Training, options.file)
+def train_settings(options: TrainOptions, phase: str = "training") -> config.Training | config.ArigTraining:
+    """The training file with what the command line changes, `phase` being the one whose steps it means."""
+    settings = load_training(options.file)
     raw = settings.model_dump(mode="json")
+    if isinstance(settings, config.ArigTraining):
+        phase = "training"
     if options.placement is not None:
         raw["listener"]["placement"] = options.placement
     if options.steps is not None:
         raw[phase]["steps"] = options.steps
-    return parse(config.Training, raw, options.file)
+    return parse_training(raw, options.file)
 
 
 @contextmanager
-def _run(options: TrainOptions) -> Iterator[Run]:
+def run_of(options: TrainOptions) -> Iterator[Run]:
+    """How the command line asks for it to be run, with a progress bar."""
     device = device_of(options.device)
     with ExitStack() as stack:
         watches: list[Watch] = []

@@ -4,37 +4,156 @@ from __future__ import annotations
 
 import json as json_module
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import typer
 
+from sfms_robot.cli.train import interruptible
+
 app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 
+
+class Size(StrEnum):
+    small = "small"
+    paper = "paper"
+
+
+class Table(StrEnum):
+    """1 and 2 of SFMS; those of ARIG."""
+
+    one = "1"
+    two = "2"
+    arig_1 = "arig-1"
+    arig_2 = "arig-2"
+    arig_4 = "arig-4"
+
+
 LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
-DATA = typer.Option(..., help="Folder with validation/ (see `sfms-robot data compose`).")
 JSON = typer.Option(False, "--json", help="Print one JSON object.")
 
 
 @app.command()
-def tokenizer(listener: str = LISTENER, data: Path = DATA, json: bool = JSON) -> None:
-    """Reconstruction error (standardised units) by keyframe placement."""
-    from sfms_robot.app.learn import evaluate_tokenizer
+def tokenizer(
+    listener: str = LISTENER,
+    table: str | None = typer.Option(
+        None, metavar="3|4|bits|adaptive|all", help="Of the SFMS paper; error at equal bits; one model for every k."
+    ),
+    data: Path | None = typer.Option(
+        None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
+    ),
+    models: Path | None = typer.Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
+    train: bool = typer.Option(False, "--train", help="Train the table's tokenizers anew, into --models."),
+    size: Size = typer.Option(Size.small, help="Of what is trained; paper: for a GPU."),
+    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the size's."),
+    jobs: int = typer.Option(1, min=1, help="Tokenizers trained at once."),
+    plots: Path | None = typer.Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
+    json: bool = JSON,
+) -> None:
+    """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
+    if table is None:
+        from sfms_robot.app.learn import evaluate_tokenizer
 
-    _print(evaluate_tokenizer(listener, data), json)
+        if data is None:
+            raise typer.BadParameter("--data is needed without --table")
+        _print(evaluate_tokenizer(listener, data), json)
+        return
+    from sfms_robot.app.tables import TableOptions, evaluate_table
+
+    options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
+    result = interruptible(lambda: evaluate_table(options))
+    if json:
+        print(json_module.dumps(result))
+    else:
+        from sfms_robot.cli.paper_tables import print_tables
+
+        print_tables(result)
 
 
 @app.command("listener")
 def listener_(
-    listener: str = LISTENER,
-    data: Path = DATA,
+    listener: list[str] = typer.Option(["sfms-small"], metavar="NAME|DIR", help="May be given often."),
+    data: Path = typer.Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
+    table: Table | None = typer.Option(
+        None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
+    ),
+    samples: int = typer.Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
+    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, for --table; all of them."),
+    models: Path | None = typer.Option(None, help="Folder of the ablations' listeners; those missing are trained."),
+    config: Path | None = typer.Option(None, help="How ablations are trained: configs/training/arig.yaml."),
+    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
     seed: int = typer.Option(1, min=0, help="Of the sampling."),
     json: bool = JSON,
 ) -> None:
-    """Nods, blinks, smiles and smoothness of the listener, beside those of the dyads' own listeners."""
-    from sfms_robot.app.learn import evaluate_listener
+    """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
+    from sfms_robot.app.learn import evaluate_listener, listener_table
 
-    _print(evaluate_listener(listener, data, seed), json)
+    if table is None:
+        _print(evaluate_listener(listener, data, seed), json)
+        return
+    if table.value.startswith("arig"):
+        from sfms_robot.app.arig import AblationOptions, arig_table
+
+        ablations = AblationOptions(models, config, steps)
+        _print(interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations)), json)
+        return
+    result = listener_table(int(table.value), listener, data, samples, clips, seed)
+    if json:
+        print(json_module.dumps(result))
+    else:
+        from sfms_robot.cli.tables import print_listener_table
+
+        print_listener_table(result["rows"])
+        typer.echo(
+            f"{result['clips']} clips of {result['frames']} frames, {result['samples']} samples; {result['features']}. "
+            "The paper's rows are from other data; FRRea, a distance between rendered pictures, is out of scope."
+        )
+
+
+@app.command()
+def timing(
+    listener: str = LISTENER,
+    data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
+    seeds: int = typer.Option(8, min=1, help="How often each person's meeting is played."),
+    people: int | None = typer.Option(12, min=1, help="At most this many people, spread over the meetings."),
+    minutes: float | None = typer.Option(5.0, min=0.5, help="Of each, from the middle of the meeting."),
+    everything: bool = typer.Option(False, "--all", help="All people, whole meetings: many hours."),
+    seed: int = typer.Option(1, min=0, help="Of voices and sampling."),
+    jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    fit_table: Path | None = typer.Option(
+        None, metavar="FILE", help="Only fit the table of nod rates on DIR and write it."
+    ),
+    json: bool = JSON,
+) -> None:
+    """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
+    from sfms_robot.app import timing as command
+
+    if fit_table is not None:
+        _print(command.fit_table(data, fit_table), json)
+        return
+    limits = (None, None) if everything else (people, minutes)
+    _print(command.evaluate_timing(listener, data, seeds, *limits, seed, jobs), json)
+
+
+@app.command()
+def interaction(
+    listener: str = typer.Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
+    data: Path = typer.Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
+    clips: int | None = typer.Option(None, min=1, help="At most this many dyads of each set; all of them."),
+    seed: int = typer.Option(1, min=0, help="Of the sampling."),
+    json: bool = JSON,
+) -> None:
+    """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
+    from sfms_robot.app.arig import evaluate_interaction
+
+    result = evaluate_interaction(listener, data, clips, seed)
+    if json:
+        print(json_module.dumps(result))
+    else:
+        from sfms_robot.cli.arig_tables import print_interaction
+
+        print_interaction(result)
 
 
 @app.command()

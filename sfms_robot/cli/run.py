@@ -22,6 +22,9 @@ def run(
     face: str = typer.Option(
         "auto", help="The speaker's face: FILE.csv[.gz], 'none', or 'auto': the shipped speaker's own, else none."
     ),
+    agent_audio: str = typer.Option(
+        "none", help="What the robot itself says: FILE.wav, a shipped speaker or 'none'. An ARIG listener's lips follow it."
+    ),
     duration: float | None = typer.Option(None, min=0.04, help="Seconds; default: as long as the recording."),
     fast: bool = typer.Option(False, help="Virtual time: as fast as it goes, bit-identical for one --seed."),
     seed: int = typer.Option(0, min=0, help="Two seeds listen differently, one seed repeats (with --fast)."),
@@ -40,8 +43,9 @@ def run(
     from sfms_robot.cli.tables import print_dry_run, print_run
 
     options = RunOptions(
-        head, port, listener, audio, face, duration, fast, seed, record, dry_run, yes, tuple(intensity), tuple(style)
-    )
+        head, port, listener, audio, face, agent_audio, duration, fast, seed, record, dry_run, yes,
+        tuple(intensity), tuple(style),
+    )  # fmt: skip
     try:
         report = run_head(options, RunProgress)
     except KeyboardInterrupt:  # before torque came on; after that an interruption is a flag, and the head comes to rest

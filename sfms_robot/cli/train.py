@@ -56,7 +56,7 @@ def tokenizer(
 
     placed = placement.value if placement else None
     options = TrainOptions(config, data, out, resume, device.value, steps, placed, tensorboard)
-    _print(_interruptible(lambda: train_tokenizer(options)), json)
+    _print(interruptible(lambda: train_tokenizer(options)), json)
 
 
 @app.command()
@@ -74,10 +74,10 @@ def listener(
     from sfms_robot.app.training import TrainOptions, train_listener
 
     options = TrainOptions(config, data, out, resume, device.value, steps, None, tensorboard)
-    _print(_interruptible(lambda: train_listener(options)), json)
+    _print(interruptible(lambda: train_listener(options)), json)
 
 
-def _interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Ctrl-C says how to go on, where there is something to go on from."""
     try:
         return train()

@@ -1,6 +1,7 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices."""
 
 from sfms_robot.config.arig import Arig, Diffusion
+from sfms_robot.config.arig_training import ArigPhase, ArigTraining, Stage, load_training, parse_training
 from sfms_robot.config.base import Model, find, load, parse
 from sfms_robot.config.drives import drives
 from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
@@ -30,6 +31,8 @@ from sfms_robot.config.training import Phase, PredictorTraining, TokenizerTraini
 
 __all__ = [
     "Arig",
+    "ArigPhase",
+    "ArigTraining",
     "Baseline",
     "Bus",
     "ChannelGroup",
@@ -59,6 +62,7 @@ __all__ = [
     "Safety",
     "Sampling",
     "Sfms",
+    "Stage",
     "Threshold",
     "TokenizerTraining",
     "Training",
@@ -68,8 +72,10 @@ __all__ = [
     "load_firmware_map",
     "load_head",
     "load_listener",
+    "load_training",
     "map_files",
     "parse",
     "parse_listener",
+    "parse_training",
     "variant",
 ]

@@ -47,6 +47,8 @@ class Arig(Listener):
         state_guidance: false leaves the conversational states out; visual: false leaves motion out of the behaviours;
             interaction: `linear` puts plain layers in place of bidirectional-integrated learning;
             discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4).
+        draws: what the sampler draws of a frame: its `motion`, as in the paper, or the `step` from the frame before,
+            which is small where a face is still, and with it what the sampler gets wrong.
         precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
     """
 
@@ -67,6 +69,7 @@ class Arig(Listener):
     interaction: Literal["bidirectional", "linear"] = "bidirectional"
     discrete: bool = False
     code_levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] = (8, 5, 5, 5)
+    draws: Literal["motion", "step"] = "motion"
     diffusion: Diffusion = Diffusion()
     precision: Literal["auto", "fp32", "int8"] = "auto"
 

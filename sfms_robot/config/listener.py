@@ -33,11 +33,18 @@ class ChannelGroup(Model):
 
 
 class Sampling(Model):
-    """How tokens are drawn, and over how many frames a plan fades into the motion before it."""
+    """How tokens are drawn and shown.
+
+    Attributes:
+        seam_frames: over these a plan fades into the motion before it.
+        smoothing: how far the head moves from each frame toward the mean of the two beside it, 0 to 1: motion between
+            coarse codes has corners, which servos would make heard. 0 is the paper.
+    """
 
     temperature: Positive = 1.0
     nucleus: Annotated[float, Field(gt=0, le=1)] = 1.0
     seam_frames: Count = 4
+    smoothing: Share = 0.0
 
 
 class Scores(Model):
@@ -149,6 +156,8 @@ class Sfms(Listener):
             raise ValueError(f"groups: no group holds {', '.join(missing)}")
         if len({len(group.levels) for group in self.groups.values()}) != 1:
             raise ValueError("groups: every group needs the same number of levels")
+        if self.wav2vec2 is not None and self.audio != "wav2vec2":
+            raise ValueError(f"wav2vec2: audio is {self.audio}, which needs no model")
         if self.hop_frames > self.future_frames:
             raise ValueError(f"hop {self.hop} is above future_frames {self.future_frames}")
         for key, width in (("tokenizer_width", self.tokenizer_width), ("predictor_width", self.predictor_width)):

@@ -11,7 +11,7 @@ from sfms_robot.config.base import Model
 from sfms_robot.config.listener import Count, Sfms
 from sfms_robot.config.training import TokenizerTraining
 
-HALVINGS = 3  # of time, in a grouped tokenizer
+HALVINGS = 3  # of time, in a grouped tokenizer: 8 frames to a code
 
 
 class Baseline(Model):

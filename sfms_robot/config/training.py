@@ -88,6 +88,7 @@ class PredictorTraining(Phase):
         history_noise: share of past keyframes that are one level off.
         group_weights: of each group's loss; 1 where it is not named.
         calibration_rounds: roll-outs that bring keyframe rates to those of the data.
+        nod_nuclei: nuclei to choose from for the group that pitches the head, by how often it then nods; none: its own.
     """
 
     transition_weight: Positive = 0.5
@@ -100,6 +101,7 @@ class PredictorTraining(Phase):
     gain_db: NonNegative = 6.0
     group_weights: dict[Name, Positive] = {}
     calibration_rounds: Annotated[int, Field(ge=0)] = 2
+    nod_nuclei: tuple[Annotated[float, Field(gt=0, le=1)], ...] = ()
 
 
 class Training(Model):

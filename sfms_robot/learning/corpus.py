@@ -144,7 +144,7 @@ def fit_scales(model: SfmsModel, corpus: Corpus, channels: Sequence[str]) -> Non
     Deviations are kept between what an eye just sees and what nobody misses: a still channel's noise is not blown up,
     and small movements of a channel that also makes large ones (a turning head) still count.
     """
-    least, most = _spread(channels)
+    least, most = spread_bounds(channels)
     model.motion_mean.copy_(corpus.motion.mean(0))
     model.motion_std.copy_(corpus.motion.std(0).clamp(min=least, max=most))
     steps = (corpus.motion.diff(dim=0) / model.motion_std).abs()
@@ -163,7 +163,7 @@ def fit_hearing(model: SfmsModel, corpus: Corpus) -> None:
         model.sound_std.copy_(spread.clamp(min=0.2 * float(spread.median())))
 
 
-def _spread(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
+def spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
     """Least and largest deviation (C,) that a channel is divided by: blendshapes, rotations [rad], places [m]."""
     bounds = []
     for name in channels:

@@ -62,7 +62,7 @@ def train_listener(
     checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
     some = dyads[:: max(1, len(dyads) // CALIBRATION_DYADS)][:CALIBRATION_DYADS]  # of the training set
     model.cpu()  # roll-outs go frame by frame, which no GPU makes faster
-    checkpoint.save_config(out, calibrated(corrected(settings), model, some, settings.predictor.calibration_rounds))
+    checkpoint.save_config(out, calibrated(corrected(settings), model, some, settings.predictor))
     scores = keyframe_scores(model, held_out, listener)
     return {**asdict(outcome), "held_out_loss": last, **scores}
 

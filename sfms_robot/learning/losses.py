@@ -12,12 +12,11 @@ from torch.nn import functional as F
 def reconstruction(
     motion: Tensor, restored: Tensor, at_keyframes: Tensor, mask: Tensor, member: Tensor, velocity: float
 ) -> Tensor:
-    """L2 + L2^Q of equation (13), and, beyond the paper, `velocity` times the error from one frame to the next.
+    """L2 + the first part of L2^Q of equation (13), and, beyond the paper, `velocity` times the error of the steps.
 
-    The velocity term keeps movement between coarse codes from having corners.
-
-    The quantization term is the error of the codes alone at the keyframes; with a fixed grid (FSQ) the two
-    stop-gradient terms of the equation have nothing to move and fall away.
+    The velocity term keeps movement between coarse codes from having corners. ||z^kf - z^kf^|| is taken in motion
+    space: the error of the codes alone, at the keyframes. The stop-gradient terms of L2^Q are the codebook's
+    (`Grid.commitment`, `Codebook.commitment`), since only it knows whether anything can move.
 
     Args:
         motion, restored, at_keyframes: (B, T, C); the last decoded from each frame's own code.

@@ -27,7 +27,7 @@ from sfms_robot.listeners.space import MotionSpace
 
 WEIGHTS = "tokenizer.safetensors"
 DRAWS = 2  # placements tried per window; the better one is the target of the masking loss
-CHUNK = 64  # windows encoded at a time
+CHUNK = 32  # windows placed and encoded at a time
 
 
 def train_tokenizer(

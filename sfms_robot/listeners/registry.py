@@ -9,7 +9,8 @@ from typing import Final, cast
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.ports import Listener
 
-LOADERS: Final = {"sfms": "sfms_robot.listeners.sfms"}  # kind -> module with load(folder) -> Listener
+# kind -> module with load(folder) -> Listener
+LOADERS: Final = {"sfms": "sfms_robot.listeners.sfms", "arig": "sfms_robot.listeners.arig"}
 
 
 def load_listener(folder: Path) -> Listener:

@@ -166,4 +166,4 @@ def read(file: Path) -> Dyad:
 
 
 def _voice(arrays: Mapping[str, NDArray[Any]], key: str) -> Floats | None:
-    return arrays[key].astype(np.float32) / 32767 if key in arrays else None
+    return np.asarray(arrays[key].astype(np.float32) / 32767, np.float32) if key in arrays else None

@@ -156,7 +156,7 @@ def cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
 
 
 def own_voice(voices: Sequence[Voice], other: Voice, rng: np.random.Generator) -> Voice | None:
-    """A filmed voice for the listener himself, another one than the speaker's if there is one; None: none was filmed."""
+    """A filmed voice for the listener, another one than the speaker's if there is one; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
@@ -254,9 +254,7 @@ def compose_one(
     )
 
 
-def _own_words(
-    stretch: Stretch, voice: Voice | None, rng: np.random.Generator
-) -> tuple[Floats | None, Floats | None]:
+def _own_words(stretch: Stretch, voice: Voice | None, rng: np.random.Generator) -> tuple[Floats | None, Floats | None]:
     """The listener's own voice (N * 640,), as a program would send it to a loudspeaker, and its mouth (N, 52)."""
     if voice is None:
         return None, None

@@ -1,8 +1,8 @@
-"""Whole recorded faces at 25 fps, what tokenizers are trained and compared on where nobody brought a dataset.
+"""Whole recorded faces at 25 fps: what tokenizers are trained and compared on where nobody brought a dataset.
 
-`build` reads them from a folder of recordings, `save` and `load` keep them in one small file (`sim/listeners/takes.npz`).
-Nothing is done to them but resampling: resting faces differ from person to person, and a tokenizer has to cope. Held out
-are whole takes of either recording system and the second half of a third one.
+`build` reads them from a folder of recordings, `save` and `load` keep them in one file, `sim/listeners/takes.npz`.
+Nothing is done to them but resampling: resting faces differ from person to person, and a tokenizer has to cope. Held
+out are whole takes of both recording systems, and the second half of a third.
 """
 
 from __future__ import annotations

@@ -8,12 +8,14 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
+from sfms_robot.listeners.sfms.hearing import SHAPES
 from sfms_robot.listeners.sfms.inpainter import Inpainter
 from sfms_robot.listeners.sfms.placement import Strategy, place
 from sfms_robot.listeners.sfms.predictor import Predictor
-from sfms_robot.listeners.sfms.quantizer import Quantizer, codes_to_indices, indices_to_codes
-from sfms_robot.listeners.sfms.score import ScoreNetwork
-from sfms_robot.signals.mel import MEL_BINS
+from sfms_robot.listeners.sfms.quantizer import Quantizer
+from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork
+from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
+from sfms_robot.signals.phase import FEATURES
 
 
 def membership(groups: Sequence[config.ChannelGroup], channels: Sequence[str]) -> Tensor:
@@ -31,36 +33,46 @@ class Tokenizer(nn.Module):
         groups = list(settings.groups.values())
         self.strategy: Strategy = settings.placement
         self.max_gap = settings.max_gap_frames
+        self.sweeps = settings.scores.sweeps
         self.window = settings.window_frames
         self.keyframes = [group.keyframes for group in groups]
         self.register_buffer("member", membership(groups, settings.channels), persistent=False)
-        self.quantizer = Quantizer(self.member, [group.levels for group in groups])
-        self.inpainter = Inpainter(self.quantizer, settings.tokenizer_width, settings.heads)
-        # Only learned placement has scores to learn; the others carry no dead weights.
-        self.score = (
-            ScoreNetwork(len(settings.channels), len(groups), settings.tokenizer_width, settings.heads)
-            if settings.placement == "learned"
-            else None
+        levels = [group.levels for group in groups]
+        self.quantizer = Quantizer(self.member, levels, settings.quantizer, settings.code_dims)
+        self.inpainter = Inpainter(
+            self.quantizer,
+            settings.tokenizer_width,
+            settings.heads,
+            settings.tokenizer_layers,
+            residual=settings.inpainter == "residual",
         )
+        self.score = _score_network(settings)
 
     def counts(self, frames: int) -> list[int]:
         """Keyframes per group for a stretch of `frames`, at the configured rate per window."""
         return [max(1, round(k * frames / self.window)) for k in self.keyframes]
 
-    def place(self, motion: Tensor) -> Tensor:
-        """Mask (B, T, G) of motion (B, T, C)."""
-        gap = self.max_gap if motion.shape[1] >= self.window else None
-        k = self.counts(motion.shape[1])
-        return place(motion, k, self.strategy, member=self.member, score=self.score, max_gap=gap)
+    def place(self, motion: Tensor, keyframes: Sequence[int] | None = None, strategy: Strategy | None = None) -> Tensor:
+        """Mask (B, T, G) of motion (B, T, C); `keyframes` (per group), `strategy`: others than the configured ones."""
+        gap = self.max_gap if motion.shape[1] >= self.window and keyframes is None else None
+        return place(
+            motion,
+            keyframes or self.counts(motion.shape[1]),
+            strategy or self.strategy,
+            member=self.member,
+            score=self.score,
+            max_gap=gap,
+            sweeps=self.sweeps,
+        )
 
     def encode(self, motion: Tensor, mask: Tensor) -> Tensor:
         """Tokens (B, T, G) of motion (B, T, C) whose keyframes are given."""
-        indices = codes_to_indices(self.quantizer.encode(motion), self.quantizer.levels)
+        indices = self.quantizer.indices(self.quantizer.encode(motion))
         return torch.where(mask > 0.5, indices + 1, 0)
 
     def decode(self, tokens: Tensor) -> Tensor:
         """Motion (B, T, C) of tokens (B, T, G); a token below 0 counts as transition."""
-        codes = indices_to_codes((tokens - 1).clamp(min=0), self.quantizer.levels)
+        codes = self.quantizer.codes((tokens - 1).clamp(min=0))
         return self.inpaint(codes, (tokens > 0).float())
 
     def inpaint(self, codes: Tensor, mask: Tensor) -> Tensor:
@@ -69,33 +81,48 @@ class Tokenizer(nn.Module):
         return out
 
 
+def _score_network(settings: config.Sfms) -> ScoreNetwork | ConditionalScore | None:
+    """Only learned placement has scores to learn; the others carry no dead weights."""
+    scores = settings.scores
+    if settings.placement == "learned_paper":
+        channels, groups = len(settings.channels), len(settings.groups)
+        return ScoreNetwork(channels, groups, scores.width, scores.heads, scores.layers)
+    if settings.placement in ("learned", "nested"):
+        largest = max(len(group.channels) for group in settings.groups.values())
+        return ConditionalScore(largest, scores.width, scores.heads, scores.layers)
+    return None
+
+
 class SfmsModel(nn.Module):
     """Weights of one listener, with the scales of its motion and sound."""
 
     motion_mean: Tensor
     motion_std: Tensor
     motion_speed: Tensor
-    mel_mean: Tensor
-    mel_std: Tensor
+    sound_mean: Tensor
+    sound_std: Tensor
 
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
-        width = len(settings.channels)
+        width, (rows, bins) = len(settings.channels), SHAPES[settings.audio]
+        phases = FEATURES if settings.phase else 0
         self.register_buffer("motion_mean", torch.zeros(width))
         self.register_buffer("motion_std", torch.ones(width))
         # Fastest natural change of each channel from one frame to the next, standardised.
         self.register_buffer("motion_speed", torch.full((width,), 1e6))
-        self.register_buffer("mel_mean", torch.zeros(MEL_BINS))
-        self.register_buffer("mel_std", torch.ones(MEL_BINS))
+        self.register_buffer("sound_mean", torch.zeros(bins))
+        self.register_buffer("sound_std", torch.ones(bins))
         self.tokenizer = Tokenizer(settings)
+        inner, heads = settings.predictor_width, settings.heads
         self.predictor = Predictor(
             [group.levels for group in settings.groups.values()],
-            width,
-            MEL_BINS,
+            settings.quantizer,
+            SpeakerEncoder(width, rows, bins, phases, inner, heads, settings.speaker_layers),
             settings.future_frames,
-            settings.predictor_width,
-            settings.heads,
+            inner,
+            heads,
             settings.predictor_layers,
+            settings.sequential,
         )
 
     def standardise(self, motion: Tensor) -> Tensor:
@@ -106,5 +133,6 @@ class SfmsModel(nn.Module):
         """The inverse of `standardise`."""
         return motion * self.motion_std + self.motion_mean
 
-    def standardise_mel(self, mel: Tensor) -> Tensor:
-        return (mel - self.mel_mean) / self.mel_std
+    def standardise_sound(self, rows: Tensor) -> Tensor:
+        """Rows (..., bins) of sound features, likewise."""
+        return (rows - self.sound_mean) / self.sound_std

@@ -1,20 +1,29 @@
-"""Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and four answers.
+"""Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and six answers.
 
-`learned` is the paper's (Gumbel top-k over the score network, Algorithm 1), `static` puts them evenly and centred,
-`static_paper` at every floor(N / k)-th frame as the paper's baseline does (which leaves the end of the window to
-extrapolation), `exact` finds the mask with the least error of linear interpolation by dynamic programming.
+    exact          the mask with the least error of linear interpolation, by dynamic programming
+    static         evenly, centred
+    static_paper   at every floor(N / k)-th frame, the paper's baseline, which leaves the window's end to extrapolation
+    learned_paper  the paper's: one look of the score network, Gumbel top-k by Algorithm 1
+    learned        ours: conditional scores, asked again at each of the k steps, then swept over (`choice`)
+    nested         the same scores not told how many are to come: the first k choices are a good code for every k
+
 Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Sequence
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-Strategy = Literal["exact", "static", "static_paper", "learned"]
+from sfms_robot.listeners.sfms.choice import choose, sweep
+from sfms_robot.listeners.sfms.exact import best_frames, segments
+from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks
+
+Strategy = Literal["exact", "static", "static_paper", "learned_paper", "learned", "nested"]
+STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 EPSILON = 1e-20  # a chosen frame falls back by 46: more than any two scores differ
 
 
@@ -24,20 +33,26 @@ def place(
     strategy: Strategy,
     *,
     member: Tensor,
-    score: Callable[[Tensor], Tensor] | None = None,
+    score: ScoreNetwork | ConditionalScore | None = None,
     max_gap: int | None = None,
+    sweeps: int = 0,
 ) -> Tensor:
     """Keyframe mask (B, T, G) of motion (B, T, C), deterministic: what encoding uses.
 
-    `score` gives the logits that `learned` ranks; `max_gap` bounds `exact`.
+    `score` is what the learned strategies ask; `max_gap` bounds `exact`; `sweeps` improve `learned`. Raises ValueError
+    when a strategy has no score network of its kind, or k does not fit the frames.
     """
     if strategy == "exact":
         return place_exact(motion, k, member, max_gap)
-    if strategy == "learned":
-        if score is None:
-            raise ValueError("learned placement needs a score network")
+    if strategy in ("static", "static_paper"):
+        return place_static(motion, k, centred=strategy == "static")
+    if strategy == "learned_paper":
+        if not isinstance(score, ScoreNetwork):
+            raise ValueError("learned_paper placement needs a score network of the paper's kind")
         return place_learned(score(motion), k)[0]
-    return place_static(motion, k, centred=strategy == "static")
+    if not isinstance(score, ConditionalScore):
+        raise ValueError(f"{strategy} placement needs a conditional score network")
+    return place_conditional(motion, k, member, score, told=strategy == "learned", sweeps=sweeps)
 
 
 def place_static(motion: Tensor, k: Sequence[int], *, centred: bool = True) -> Tensor:
@@ -65,7 +80,8 @@ def place_learned(
     if temperature == 0.0:
         hard = torch.cat([_top_k(scores[..., g], c)[..., None] for g, c in enumerate(k)], dim=-1)
         return hard, hard
-    uniform = torch.rand(scores.shape, generator=generator, device=scores.device).clamp(1e-7, 1 - 1e-7)
+    source = scores.device if generator is None else generator.device
+    uniform = torch.rand(scores.shape, generator=generator, device=source).to(scores.device).clamp(1e-7, 1 - 1e-7)
     noisy = scores - torch.log(-torch.log(uniform))  # lines 3 to 6
     relaxed = torch.stack([_relaxed_k_hot(noisy[..., g], c, temperature) for g, c in enumerate(k)], dim=-1)
     hard = torch.stack([_top_k(relaxed[..., g], c) for g, c in enumerate(k)], dim=-1)  # lines 14 to 16
@@ -87,6 +103,32 @@ def _top_k(scores: Tensor, count: int) -> Tensor:
     return torch.zeros_like(scores).scatter(-1, scores.topk(count, dim=-1).indices, 1.0)
 
 
+@torch.no_grad()
+def place_conditional(
+    motion: Tensor, k: Sequence[int], member: Tensor, score: ConditionalScore, *, told: bool, sweeps: int = 0
+) -> Tensor:
+    """Mask of the highest conditional scores, one keyframe after another, then `sweeps` rounds of second thoughts."""
+    b, t, _ = motion.shape
+    for count in k:
+        _check(count, t)
+    track = tracks(motion, member, score.curves)
+    counts = torch.tensor(k, device=motion.device).repeat(b)
+    mask = choose(score, track, counts, told=told).mask
+    for turn in range(sweeps if told else 0):  # a keyframe chosen anew would break the order of a nested code
+        mask = sweep(score, track, mask, together=1 + turn % 2)
+    return mask.view(b, len(k), t).transpose(1, 2).contiguous()
+
+
+@torch.no_grad()
+def nested_order(motion: Tensor, most: int, member: Tensor, score: ConditionalScore) -> Tensor:
+    """Frames (B, most, G) in the order in which each group would have them: any first k are a code."""
+    _check(most, motion.shape[1])
+    track = tracks(motion, member, score.curves)
+    counts = torch.full((len(track.curves),), most, device=motion.device)
+    order = choose(score, track, counts, told=False).order
+    return order.view(len(motion), len(member), most).transpose(1, 2)
+
+
 def place_exact(motion: Tensor, k: Sequence[int], member: Tensor, max_gap: int | None = None) -> Tensor:
     """The mask with the least squared error of linear interpolation between keyframes, held at both ends.
 
@@ -97,69 +139,14 @@ def place_exact(motion: Tensor, k: Sequence[int], member: Tensor, max_gap: int |
         max_gap: at most this many frames from one keyframe to the next; None for no bound.
     """
     b, t, _ = motion.shape
-    x = motion.double()[:, None] * member[:, None].double()  # (B, G, T, C)
-    inside, before, after = _segment_errors(x @ x.transpose(-1, -2))
-    if max_gap is not None:
-        frame = torch.arange(t)
-        inside = inside.masked_fill(frame[None, :] - frame[:, None] > max_gap, torch.inf)
-        before = before.masked_fill(frame > max_gap, torch.inf)
-        after = after.masked_fill(t - 1 - frame > max_gap, torch.inf)
     mask = motion.new_zeros(b, t, len(k))
-    for group, count in enumerate(k):
+    for group, count in enumerate(k):  # one at a time: the tables of one group fit the processor's cache
         _check(count, t, max_gap)
-        index = _cheapest_path(inside[:, group], before[:, group], after[:, group], count)
-        mask[:, :, group] = mask[:, :, group].scatter(1, index, 1.0)
+        own = motion[..., member[group] > 0.5].double()  # errors are small differences
+        cost = segments(own @ own.transpose(1, 2))
+        frames = best_frames(cost if max_gap is None else cost.bounded(max_gap), count)
+        mask[:, :, group] = mask[:, :, group].scatter(1, frames, 1.0)
     return mask
-
-
-def _segment_errors(gram: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gram matrix (..., T, T) of the frames -> error of the segment between keyframes i < j (..., T, T; infinite where
-    j <= i), of holding j back to the start, of holding i to the end, both (..., T).
-
-    With w = (s - i) / (j - i) the frame between is (1 - w) x_i + w x_j, so its squared error is a sum of Gram entries
-    weighted by 1, s and s^2; prefix sums over s make every segment O(1).
-    """
-    t = gram.shape[-1]
-    s = torch.arange(t, dtype=gram.dtype)
-    square = gram.diagonal(dim1=-2, dim2=-1)  # |x_s|^2, (..., T)
-    p0, p1 = gram.cumsum(-2), (gram * s[:, None]).cumsum(-2)  # sums over frames s of <x_s, x_i> and s <x_s, x_i>
-    norm = square.cumsum(-1)
-
-    own0, own1 = p0.diagonal(dim1=-2, dim2=-1), p1.diagonal(dim1=-2, dim2=-1)  # at s = i
-    # Sums over i < s <= j, as matrices (i, j); the interpolation error is zero at s = j, so j may be included.
-    sum0_i = p0.transpose(-1, -2) - own0[..., :, None]  # of <x_s, x_i>
-    sum1_i = p1.transpose(-1, -2) - own1[..., :, None]
-    sum0_j = own0[..., None, :] - p0  # of <x_s, x_j>
-    sum1_j = own1[..., None, :] - p1
-    n = (s[None, :] - s[:, None]).clamp(min=1.0)  # j - i
-    i = s[:, None]
-    w_i = sum0_i - (sum1_i - i * sum0_i) / n  # sum of (1 - w) <x_s, x_i>
-    w_j = (sum1_j - i * sum0_j) / n  # sum of w <x_s, x_j>
-    ww = (n + 1) * (2 * n + 1) / (6 * n)  # sum of w^2 over s = i + 1 .. j
-    w1w = (n + 1) / 2 - ww  # sum of w (1 - w)
-    vv = n - (n + 1) + ww  # sum of (1 - w)^2
-    error = norm[..., None, :] - norm[..., :, None] - 2 * w_i - 2 * w_j
-    error = error + vv * square[..., :, None] + 2 * w1w * gram + ww * square[..., None, :]
-    inside = error.clamp(min=0.0).masked_fill(s[None, :] <= s[:, None], torch.inf)
-
-    total0 = p0[..., -1, :]  # sum over all s of <x_s, x_i>
-    before = norm - 2 * own0 + (s + 1) * square
-    after = norm[..., -1:] - norm - 2 * (total0 - own0) + (t - 1 - s) * square
-    return inside, before.clamp(min=0.0), after.clamp(min=0.0)
-
-
-def _cheapest_path(inside: Tensor, before: Tensor, after: Tensor, count: int) -> Tensor:
-    """Frames (B, count) of the best keyframes: cost[j] = min_i cost[i] + inside[i, j], `count` - 1 times."""
-    cost, parents = before, []
-    for _ in range(count - 1):
-        cost, parent = (cost[:, :, None] + inside).min(dim=1)
-        parents.append(parent)
-    frame = (cost + after).argmin(dim=1, keepdim=True)
-    path = [frame]
-    for parent in reversed(parents):
-        frame = parent.gather(1, frame)
-        path.append(frame)
-    return torch.cat(path[::-1], dim=1)
 
 
 def _check(count: int, frames: int, max_gap: int | None = None) -> None:

@@ -1,16 +1,23 @@
-"""Finite scalar quantization (Mentzer et al. 2023, arXiv:2309.15505): a code is a point on a small fixed grid.
+"""Codes of keyframes (IV-B4): motion of one frame -> one code per channel group -> motion of that frame.
 
-Every group has its own grid of D dimensions; dimension d of group g has L[g, d] levels, spread evenly over -1..1.
-A code's index counts the levels in mixed radix, first dimension fastest.
+Two kinds of codebook behind one interface. Finite scalar quantization (Mentzer et al. 2023, arXiv:2309.15505): a code
+is a point on a small fixed grid; dimension d of group g has L[g, d] levels, spread evenly over -1..1, and a code's
+index counts the levels in mixed radix, first dimension fastest. Vector quantization (van den Oord et al. 2017,
+arXiv:1711.00937): a code is the nearest of a list of learned vectors, which follow the mean of what they stand for.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
+
+DECAY = 0.99  # of a vector's running mean, per step
+DEAD = 0.05  # a vector that stands for less than this share of what the average one does begins anew
 
 
 def as_levels(levels: Sequence[Sequence[int]]) -> Tensor:
@@ -43,6 +50,101 @@ def _radix(levels: Tensor) -> Tensor:
     return torch.cat([ones, levels[:, :-1]], dim=-1).cumprod(-1).long()  # (G, D)
 
 
+class Grid(nn.Module):
+    """The fixed codebook of finite scalar quantization: nothing to learn."""
+
+    levels: Tensor
+
+    def __init__(self, levels: Sequence[Sequence[int]]) -> None:
+        super().__init__()
+        self.register_buffer("levels", as_levels(levels), persistent=False)
+        self.dims = len(levels[0])
+
+    def nearest(self, latent: Tensor) -> Tensor:
+        """(..., G, D) -> codes (..., G, D), gradient straight through."""
+        return quantize(latent, self.levels)
+
+    def indices(self, codes: Tensor) -> Tensor:
+        """(..., G, D) -> (..., G)."""
+        return codes_to_indices(codes, self.levels)
+
+    def codes(self, indices: Tensor) -> Tensor:
+        """(..., G) -> (..., G, D)."""
+        return indices_to_codes(indices, self.levels)
+
+    def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
+        """The stop-gradient terms of equation (13): a grid cannot move, and rounding is never far."""
+        return latent.new_zeros(())
+
+
+class Codebook(nn.Module):
+    """V learned vectors per group. They move only by `learn`, which training calls: encoding never changes them."""
+
+    vectors: Tensor
+    counts: Tensor
+    sizes: Tensor
+
+    def __init__(self, sizes: Sequence[int], dims: int) -> None:
+        super().__init__()
+        self.dims = dims
+        self.register_buffer("vectors", torch.randn(len(sizes), max(sizes), dims))
+        self.register_buffer("counts", torch.zeros(len(sizes), max(sizes)))  # keyframes a step, running mean
+        self.register_buffer("sizes", torch.tensor(sizes), persistent=False)
+
+    def nearest(self, latent: Tensor) -> Tensor:
+        """(..., G, D) -> codes (..., G, D), gradient straight through."""
+        code = self.codes(self.indices(latent))
+        return latent + (code - latent).detach()
+
+    @torch.no_grad()
+    def indices(self, codes: Tensor) -> Tensor:
+        """(..., G, D), also off the list -> (..., G) of the nearest vectors."""
+        flat = codes.detach().float().flatten(0, -3).transpose(0, 1)  # (G, N, D)
+        with torch.autocast(codes.device.type, enabled=False):  # nearest is a matter of small differences
+            distance = self.vectors.square().sum(-1)[:, None] - 2 * flat @ self.vectors.transpose(1, 2)
+        absent = torch.arange(self.vectors.shape[1], device=codes.device) >= self.sizes[:, None]
+        found = distance.masked_fill(absent[:, None], torch.inf).argmin(-1)
+        return found.transpose(0, 1).view(codes.shape[:-1])
+
+    def codes(self, indices: Tensor) -> Tensor:
+        """(..., G) -> (..., G, D)."""
+        return self.vectors[torch.arange(len(self.sizes), device=indices.device), indices]
+
+    def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
+        """||sg[z_q] - E(z)||^2 of equation (13) at the keyframes; `learn` minimises ||sg[E(z)] - z_q||^2 by itself."""
+        away = (latent - self.codes(self.indices(latent)).detach()).square().mean(-1)
+        return (away * mask).sum() / mask.sum().clamp(min=1.0)
+
+    @torch.no_grad()
+    def learn(self, latent: Tensor, mask: Tensor, generator: torch.Generator) -> None:
+        """Move every vector toward the mean of the keyframes it stands for, and put idle ones where a keyframe is.
+
+        Args:
+            latent: (B, T, G, D) encoded motion; mask: (B, T, G), only keyframes are learned from (IV-B4).
+            generator: draws, on the CPU, the keyframes at which idle vectors begin anew.
+        """
+        groups, most = self.counts.shape
+        key = (mask > 0.5).flatten(0, 1)  # (N, G)
+        flat = latent.float().flatten(0, 1)
+        chosen = (F.one_hot(self.indices(latent).flatten(0, 1), most) * key[..., None]).float()  # (N, G, V)
+        now = chosen.sum(0)
+        with torch.autocast(latent.device.type, enabled=False):
+            mean = torch.einsum("ngv,ngd->gvd", chosen, flat) / now.clamp(min=1.0)[..., None]
+        counts = DECAY * self.counts + (1 - DECAY) * now
+        share = ((1 - DECAY) * now / counts.clamp(min=1e-9))[..., None]  # weight of this step in the running mean
+        self.vectors.lerp_(mean, share.clamp(max=1.0))
+        for group in range(groups):
+            seen = flat[key[:, group], group]
+            average = counts[group].sum() / self.sizes[group]
+            idle = (counts[group, : int(self.sizes[group])] < DEAD * average).nonzero()[:, 0]
+            if len(seen) == 0 or len(idle) == 0:
+                continue
+            drawn = torch.randint(len(seen), (len(idle),), generator=generator).to(seen.device)
+            self.vectors[group, idle] = seen[drawn]
+            counts[group, idle] = average  # time to prove itself
+        self.counts.copy_(counts)
+
+
 class GroupMLP(nn.Module):
     """One two-layer network per group, all groups at once: no group sees another's input."""
 
@@ -56,29 +158,63 @@ class GroupMLP(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(B, T, G, inputs) -> (B, T, G, outputs)."""
         y = torch.einsum("btgi,gih->btgh", x, self.w1) + self.b1
-        return torch.einsum("btgh,gho->btgo", nn.functional.gelu(y), self.w2) + self.b2
+        return torch.einsum("btgh,gho->btgo", F.gelu(y), self.w2) + self.b2
 
 
 class Quantizer(nn.Module):
-    """Motion of one frame -> one code per group -> motion of that frame. Frames do not see each other."""
+    """Encoder, codebook and decoder of single frames. Frames do not see each other, groups do not either."""
 
     member: Tensor
+    slots: Tensor
+    filled: Tensor
+    owner: Tensor
+    slot: Tensor
     levels: Tensor
 
-    def __init__(self, member: Tensor, levels: Sequence[Sequence[int]], hidden: int = 48) -> None:
-        """`member` (G, C): 1 where channel c belongs to group g."""
+    def __init__(
+        self,
+        member: Tensor,
+        levels: Sequence[Sequence[int]],
+        kind: Literal["fsq", "vq"] = "fsq",
+        dims: int = 4,
+        hidden: int = 48,
+    ) -> None:
+        """`member` (G, C): 1 where channel c belongs to group g; `levels` of a group multiply to its codes."""
         super().__init__()
-        groups, channels = member.shape
+        groups, _ = member.shape
+        own = [row.nonzero()[:, 0] for row in member]
+        most = max(map(len, own))
         self.register_buffer("member", member, persistent=False)
         self.register_buffer("levels", as_levels(levels), persistent=False)
-        self.encoder = GroupMLP(groups, channels, hidden, len(levels[0]))
-        self.decoder = GroupMLP(groups, len(levels[0]), hidden, channels)
+        # Each group's channels in slots 0..: with a group per channel a full (G, C) matrix would be zeros but for 1/C.
+        self.register_buffer("slots", torch.stack([F.pad(c, (0, most - len(c))) for c in own]), persistent=False)
+        self.register_buffer("filled", torch.stack([(torch.arange(most) < len(c)).float() for c in own]), False)
+        self.register_buffer("owner", member.argmax(0), persistent=False)
+        self.register_buffer("slot", (member.cumsum(-1) * member).amax(0).long() - 1, persistent=False)
+        sizes = [math.prod(row) for row in levels]
+        self.codebook: Grid | Codebook = Grid(levels) if kind == "fsq" else Codebook(sizes, dims)
+        self.dims = self.codebook.dims
+        self.encoder = GroupMLP(groups, most, hidden, self.dims)
+        self.decoder = GroupMLP(groups, self.dims, hidden, most)
+
+    def latent(self, motion: Tensor) -> Tensor:
+        """(B, T, C) standardised -> (B, T, G, D), not yet codes."""
+        out: Tensor = self.encoder(motion[..., self.slots] * self.filled)
+        return out
 
     def encode(self, motion: Tensor) -> Tensor:
-        """(B, T, C) standardised -> codes (B, T, G, D) on the grid."""
-        return quantize(self.encoder(motion[..., None, :] * self.member), self.levels)
+        """(B, T, C) standardised -> codes (B, T, G, D) of the codebook."""
+        return self.codebook.nearest(self.latent(motion))
 
     def decode(self, codes: Tensor) -> Tensor:
         """(B, T, G, D) -> (B, T, C): each channel from its own group's code."""
-        out: Tensor = (self.decoder(codes) * self.member).sum(-2)
+        out: Tensor = self.decoder(codes)[..., self.owner, self.slot]
         return out
+
+    def indices(self, codes: Tensor) -> Tensor:
+        """Codes (..., G, D) -> (..., G) from 0."""
+        return self.codebook.indices(codes)
+
+    def codes(self, indices: Tensor) -> Tensor:
+        """The inverse."""
+        return self.codebook.codes(indices)

@@ -10,29 +10,27 @@ import torch
 from torch import Tensor
 
 from sfms_robot.listeners.sfms.model import SfmsModel
-from sfms_robot.listeners.sfms.quantizer import indices_to_codes
 
 
 class Reach:
-    """Frames needed from each code to each other one, per group, V = codes of the largest group."""
+    """Frames needed from each token to each other one, per group, V = codes of the largest group."""
 
     @torch.no_grad()
     def __init__(self, model: SfmsModel) -> None:
         quantizer = model.tokenizer.quantizer
         sizes = quantizer.levels.prod(-1).long()
         indices = torch.arange(int(sizes.max()))[:, None] % sizes  # (V, G)
-        motion = quantizer.decoder(indices_to_codes(indices, quantizer.levels)[None])[0]  # (V, G, C)
-        self.needed = torch.zeros(len(sizes), len(indices), len(indices))
+        motion = quantizer.decode(quantizer.codes(indices)[None])[0]  # (V, C)
+        # By token: class 0 may always follow, and anything may follow class 0, which is no keyframe yet.
+        self.needed = torch.zeros(len(sizes), 1 + len(indices), 1 + len(indices))
         for group, size in enumerate(sizes.tolist()):
+            needed = self.needed[group, 1:, 1:]
             for channel in quantizer.member[group].nonzero()[:, 0].tolist():
-                value = motion[:, group, channel]
-                frames = (value[:, None] - value[None, :]).abs() / model.motion_speed[channel]
-                self.needed[group] = torch.maximum(self.needed[group], frames)
-            self.needed[group, :, size:] = torch.inf
+                value = motion[:, channel]
+                torch.maximum(needed, (value[:, None] - value[None, :]).abs() / model.motion_speed[channel], out=needed)
+            self.needed[group, :, 1 + size :] = torch.inf
+        self._groups = torch.arange(len(sizes))
 
-    def allowed(self, last: Tensor, gap: Tensor) -> Tensor:
-        """Tokens (G,) of the last keyframes (0: none) and frames (G,) since -> (G, V + 1) bool; class 0 always is."""
-        groups = torch.arange(len(last))
-        reachable = self.needed[groups, (last - 1).clamp(min=0)] <= gap[:, None]
-        reachable = reachable | (last == 0)[:, None]
-        return torch.cat([torch.ones(len(last), 1, dtype=torch.bool), reachable], dim=1)
+    def too_soon(self, last: Tensor, gap: Tensor) -> Tensor:
+        """Tokens (..., G) of the last keyframes (0: none), frames since -> classes (..., G, V + 1) out of reach."""
+        return self.needed[self._groups, last] > gap[..., None]

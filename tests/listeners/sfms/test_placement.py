@@ -1,12 +1,23 @@
 import itertools
+from functools import cache
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.listeners.sfms.inpainter import Neighbours
-from sfms_robot.listeners.sfms.placement import place, place_exact, place_learned, place_static
+from sfms_robot.listeners.sfms.choice import choose, sweep
+from sfms_robot.listeners.sfms.exact import best_frames_each, completion_errors, mask_cost, segments
+from sfms_robot.listeners.sfms.neighbours import Neighbours
+from sfms_robot.listeners.sfms.placement import (
+    STRATEGIES,
+    nested_order,
+    place,
+    place_exact,
+    place_learned,
+    place_static,
+)
+from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, stretch_errors, tracks
 
 MEMBER = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -14,7 +25,7 @@ MEMBER = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 def interpolation_error(motion: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """(B, G) squared error of linear interpolation, by the inpainter's own interpolation."""
     values = motion[:, :, None] * MEMBER
-    return ((Neighbours(mask).interpolate(values) - values) ** 2).sum((1, 3))
+    return ((Neighbours.in_mask(mask).interpolate(values) - values) ** 2).sum((1, 3))
 
 
 @settings(max_examples=25, deadline=None)
@@ -31,12 +42,17 @@ def test_exact_placement_beats_every_other_mask(first: int, second: int, seed: i
         torch.testing.assert_close(error[:, group], torch.stack(others).min(0).values, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("strategy", ["exact", "static", "static_paper", "learned"])
+@cache
+def scores(strategy: str) -> ScoreNetwork | ConditionalScore:
+    torch.manual_seed(0)
+    return (ScoreNetwork(3, 2, 8, 2) if strategy == "learned_paper" else ConditionalScore(2, 8, 2, 1)).eval()
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("k", [(1, 1), (3, 7), (48, 10)])
 def test_every_strategy_places_exactly_k(strategy, k):
     motion = torch.randn(3, 48, 3)
-    score = torch.nn.Linear(3, 2)
-    mask = place(motion, k, strategy, member=MEMBER, score=score)
+    mask = place(motion, k, strategy, member=MEMBER, score=scores(strategy), sweeps=2)
     assert torch.equal(mask.sum(1), torch.tensor(k).float().expand(3, 2))
     assert set(mask.unique().tolist()) <= {0.0, 1.0}
 
@@ -97,3 +113,116 @@ def test_gaps_stay_below_the_bound():
 def test_impossible_counts_are_refused(k, gap, text):
     with pytest.raises(ValueError, match=text):
         place_exact(torch.zeros(1, 9, 3), [k, k], MEMBER, gap)
+
+
+def walk(seed: int, tracks_: int = 4, frames: int = 9) -> torch.Tensor:
+    """(N, 1, T) gram-ready random walks."""
+    return torch.randn(tracks_, frames, 1, generator=torch.Generator().manual_seed(seed)).cumsum(1).double()
+
+
+def cost_of(motion: torch.Tensor):
+    return segments(motion @ motion.transpose(1, 2))
+
+
+def every_mask(frames: int, count: int) -> torch.Tensor:
+    rows = torch.tensor(list(itertools.combinations(range(frames), count)))
+    return torch.zeros(len(rows), frames, dtype=torch.float64).scatter(1, rows, 1.0)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 9), st.integers(0, 10_000))
+def test_the_cost_of_a_mask_is_its_interpolation_error(count: int, seed: int):
+    motion = walk(seed, 1)
+    masks = every_mask(9, count)
+    same = motion.expand(len(masks), -1, -1)
+    drawn = Neighbours.in_mask(masks[..., None]).interpolate((same * masks[..., None])[:, :, None])[:, :, 0]
+    torch.testing.assert_close(mask_cost(cost_of(same), masks), ((drawn - same) ** 2).sum((1, 2)), rtol=1e-6, atol=1e-8)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sets(st.integers(0, 7), max_size=3), st.integers(1, 5), st.integers(0, 10_000))
+def test_completion_errors_are_those_of_the_best_mask_through_the_chosen_frames(chosen, most: int, seed: int):
+    frames, motion = 8, walk(seed, 1, 8)
+    state = torch.zeros(1, frames, dtype=torch.float64)
+    state[0, sorted(chosen)] = 1.0
+    found = completion_errors(cost_of(motion), state, most)[0]
+    for k in range(1, most + 1):
+        masks = every_mask(frames, k)
+        costs = mask_cost(cost_of(motion.expand(len(masks), -1, -1)), masks)
+        for frame in range(frames):
+            holds = (masks * state).sum(1).eq(len(chosen)) & (masks[:, frame] > 0)
+            best = costs[holds].min() if holds.any() else torch.tensor(torch.inf, dtype=torch.float64)
+            torch.testing.assert_close(found[k - 1, frame], best, rtol=1e-6, atol=1e-8)
+
+
+def test_one_pass_for_every_k_equals_one_pass_each():
+    motion = walk(3, 5, 12)
+    for k, frames in zip(range(2, 7), best_frames_each(cost_of(motion), 2, 6), strict=True):
+        mask = place_exact(motion.float(), [k], torch.ones(1, 1))[..., 0]
+        assert torch.equal(frames, mask.nonzero()[:, 1].view(5, k))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sets(st.integers(0, 8), min_size=1, max_size=6), st.integers(0, 10_000))
+def test_stretch_errors_tell_what_one_more_keyframe_changes(chosen, seed: int):
+    motion = walk(seed, 1)
+    mask = torch.zeros(1, 9, dtype=torch.float64)
+    mask[0, sorted(chosen)] = 1.0
+    now, then = stretch_errors(cost_of(motion), mask)
+    before = mask_cost(cost_of(motion), mask)
+    for frame in set(range(9)) - set(chosen):
+        more = mask.clone()
+        more[0, frame] = 1.0
+        torch.testing.assert_close(
+            before - mask_cost(cost_of(motion), more), (now - then)[:, frame], rtol=1e-6, atol=1e-8
+        )
+
+
+@pytest.mark.parametrize("together", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_sweep_keeps_k_and_never_makes_a_mask_worse(together: int, count: int):
+    score = scores("learned")
+    track = tracks(torch.randn(6, 16, 3).cumsum(1), MEMBER, score.curves)
+    start = choose(score, track, torch.full((12,), count)).mask
+    swept = sweep(score, track, start, together)
+    assert torch.equal(swept.sum(1), start.sum(1))
+    assert (mask_cost(track.cost, swept) <= mask_cost(track.cost, start) + 1e-6).all()
+
+
+def test_conditional_scores_never_choose_a_frame_twice_and_see_no_other_track():
+    score = scores("learned")
+    motion = torch.randn(4, 16, 3).cumsum(1)
+    mask = place(motion, [16, 3], "learned", member=MEMBER, score=score)
+    assert (mask[..., 0] == 1).all()
+    alone = place(motion[2:3], [16, 3], "learned", member=MEMBER, score=score)
+    assert torch.equal(alone[0], mask[2])
+
+
+@pytest.mark.parametrize("most", [2, 5, 9])
+def test_nested_keyframes_are_prefixes_of_one_order(most: int):
+    score = scores("nested")
+    motion = torch.randn(3, 16, 3).cumsum(1)
+    order = nested_order(motion, most, MEMBER, score)
+    for k in range(1, most + 1):
+        mask = place(motion, [k, k], "nested", member=MEMBER, score=score)
+        assert torch.equal(torch.zeros_like(mask).scatter(1, order[:, :k], 1.0), mask)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(0.1, 10), st.integers(0, 1000))
+def test_scores_do_not_depend_on_size_or_offset_of_the_motion(scale: float, seed: int):
+    score = scores("learned")
+    motion = torch.randn(2, 16, 3, generator=torch.Generator().manual_seed(seed)).cumsum(1)
+    state, remaining = torch.zeros(4, 16), torch.full((4,), 3)
+    state[:, 5] = 1.0
+    plain = score(tracks(motion, MEMBER, score.curves), state, remaining)
+    moved = score(tracks(motion * scale + 3, MEMBER, score.curves), state, remaining)
+    torch.testing.assert_close(plain, moved, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "strategy, wrong", [("learned", "learned_paper"), ("nested", None), ("learned_paper", "nested")]
+)
+def test_a_learned_placement_without_its_own_scores_is_refused(strategy, wrong):
+    with pytest.raises(ValueError, match="score network"):
+        place(torch.zeros(1, 9, 3), [2, 2], strategy, member=MEMBER, score=scores(wrong) if wrong else None)

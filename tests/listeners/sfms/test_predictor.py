@@ -2,69 +2,121 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tiny_sfms import tiny_listener
 
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, _loudness, _speech_phase
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, Trail, trails
+from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)
 
 
-def context(**changes) -> Context:
+def context(drawn_frames: int = 0, **changes) -> Context:
     drawn = torch.Generator().manual_seed(2)
+    tokens = torch.randint(0, 7, (1, 48, 2), generator=drawn)
+    tokens[:, 40 + drawn_frames :] = UNDECIDED
     return replace(
         Context(
             face=torch.randn(1, 40, 58, generator=drawn),
             face_known=HEARD,
-            mel=torch.randn(1, 160, 128, generator=drawn),
+            voice=torch.randn(1, 40, 16, generator=drawn),
             heard=HEARD,
-            tokens=torch.randint(0, 7, (1, 40, 2), generator=drawn),
+            phase=torch.rand(1, 40, 21, generator=drawn),
+            tokens=tokens,
         ),
         **changes,
     )
 
 
 @torch.no_grad()
-def logits(predictor, seen: Context, given: int = 0) -> list[torch.Tensor]:
-    future = torch.full((1, 8, 2), UNDECIDED)
-    future[:, :given] = 1
-    return predictor.decode(predictor.remember(seen), seen.tokens, future)
+def logits(predictor, seen: Context, target: torch.Tensor | None = None) -> torch.Tensor:
+    return predictor.teacher_forced(seen, torch.ones(1, 8, 2).long() if target is None else target)
 
 
 def test_every_group_gets_its_codes_and_the_transition_for_every_future_frame(tiny):
-    assert [tuple(group.shape) for group in logits(tiny.model.predictor, context())] == [(1, 8, 7), (1, 8, 9)]
+    out = logits(tiny.model.predictor, context())
+    assert out.shape == (1, 8, 2, 9)
+    assert out.isfinite().sum(-1)[0, 0].tolist() == [7, 9]
 
 
-@pytest.mark.parametrize("given", [1, 4, 7])
-def test_frames_already_decided_change_what_follows(tiny, given: int):
-    parallel = logits(tiny.model.predictor, context())
-    after = logits(tiny.model.predictor, context(), given)
-    assert all(not torch.equal(a[:, given:], b[:, given:]) for a, b in zip(parallel, after, strict=True))
+@pytest.mark.parametrize("changed", [0, 3, 6])
+def test_a_frame_knows_the_keyframes_before_it_and_none_behind(tiny, changed: int):
+    one, other = torch.ones(1, 8, 2).long(), torch.ones(1, 8, 2).long()
+    other[:, changed] = 4
+    a, b = (logits(tiny.model.predictor, context(), target) for target in (one, other))
+    assert torch.equal(a[:, : changed + 1], b[:, : changed + 1])
+    assert not torch.equal(a[:, changed + 1], b[:, changed + 1])
 
 
+def test_a_parallel_predictor_answers_all_frames_alone():
+    predictor = tiny_listener(sequential=False).model.predictor
+    a, b = (logits(predictor, context(), torch.full((1, 8, 2), token)) for token in (0, 4))
+    assert torch.equal(a, b)
+
+
+def test_what_is_drawn_already_changes_what_follows(tiny):
+    a, b = (logits(tiny.model.predictor, context(drawn)) for drawn in (0, 4))
+    assert not torch.equal(a, b)
+
+
+@pytest.mark.parametrize("sequential", [True, False])
 @pytest.mark.parametrize("modality", ["voice", "face"])
-def test_what_is_marked_missing_does_not_matter(tiny, modality: str):
+def test_what_is_marked_missing_does_not_matter(modality: str, sequential: bool):
+    predictor = tiny_listener(sequential=sequential).model.predictor
     gone = torch.zeros_like(HEARD)
     if modality == "voice":
-        one, other = context(heard=gone), context(heard=gone, mel=torch.ones(1, 160, 128))
+        one = context(heard=gone)
+        other = replace(one, voice=torch.full((1, 40, 16), torch.nan), phase=torch.full((1, 40, 21), torch.nan))
     else:
-        one, other = context(face_known=gone), context(face_known=gone, face=torch.ones(1, 40, 58))
-    for a, b in zip(logits(tiny.model.predictor, one), logits(tiny.model.predictor, other), strict=True):
-        assert torch.equal(a, b)
+        one, other = context(face_known=gone), context(face_known=gone, face=torch.full((1, 40, 58), torch.nan))
+    assert torch.equal(logits(predictor, one), logits(predictor, other))
 
 
-def speech_then_silence(silent_frames: int) -> torch.Tensor:
-    mel = torch.ones(1, 160, 128)
-    if silent_frames:
-        mel[:, -4 * silent_frames :] = -1.0
-    return mel
+def test_many_answers_to_one_speaker_are_those_to_copies_of_him(tiny):
+    one, copies = context(), context()
+    own = torch.cat([one.tokens, one.tokens.flip(1).clamp(min=0)])
+    copies = Context(*(getattr(one, name).expand(2, *[-1] * (getattr(one, name).ndim - 1)) for name in
+                       ("face", "face_known", "voice", "heard", "phase")), own)  # fmt: skip
+    with torch.no_grad():
+        torch.testing.assert_close(tiny.model.predictor(replace(one, tokens=own)), tiny.model.predictor(copies))
 
 
-@pytest.mark.parametrize("silent, bin_", [(0, 0), (1, 1), (4, 1), (5, 2), (9, 2), (10, 3), (19, 3), (20, 4), (38, 4)])
-def test_silence_so_far_falls_into_its_bin_whatever_the_gain(silent: int, bin_: int):
-    for gain in (-1.5, 0.0, 1.5):
-        phase = _speech_phase(speech_then_silence(silent) + gain * (silent > 0), HEARD)
-        assert phase[0, :6].argmax() == bin_
+def test_every_weight_has_a_gradient(tiny):
+    predictor = tiny_listener().model.predictor
+    seen = context(voice=predictor.speaker.listen(torch.randn(1, 41 * 4, 128)), face_known=torch.rand(1, 40) > 0.5)
+    seen = replace(seen, heard=torch.rand(1, 40) > 0.5, tokens=context(3).tokens)
+    out = predictor.teacher_forced(seen, torch.randint(0, 7, (1, 8, 2)))
+    out[out.isfinite()].square().sum().backward()
+    assert [name for name, weight in predictor.named_parameters() if weight.grad is None] == []
 
 
-def test_loudness_does_not_depend_on_the_gain():
-    mel = torch.randn(1, 160, 128)
-    torch.testing.assert_close(_loudness(mel, HEARD), _loudness(mel + 3, HEARD), atol=1e-5, rtol=1e-4)
+@pytest.mark.parametrize("rows, bins", [(4, 128), (1, 78)])
+@pytest.mark.parametrize("chunk", [1, 3, 7])
+def test_listening_in_chunks_equals_listening_at_once(rows: int, bins: int, chunk: int):
+    encoder = SpeakerEncoder(58, rows, bins, 0, 16, 2, 1)
+    sound = torch.randn(1, 22 * rows, bins)
+    whole = encoder.listen(sound)
+    parts = [encoder.listen(sound[:, at * rows : (at + chunk + 1) * rows]) for at in range(0, 21, chunk)]
+    torch.testing.assert_close(torch.cat(parts, dim=1)[:, :21], whole)
+
+
+def test_trails_are_the_last_two_keyframes_at_every_frame():
+    tokens = torch.tensor([0, 3, 0, 5, 0])[None, :, None]
+    trail = trails(tokens)
+    assert trail.tokens[0, :, 0].tolist() == [[0, 0], [3, 0], [3, 0], [5, 3], [5, 3]]
+    assert trail.at[0, :, 0].tolist() == [[-1, -1], [1, -1], [1, -1], [3, 1], [3, 1]]
+
+
+def test_a_trail_grown_frame_by_frame_is_the_trail_of_the_whole():
+    tokens = torch.randint(0, 3, (4, 30, 5), generator=torch.Generator().manual_seed(0))
+    whole = trails(tokens)
+    grown = Trail(*(part[:, 9] for part in whole))
+    for frame in range(10, 30):
+        grown = grown.then(tokens[:, frame], frame)
+        for a, b in zip(grown, whole, strict=True):
+            assert torch.equal(a, b[:, frame])
+
+
+def test_learned_vectors_take_a_parameter_where_a_grid_needs_none():
+    grid, vectors = (tiny_listener(quantizer=kind).model.predictor for kind in ("fsq", "vq"))
+    assert "codes" not in dict(grid.named_parameters()) and "codes" in dict(vectors.named_parameters())
+    assert logits(vectors, context()).isfinite().any()

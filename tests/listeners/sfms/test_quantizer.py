@@ -3,7 +3,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.listeners.sfms.quantizer import Quantizer, as_levels, codes_to_indices, indices_to_codes, quantize
+from sfms_robot.listeners.sfms.quantizer import (
+    Codebook,
+    Quantizer,
+    as_levels,
+    codes_to_indices,
+    indices_to_codes,
+    quantize,
+)
 
 grids = st.integers(1, 4).flatmap(
     lambda dims: st.lists(st.lists(st.integers(2, 6), min_size=dims, max_size=dims), min_size=1, max_size=3)
@@ -56,3 +63,89 @@ def test_a_group_neither_sees_nor_moves_the_channels_of_another():
 def test_extremes_reach_the_ends_of_the_grid(value: float):
     code = quantize(torch.full((1, 1, 1), value), as_levels([[4]]))
     assert code.item() == pytest.approx(value / 9)
+
+
+def book(sizes=(5, 3), dims: int = 2) -> Codebook:
+    torch.manual_seed(0)
+    return Codebook(list(sizes), dims)
+
+
+def test_every_vector_is_the_nearest_to_itself_and_absent_ones_are_never_chosen():
+    codebook = book()
+    indices = torch.stack([torch.arange(5), torch.arange(5) % 3], dim=-1)
+    assert torch.equal(codebook.indices(codebook.codes(indices)), indices)
+    assert codebook.indices(torch.randn(1, 200, 2, 2) * 9)[..., 1].max() < 3
+
+
+def test_a_vector_code_passes_its_gradient_to_the_encoder_alone():
+    codebook = book()
+    latent = torch.randn(1, 4, 2, 2, requires_grad=True)
+    code = codebook.nearest(latent)
+    torch.testing.assert_close(code.detach(), codebook.codes(codebook.indices(latent)))
+    code.sum().backward()
+    torch.testing.assert_close(latent.grad, torch.ones_like(latent))
+
+
+def test_commitment_is_the_distance_to_the_vectors_at_keyframes_only():
+    codebook = book((1, 1))
+    codebook.vectors.zero_()
+    latent = torch.tensor([[[[3.0, 1.0], [0.0, 0.0]], [[9.0, 9.0], [9.0, 9.0]]]], requires_grad=True)
+    mask = torch.tensor([[[1.0, 1.0], [0.0, 0.0]]])
+    loss = codebook.commitment(latent, mask)
+    assert loss.item() == pytest.approx((9 + 1) / 2 / 2)
+    loss.backward()
+    assert (latent.grad[0, 1] == 0).all() and latent.grad[0, 0, 0, 0] > 0
+
+
+def test_vectors_settle_at_the_means_of_the_keyframes_they_stand_for():
+    codebook, drawn = book((2,), 1), torch.Generator().manual_seed(0)
+    mask = torch.ones(1, 40, 1)
+    for _ in range(600):
+        noise = torch.randn(1, 40, 1, 1, generator=drawn) * 0.1
+        codebook.learn(torch.where(torch.arange(40)[None, :, None, None] < 20, -2.0, 3.0) + noise, mask, drawn)
+    found = sorted(codebook.vectors[0, :, 0].tolist())
+    assert found == pytest.approx([-2.0, 3.0], abs=0.05)
+
+
+def test_idle_vectors_begin_anew_at_keyframes():
+    codebook, drawn = book((8,), 1), torch.Generator().manual_seed(0)
+    codebook.vectors.fill_(100.0)
+    latent = torch.rand(1, 400, 1, 1, generator=drawn)
+    mask = torch.zeros(1, 400, 1)
+    mask[:, ::2] = 1.0
+    for _ in range(30):
+        codebook.learn(latent, mask, drawn)
+    assert ((codebook.vectors >= 0) & (codebook.vectors <= 1)).all()
+    assert len(codebook.indices(latent).unique()) == 8
+
+
+def test_learning_looks_at_keyframes_only():
+    changed = []
+    for other in (0.0, 50.0):
+        codebook = book((4,), 1)
+        latent = torch.linspace(0, 1, 20).view(1, 20, 1, 1).clone()
+        latent[:, 10:] += other
+        mask = (torch.arange(20) < 10).float().view(1, 20, 1)
+        codebook.learn(latent, mask, torch.Generator().manual_seed(1))
+        changed.append(codebook.vectors.clone())
+    assert torch.equal(*changed)
+
+
+@pytest.mark.parametrize("kind", ["fsq", "vq"])
+def test_uneven_groups_read_and_write_their_own_channels(kind):
+    torch.manual_seed(0)
+    member = torch.tensor([[0.0, 1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    quantizer = Quantizer(member, [[4, 2], [3, 3], [2, 2]], kind)
+    motion = torch.randn(1, 3, 4)
+    latent = quantizer.latent(motion)
+    for channel in range(4):
+        moved = motion.clone()
+        moved[..., channel] += 1
+        changed = (quantizer.latent(moved) != latent).any(-1)
+        assert torch.equal(changed[0, 0].float(), member[:, channel])
+    codes = quantizer.encode(motion)
+    for group in range(3):
+        other = codes.clone()
+        other[..., group, :] += 0.5
+        changed = quantizer.decode(other) != quantizer.decode(codes)
+        assert torch.equal(changed[0, 0].float(), member[group])

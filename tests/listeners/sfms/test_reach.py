@@ -14,7 +14,7 @@ def listener_with_speed(speed: float):
 def test_a_code_may_follow_itself_and_class_0_anything():
     _, reach = listener_with_speed(1e-6)
     for code in range(1, 7):
-        allowed = reach.allowed(torch.tensor([code, code]), torch.tensor([1, 1]))
+        allowed = ~reach.too_soon(torch.tensor([code, code]), torch.tensor([1, 1]))
         assert allowed[:, 0].all() and allowed[:, code].all()
 
 
@@ -24,15 +24,15 @@ def test_allowed_codes_are_exactly_those_no_channel_has_to_hurry_for():
     codes = indices_to_codes(torch.arange(6)[:, None].expand(6, 2), quantizer.levels)
     neck = quantizer.decode(codes[None])[0, :, :6].detach()
     for gap in (1, 5, 20):
-        allowed = reach.allowed(torch.tensor([3, 0]), torch.tensor([gap, gap]))[0, 1:7]
+        allowed = ~reach.too_soon(torch.tensor([3, 0]), torch.tensor([gap, gap]))[0, 1:7]
         assert torch.equal(allowed, ((neck - neck[2]).abs() <= 0.1 * gap).all(-1))
 
 
 def test_a_group_with_fewer_codes_never_gets_one_it_lacks():
     _, reach = listener_with_speed(1e6)
-    assert reach.allowed(torch.tensor([1, 1]), torch.tensor([9, 9])).sum(1).tolist() == [7, 9]
+    assert (~reach.too_soon(torch.tensor([1, 1]), torch.tensor([9, 9]))).sum(1).tolist() == [7, 9]
 
 
 def test_without_a_keyframe_so_far_every_code_is_allowed():
     _, reach = listener_with_speed(1e-6)
-    assert reach.allowed(torch.tensor([0, 0]), torch.tensor([1, 1])).all()
+    assert (~reach.too_soon(torch.tensor([0, 0]), torch.tensor([1, 1]))).sum(1).tolist() == [7, 9]

@@ -1,3 +1,4 @@
+import copy
 import dataclasses
 
 import numpy as np
@@ -5,10 +6,12 @@ import pytest
 import torch
 from tiny_sfms import plans_of, speech, tiny_listener
 
+from sfms_robot.config.listener import default_hop
 from sfms_robot.frames import FRAME_S, SpeakerFrame
-from sfms_robot.listeners.sfms.predictor import Context
-from sfms_robot.listeners.sfms.stream import draw, join, neutral_tokens, sample
-from sfms_robot.signals import mel
+from sfms_robot.listeners.sfms.draw import draw, sample
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
+from sfms_robot.listeners.sfms.stream import join, neutral_tokens
+from sfms_robot.signals import phase
 
 
 def test_a_plan_comes_on_every_hop_and_starts_one_frame_later(tiny):
@@ -25,28 +28,30 @@ def test_a_plan_comes_on_every_hop_and_starts_one_frame_later(tiny):
 def offline(listener, speaker, seed):
     """The same motion computed from whole arrays: features of everything first, then windows cut out of them."""
     model, settings = listener.model, listener.settings
-    p, h, hop, n = settings.past_frames, settings.future_frames, settings.hop, len(speaker)
-    rows = torch.from_numpy(mel.log_mel(np.concatenate([frame.audio for frame in speaker]), mel.start())[0])
-    sound = torch.cat([torch.zeros(4 * p, 128), model.standardise_mel(rows)])
+    p, h, hop, n = settings.past_frames, settings.future_frames, settings.hop_frames, len(speaker)
+    audio, hearing = np.concatenate([frame.audio for frame in speaker]), listener.hearing
+    rows = model.standardise_sound(torch.from_numpy(hearing.rows(audio)))
+    voice = model.predictor.speaker.listen(torch.cat([torch.zeros(hearing.shape), rows])[None])[0]
+    voice = torch.cat([torch.zeros(p, voice.shape[1]), voice])  # frame t at index p + t
+    place = torch.zeros(p + n, hearing.phase_features)
+    if hearing.phased:
+        place[p:] = torch.from_numpy(phase.of_audio(audio))
     face = torch.from_numpy(np.stack([frame.face.motion for frame in speaker]))
     face = torch.cat([torch.zeros(p, 58), model.standardise(face)])
     known = torch.cat([torch.zeros(p), torch.ones(n)]).bool()
-    tokens = torch.cat(
-        [neutral_tokens(model, listener.space, p), torch.zeros(n + h, 2).long()]
-    )  # frame t at index p + t
+    tokens = torch.cat([neutral_tokens(model, listener.space, p), torch.zeros(n + h, 2).long()])
     generator = torch.Generator().manual_seed(seed)
-    still = model.standardise(torch.zeros(n + h + 2, 58))  # frame t at index 2 + t; two before the start
-    path, plans, decided = still, {}, 1
+    path = model.standardise(torch.zeros(n + h + 2, 58))  # frame t at index 2 + t; two before the start
+    plans, decided = {}, 1
     for now in range(0, n, hop):  # newest frame heard
         past = slice(now + 1, now + 1 + p)
-        seen = Context(
-            face[None, past], known[None, past], sound[None, 4 * past.start : 4 * past.stop], known[None, past],
-            tokens[None, past],
-        )  # fmt: skip
-        ahead = tokens[p + now + 1 : p + decided]
-        tokens[p + now + 1 : p + now + 1 + h] = draw(model, settings, listener.reach, seen, ahead, generator)
+        own = tokens[None, past.start : past.stop + h].clone()
+        own[:, p + decided - (now + 1) :] = UNDECIDED
+        seen = Context(*(x[None, past] for x in (face, known, voice, known, place)), own)
+        drawn = draw(model, settings, listener.reach, seen, [generator])
+        tokens[past.stop : past.stop + h] = drawn[0, p:]
         decided = now + 1 + h
-        window = model.tokenizer.decode(tokens[None, past.start : past.stop + h])[0]
+        window = model.tokenizer.decode(drawn)[0]
         joined = join(path[now + 1 : now + 3], window[-h - 2 :], settings.sampling.seam_frames)
         path = torch.cat([path[: now + 1], joined, path[now + 1 + len(joined) :]])
         plans[now] = listener.space.decode(model.restore(joined[2:]).numpy())[0]
@@ -54,9 +59,9 @@ def offline(listener, speaker, seed):
 
 
 @pytest.mark.parametrize("hop", [1, 4, 8])
-@pytest.mark.parametrize("together", [1, 8])
-def test_stream_equals_offline(hop: int, together: int):
-    listener = tiny_listener(hop=hop, sampling={"frames_per_pass": together})
+@pytest.mark.parametrize("changes", [{}, {"sequential": False, "phase": False}, {"audio": "mfcc78"}])
+def test_stream_equals_offline(hop: int, changes: dict):
+    listener = tiny_listener(hop=hop, **changes)
     speaker = speech(61)
     expected = offline(listener, speaker, seed=3)
     streamed = plans_of(listener, speaker, seed=3)
@@ -80,8 +85,8 @@ def test_a_plan_keeps_the_tokens_of_the_one_before(tiny):
     for frame in speech(30):
         plan, memory = tiny.step(frame, memory)
         if plan is not None and last is not None:
-            assert torch.equal(memory.ahead[:4], last[-4:])
-        last = memory.ahead if plan is not None else last
+            assert torch.equal(memory.tokens[-8:-4], last[-4:])
+        last = memory.tokens if plan is not None else last
 
 
 def test_memory_is_not_changed(tiny):
@@ -89,12 +94,25 @@ def test_memory_is_not_changed(tiny):
     memory = tiny.start(1)
     for frame in speaker[:8]:
         _, memory = tiny.step(frame, memory)
-    copies = {field.name: np.copy(np.asarray(getattr(memory, field.name))) for field in dataclasses.fields(memory)}
+    before = copy.deepcopy(memory)
     first, _ = tiny.step(speaker[8], memory)
     second, _ = tiny.step(speaker[8], memory)
     np.testing.assert_array_equal(first.frames, second.frames)
-    for name, copy in copies.items():
-        np.testing.assert_array_equal(np.asarray(getattr(memory, name)), copy)
+    for one, other in ((before, memory), (before.speaker, memory.speaker)):
+        for field in dataclasses.fields(one):
+            if field.name not in ("speaker", "ears"):
+                np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+def test_streams_side_by_side_do_what_each_does_alone(tiny):
+    speaker, seeds = speech(21), (1, 2, 3)
+    alone = [plans_of(tiny, speaker, seed) for seed in seeds]
+    memories = [tiny.start(seed) for seed in seeds]
+    for index, frame in enumerate(speaker):
+        plans, memories = tiny.step_many(frame, memories)
+        assert len(plans) == (3 if index in alone[0] else 0)
+        for plan, own in zip(plans, alone, strict=False):
+            np.testing.assert_allclose(plan.frames, own[index].frames, atol=1e-5)
 
 
 def test_one_seed_repeats_and_two_differ(tiny):
@@ -131,6 +149,19 @@ def test_a_face_that_is_not_finite_is_a_face_not_known(tiny):
         np.testing.assert_array_equal(plan.frames, without[index].frames)
 
 
+def test_streams_side_by_side_are_the_streams_alone(tiny):
+    speaker, seeds = speech(30), (1, 2, 3)
+    together, memories = [], [tiny.start(seed) for seed in seeds]
+    for frame in speaker:
+        plans, memories = tiny.step_many(frame, memories)
+        together += [plans] if plans else []
+    for row, seed in enumerate(seeds):
+        alone = list(plans_of(tiny, speaker, seed).values())
+        assert len(alone) == len(together)
+        for one, many in zip(alone, together, strict=True):
+            np.testing.assert_allclose(many[row].frames, one.frames, atol=1e-5)
+
+
 def test_frames_of_another_length_are_refused(tiny):
     with pytest.raises(ValueError, match="640 samples or none, got 100"):
         tiny.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), tiny.start(1))
@@ -138,11 +169,39 @@ def test_frames_of_another_length_are_refused(tiny):
 
 def test_sampling_follows_the_probabilities_of_the_nucleus():
     logits = torch.log(torch.tensor([0.1, 0.4, 0.3, 0.2]))
-    generator = torch.Generator().manual_seed(0)
-    drawn = sample(logits.expand(2000, 1, 4), torch.zeros(1), torch.tensor([0.65]), generator)
+    chance = torch.rand(2000, 1, generator=torch.Generator().manual_seed(0))
+    drawn = sample(logits.expand(2000, 1, 4), torch.zeros(1), torch.tensor([0.65]), chance)
     counts = torch.bincount(drawn[:, 0], minlength=4)
     assert counts[0] == counts[3] == 0
     assert counts[1] / 2000 == pytest.approx(4 / 7, abs=0.04)
+
+
+@pytest.mark.parametrize("horizon, step_s, lead_s, hop", [
+    (8, 0.025, 0.080, 4), (8, 0.0, 0.0, 7), (8, 0.01, 0.03, 6), (8, 0.2, 0.2, 1), (1, 0.0, 0.0, 1),
+])  # fmt: skip
+def test_the_default_hop_is_the_largest_that_leaves_time_for_step_and_lead(horizon, step_s, lead_s, hop):
+    assert default_hop(horizon, step_s, lead_s) == hop
+    if hop > 1:
+        assert hop * FRAME_S + step_s + lead_s <= (horizon - 1) * FRAME_S < (hop + 1) * FRAME_S + step_s + lead_s
+
+
+def test_colder_and_narrower_sampling_chooses_the_likeliest():
+    speaker = speech(9)
+    cold = tiny_listener(sampling={"temperature": 1e-6})
+    narrow = tiny_listener(sampling={"nucleus": 1e-6})
+    for index, plan in plans_of(cold, speaker, seed=1).items():
+        np.testing.assert_allclose(plan.frames, plans_of(narrow, speaker, seed=2)[index].frames, atol=1e-5)
+
+
+def test_smoothing_rounds_the_corners_of_the_head_and_leaves_steady_motion_and_the_face():
+    soft = tiny_listener(sampling={"smoothing": 0.5})
+    steady = torch.arange(10.0)[:, None].expand(-1, 58)
+    torch.testing.assert_close(soft.shown(steady), steady[2:])
+    corner = (torch.arange(10.0) - 5).clamp(min=0)[:, None].expand(-1, 58)
+    shown = soft.shown(corner)
+    assert shown[3, :6].tolist() == [0.25] * 6 and torch.equal(shown[:, 6:], corner[2:, 6:])
+    assert shown[:, 0].diff(n=2).abs().max() <= 0.5 * corner[:, 0].diff(n=2).abs().max()
+    assert torch.equal(tiny_listener().shown(corner), corner[2:])
 
 
 def test_a_plan_goes_on_in_place_and_speed():

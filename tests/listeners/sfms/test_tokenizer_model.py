@@ -1,8 +1,13 @@
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny_sfms import tiny_settings
 
-from sfms_robot.listeners.sfms.inpainter import Neighbours
+from sfms_robot.listeners.sfms.adaptive import encode_adaptive, fewest, prefixes
+from sfms_robot.listeners.sfms.model import Tokenizer
+from sfms_robot.listeners.sfms.neighbours import Neighbours
+from sfms_robot.listeners.sfms.placement import STRATEGIES
 
 
 def test_tokens_mark_exactly_the_keyframes(tiny):
@@ -37,17 +42,81 @@ def test_a_straight_line_between_keyframes_is_restored(frames, slope, start):
     mask = torch.zeros(1, 20, 1)
     mask[0, sorted(frames)] = 1.0
     line = (start + slope * torch.arange(20.0))[None, :, None, None]
-    torch.testing.assert_close(Neighbours(mask).interpolate(line * mask[..., None]), line)
+    torch.testing.assert_close(Neighbours.in_mask(mask).interpolate(line * mask[..., None]), line)
 
 
 def test_ends_are_held_and_a_window_without_keyframes_is_finite(tiny):
     mask = torch.zeros(1, 10, 1)
     mask[0, 4] = 1.0
     values = torch.full((1, 10, 1, 1), 2.0)
-    assert torch.equal(Neighbours(mask).interpolate(values), values)
+    assert torch.equal(Neighbours.in_mask(mask).interpolate(values), values)
     assert tiny.model.tokenizer.decode(torch.zeros(1, 48, 2).long()).isfinite().all()
 
 
 def test_restoring_undoes_standardising_within_range(tiny):
     motion = torch.rand(5, 58)
     torch.testing.assert_close(tiny.model.restore(tiny.model.standardise(motion)), motion)
+
+
+@pytest.mark.parametrize("quantizer", ["fsq", "vq"])
+@pytest.mark.parametrize("placement", STRATEGIES)
+def test_every_kind_of_tokenizer_encodes_and_decodes(placement, quantizer):
+    torch.manual_seed(0)
+    settings = tiny_settings(placement=placement, quantizer=quantizer, scores={"width": 8, "layers": 1, "heads": 2})
+    tokenizer = Tokenizer(settings).eval()
+    motion = torch.randn(2, 48, 58)
+    mask = tokenizer.place(motion)
+    tokens = tokenizer.encode(motion, mask)
+    assert torch.equal(tokens > 0, mask > 0) and mask.sum(1).tolist() == [[6.0, 5.0]] * 2
+    for group, one in enumerate(settings.groups.values()):
+        assert tokens[..., group].max() <= one.codes
+    at_mask = tokenizer.inpaint(tokenizer.quantizer.encode(motion), mask)
+    torch.testing.assert_close(tokenizer.decode(tokens), at_mask)
+
+
+def test_a_tokenizer_can_be_asked_for_another_number_or_placement():
+    tokenizer = Tokenizer(tiny_settings(placement="nested", scores={"width": 8, "layers": 1, "heads": 2}))
+    motion = torch.randn(1, 48, 58)
+    for strategy in ("exact", "static", "learned", "nested"):
+        assert tokenizer.place(motion, [3, 11], strategy).sum(1).tolist() == [[3.0, 11.0]]
+
+
+@pytest.mark.parametrize("per_group", [True, False])
+def test_adaptive_encoding_takes_the_fewest_keyframes_within_the_tolerance(per_group):
+    torch.manual_seed(0)
+    tokenizer = Tokenizer(tiny_settings(placement="nested", scores={"width": 8, "layers": 1, "heads": 2})).eval()
+    motion = torch.randn(3, 48, 58).cumsum(1) / 4
+    tried = prefixes(tokenizer, motion, 6)
+    share = torch.tensor([6 / 58, 52 / 58])
+    errors = tried.errors if per_group else (tried.errors @ share)[..., None].expand(-1, -1, 2)
+    tolerance = float(errors.median())
+    mask, k = encode_adaptive(tokenizer, motion, tolerance, 6, per_group)
+    assert torch.equal(mask.sum(1).long(), k)
+    for window in range(3):
+        for group in range(2):
+            row = errors[window, :, group]
+            within = (row <= tolerance).nonzero()
+            assert k[window, group] == (within[0] + 1 if len(within) else 6)
+
+
+def test_a_tighter_tolerance_never_takes_fewer_keyframes():
+    errors = torch.rand(5, 9, 4)
+    counts = [fewest(errors, tolerance) for tolerance in (0.0, 0.1, 0.3, 0.6, 1.0)]
+    assert all((few <= many).all() for many, few in zip(counts[:-1], counts[1:], strict=True))
+    assert (counts[0] == 9).all() and (counts[-1] == 1).all()
+
+
+def test_prefix_errors_are_those_of_decoding_the_prefix():
+    torch.manual_seed(0)
+    tokenizer = Tokenizer(tiny_settings(placement="nested", scores={"width": 8, "layers": 1, "heads": 2})).eval()
+    motion = torch.randn(2, 48, 58)
+    tried = prefixes(tokenizer, motion, 4)
+    mask = tokenizer.place(motion, [3, 3])
+    restored = tokenizer.decode(tokenizer.encode(motion, mask))
+    error = ((restored - motion) ** 2).mean(1)
+    torch.testing.assert_close(tried.errors[:, 2, 0], error[:, :6].mean(1), rtol=1e-3, atol=1e-4)
+
+
+def test_adaptive_encoding_without_conditional_scores_is_refused(tiny):
+    with pytest.raises(ValueError, match="learned or nested"):
+        encode_adaptive(tiny.model.tokenizer, torch.zeros(1, 48, 58), 0.1)

@@ -1,0 +1,50 @@
+"""How the pictures of the tables look, and how they reach a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sfms_robot.errors import ConfigError, MissingExtra
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, FAINT, RULE, TRUTH, KEY = "#2a2d34", "#7d828c", "#e4e9ec", "#9aa3ad", "#c8553d"
+SERIES: Final = ("#1f6f9c", "#c29a2e", "#5b8c5a", "#c8553d", "#7a5c99")
+KINDS: Final = {
+    "sparse": (SERIES[3], "sparse keyframes"),
+    "dense": (SERIES[0], "dense, codes every frame"),
+    "grouped": (SERIES[1], "grouped, codes every 8 frames"),
+}
+_DPI: Final = 110
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure. Raises MissingExtra without matplotlib."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra.of("--plots", "pictures") from error
+    return Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
+
+
+def save(figure: Figure, png: Path) -> None:
+    """Write a picture. Raises ConfigError where that cannot be done."""
+    try:
+        png.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(png)
+    except OSError as error:
+        raise ConfigError(f"--plots: {png} cannot be written: {error}") from error
+
+
+def plain(axes: Axes, size: float = 8) -> None:
+    """No box, faint grid."""
+    axes.tick_params(labelsize=size, colors=INK, length=2, which="both")
+    axes.grid(color=RULE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(FAINT)

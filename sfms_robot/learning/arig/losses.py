@@ -1,0 +1,134 @@
+"""What ARIG is trained on: noise prediction, states, coarse motion; and what a window is put through before.
+
+loss = L(3) + state_weight * CE(states, 3.3) + coarse_weight * |coarse motion - motion|^2 (3.4)
+
+Every frame is told the true past (teacher forcing). The paper states (3) and the cross-entropy; that the coarse motion
+is held to the motion itself, through a linear layer that is thrown away afterwards, is ours: it makes lips follow
+sounds within fewer steps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sfms_robot import config
+from sfms_robot.listeners.arig.csu import FIRST, STATES
+from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.sound import MEL_WIDTH
+
+LN_PER_DB = math.log(10) / 10  # of power
+RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
+JUMPS = 0.04  # of frames at which the slow part jumps
+COLD = 0.5  # share of windows whose past is exact
+
+
+class Pupil(nn.Module):
+    """The model, and the layer that reads motion off its coarse motion while it learns."""
+
+    def __init__(self, model: ArigModel) -> None:
+        super().__init__()
+        self.model = model
+        self.readout = nn.Linear(model.settings.width, model.channels)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Means over frames: equation (3), cross-entropy of labelled frames, squared error of the coarse motion."""
+
+    motion: Tensor
+    state: Tensor
+    coarse: Tensor
+
+    def total(self, phase: config.ArigPhase) -> Tensor:
+        return self.motion + phase.state_weight * self.state + phase.coarse_weight * self.coarse
+
+
+def loss_parts(
+    pupil: Pupil, told: Dyad, states: Tensor, truth: Tensor, draws: int, generator: torch.Generator, previous: Tensor
+) -> Parts:
+    """Losses of frames 1..N-1.
+
+    Args:
+        told: what the model is told, its past possibly noisy.
+        states: (B, N) int64, -1 where not labelled.
+        truth: (B, N, C) motion to be predicted after the past it is told.
+        draws: noise levels per frame.
+        previous: (B, N) the states it is told, of which each frame gets the one before.
+    """
+    model = pupil.model
+    found = model.condition(told, previous)
+    target = model.standardise(truth[:, 1:])
+    to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]))
+    z, wanted = (each.flatten(0, 1).repeat(draws, 1) for each in (found.z, to_draw))
+    motion = model.head.loss(z, wanted, generator).mean()
+    coarse = (pupil.readout(found.outline) - target).square().mean()
+    known = states[:, 1:] >= 0
+    state = motion.new_zeros(())
+    if found.states is not None and bool(known.any()):
+        state = F.cross_entropy(found.states[known], states[:, 1:][known])
+    return Parts(motion, state, coarse)
+
+
+def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> tuple[Dyad, Tensor]:
+    """Missing modalities, other microphones, and a past that is not quite what it was.
+
+    Also the motion (B, N, C) that comes after such a past.
+    The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
+    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter.
+    """
+    b, n = dyad.user_heard.shape
+    device = dyad.agent_motion.device
+
+    def lot(share: float) -> Tensor:
+        return (torch.rand(b, 1, generator=generator) < share).to(device)
+
+    deaf, blind = lot(phase.drop_audio), lot(phase.drop_face)
+    mute = lot(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
+    voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf], dim=-1)
+    gain = (torch.rand(2, b, 1, 1, generator=generator) * 2 - 1).to(device) * phase.gain_db * LN_PER_DB
+    if model.settings.sound != "mel":
+        gain = torch.zeros_like(gain)
+    rows = (torch.arange(model.sound_width, device=device) < MEL_WIDTH).float()  # logarithms of power
+    slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, model, phase, generator))
+    told = replace(
+        dyad,
+        user_sound=dyad.user_sound + gain[0] * rows,
+        agent_sound=dyad.agent_sound + gain[1] * rows,
+        user_heard=dyad.user_heard & ~deaf,
+        agent_heard=dyad.agent_heard & ~mute,
+        user_seen=dyad.user_seen & ~blind,
+        agent_motion=dyad.agent_motion + slow + fast * model.step_std,
+        voiced=voiced,
+    )
+    carried = (1 - RETURN) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
+    return told, dyad.agent_motion + carried
+
+
+def _wander(
+    b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of steps.
+
+    The slow part jumps once a second or so, and goes back by a tenth a frame.
+    """
+    size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
+    size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
+    jumps = torch.randn(b, n, model.channels, generator=generator)
+    jumps = jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS)
+    fast = torch.randn(b, n, model.channels, generator=generator)
+    frame = torch.arange(n, dtype=torch.float32)
+    left = torch.tril((1 - RETURN) ** (frame[:, None] - frame).clamp(min=0))  # of a jump, frames later
+    return size * torch.einsum("ts,bsc->btc", left, jumps), size * fast
+
+
+def previous_states(states: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """(B, N) what the model is told: unlabelled ones count as `waiting`, a share is drawn by lot."""
+    known = torch.where(states < 0, FIRST, states)
+    drawn = torch.randint(len(STATES), states.shape, generator=generator).to(states.device)
+    by_lot = (torch.rand(states.shape, generator=generator) < share).to(states.device)
+    return torch.where(by_lot, drawn, known)

@@ -1,0 +1,123 @@
+"""Training of ARIG: one phase, windows that begin as a stream does, teacher forcing, and the paper's curriculum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sfms_robot import config
+from sfms_robot.errors import ConfigError
+from sfms_robot.learning.arig.corpus import SCENES, Corpus, fit_scales, gather, open_scenes
+from sfms_robot.learning.arig.losses import Parts, Pupil, augment, loss_parts, previous_states
+from sfms_robot.learning.job import Job, Run
+from sfms_robot.learning.loop import fit, optimizer
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.space import MotionSpace
+
+HELD_OUT_WINDOWS, HELD_OUT_BATCH = 24, 4
+
+
+def train_arig(
+    settings: config.ArigTraining,
+    data: Path,
+    out: Path,
+    run: Run = Run(),  # noqa: B008
+) -> dict[str, Any]:
+    """Train on `data`/train (and its speaking/ and interaction/) and write `out`/config.yaml and model.safetensors.
+
+    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on.
+    """
+    listener, phase = settings.listener, settings.training
+    torch.manual_seed(settings.seed)
+    pupil = Pupil(ArigModel(listener))
+    space, width = MotionSpace.of(listener), pupil.model.sound_width
+    corpus = gather(open_scenes(data, "train"), phase.window_frames, space, width)
+    held_out = gather(open_scenes(data, "validation"), phase.window_frames, space, width)
+    fit_scales(pupil.model, corpus, listener.channels)
+    job = arig_job(settings, pupil, corpus, held_out, run.device)
+    outcome = fit(job, out, run)
+    checkpoint.save_config(out, listener)
+    checkpoint.save_weights(out / checkpoint.WEIGHTS, pupil.model.cpu())
+    parts = held_out_parts(pupil.to(run.device), held_out.to(run.device), phase)
+    return {
+        **asdict(outcome),
+        "held_out_noise": float(parts.motion),
+        "held_out_state": float(parts.state),
+        "held_out_coarse": float(parts.coarse),
+    }
+
+
+def arig_job(
+    settings: config.ArigTraining, pupil: Pupil, corpus: Corpus, held_out: Corpus, device: torch.device
+) -> Job:
+    """The training as the loop takes it, on a model whose scales are set; moves it to `device`."""
+    phase = settings.training
+    starts = corpus.starts(phase.window_frames)
+    for stage in phase.stages:
+        weights_of(stage, starts)
+    fingerprint = corpus.fingerprint()
+    pupil.to(device)
+    corpus, held_out = corpus.to(device), held_out.to(device)
+
+    def loss_of(step: int, generator: torch.Generator) -> Tensor:
+        chosen = draw(starts, weights_of(phase.stage(step), starts), phase.batch, generator)
+        dyad, states = corpus.cut(chosen.to(device), phase.window_frames)
+        told, truth = augment(dyad, pupil.model, phase, generator)
+        previous = previous_states(states, phase.state_noise, generator)
+        return loss_parts(pupil, told, states, truth, phase.draws, generator, previous).total(phase)
+
+    return Job(
+        name="arig",
+        model=pupil,
+        optimizers=[optimizer(pupil.parameters(), phase.learning_rate, phase.weight_decay)],
+        loss_of=loss_of,
+        held_out=lambda: float(held_out_parts(pupil, held_out, phase).total(phase)),
+        frames_per_step=phase.batch * phase.window_frames,
+        phase=phase,
+        seed=settings.seed,
+        identity={
+            "seed": settings.seed,
+            "listener": settings.listener.model_dump(mode="json"),
+            "training": phase.identity(),
+            "data": fingerprint,
+        },
+    )
+
+
+def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
+    """(3,) how likely a window is of each of `SCENES`; those without windows are left out. Raises ConfigError."""
+    weights = torch.tensor([getattr(stage, scene) * (scene in starts) for scene in SCENES], dtype=torch.float64)
+    if not weights.any():
+        wanted = ", ".join(scene for scene in SCENES if getattr(stage, scene))
+        raise ConfigError(f"training.stages: a stage draws from {wanted} alone, the data have {', '.join(starts)}")
+    return weights / weights.sum()
+
+
+def draw(starts: Mapping[str, Tensor], weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """(count,) first frames: a scene by its weight, then any of its windows."""
+    scenes = torch.multinomial(weights, count, replacement=True, generator=generator)
+    places = torch.rand(count, generator=generator, dtype=torch.float64)
+    firsts = [starts[SCENES[int(scene)]] for scene in scenes]
+    return torch.stack([of[int(place * len(of))] for of, place in zip(firsts, places, strict=True)])
+
+
+@torch.no_grad()
+def held_out_parts(pupil: Pupil, corpus: Corpus, phase: config.ArigPhase) -> Parts:
+    """Losses on windows drawn with a fixed seed as the last stage draws them, without augmentation."""
+    pupil.eval()
+    generator = torch.Generator().manual_seed(0)
+    starts = corpus.starts(phase.window_frames)
+    chosen = draw(starts, weights_of(phase.stages[-1], starts), HELD_OUT_WINDOWS, generator)
+    found = []
+    for some in torch.split(chosen, HELD_OUT_BATCH):
+        dyad, states = corpus.cut(some.to(corpus.states.device), phase.window_frames)
+        previous = previous_states(states, phase.state_noise, generator)
+        found.append(loss_parts(pupil, dyad, states, dyad.agent_motion, phase.draws, generator, previous))
+    mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
+    return Parts(**mean)

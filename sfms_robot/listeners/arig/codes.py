@@ -1,0 +1,44 @@
+"""The discrete ablation (table 4): motion as one of N codes, drawn from a softmax, in place of diffusion.
+
+The codebook is that of finite scalar quantization (`listeners.sfms.quantizer`), one for the whole face. It is learned
+beside the model: its own loss is how well motion survives it, and no gradient of the softmax reaches it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sfms_robot.listeners.sfms.quantizer import as_levels, codes_to_indices, indices_to_codes, quantize
+
+
+class CodeHead(nn.Module):
+    """The same face as `diffusion.Denoiser`: a loss, and a sample from given noise."""
+
+    levels: Tensor
+
+    def __init__(self, channels: int, width: int, levels: tuple[int, ...]) -> None:
+        super().__init__()
+        self.register_buffer("levels", as_levels([levels]), persistent=False)
+        self.encode = nn.Sequential(nn.Linear(channels, width), nn.GELU(), nn.Linear(width, len(levels)))
+        self.decode = nn.Sequential(nn.Linear(len(levels), width), nn.GELU(), nn.Linear(width, channels))
+        self.classify = nn.Linear(width, math.prod(levels))
+
+    def loss(self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """z (N, D), standardised motion (N, C) -> cross-entropy of its code plus squared error of the code, (N,)."""
+        code = quantize(self.encode(motion)[:, None], self.levels)  # (N, 1, dims)
+        rebuilt: Tensor = (self.decode(code[:, 0]) - motion).square().mean(-1)
+        index = codes_to_indices(code.detach(), self.levels)[:, 0]
+        wrong: Tensor = F.cross_entropy(self.classify(z), index, reduction="none")
+        return rebuilt + wrong
+
+    def sample(self, z: Tensor, noise: Tensor) -> Tensor:
+        """Conditions (N, D), noise (N, 1, 1) standard normal -> motion (N, C) of a code drawn by the softmax."""
+        share = torch.special.ndtr(noise[:, 0].double())  # standard normal -> uniform
+        mass = torch.softmax(self.classify(z).double(), dim=-1).cumsum(-1)
+        index = (mass <= share * mass[:, -1:]).sum(-1, keepdim=True).clamp(max=mass.shape[-1] - 1)
+        out: Tensor = self.decode(indices_to_codes(index, self.levels)[:, 0])
+        return out

@@ -1,0 +1,60 @@
+"""Conversation states understanding (3.3): which of seven states the agent is in, and a feature of it.
+
+Voice activity alone tells four patterns; which state a pattern means depends on the conversation (figure 3):
+
+| agent | user | states |
+|---|---|---|
+| speaks | silent | speaking |
+| speaks | speaks | receiving feedback, interrupted |
+| silent | speaks | listening, giving feedback |
+| silent | silent | thinking (its own pause), waiting (the other's) |
+
+The figure itself is not in the text at hand; giving feedback, where it is a word and not a nod, is speech of both.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from sfms_robot.listeners.arig.parts import Look
+
+STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
+FIRST: Final = STATES.index("waiting")  # of a stream: nobody has spoken yet
+
+
+class StateUnderstanding(nn.Module):
+    """The previous state asks voice activity and cis-token what the state is now."""
+
+    def __init__(self, width: int, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.previous = nn.Embedding(len(STATES), width)
+        self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
+        self.look = Look(width, hidden, heads, slots=3)
+        self.norm = nn.LayerNorm(width)
+        self.classify = nn.Linear(width, len(STATES))
+
+    def condition(self, cis: Tensor, voiced: Tensor) -> Tensor:
+        """cis (N, D), voiced (N, 2) bool: agent now, user one frame before -> keys (N, 3, 2D)."""
+        told = torch.where(voiced[..., None], self.voices[:, 1], self.voices[:, 0])  # (N, 2, D)
+        return self.look.keys(torch.cat([told, cis[:, None]], dim=1))
+
+    def forward(self, keys: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
+        """`condition` (N, 3, 2D) and previous states (N,) -> state feature (N, D) and logits (N, 7)."""
+        feature = self.norm(self.look(self.previous(previous), keys))
+        return feature, self.classify(feature)
+
+    def roll(self, keys: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        """Every frame's own answer becomes the next one's question: as a stream runs.
+
+        keys (B, T, 3, 2D), first (B,) -> features (B, T, D), logits (B, T, 7).
+        """
+        features, logits, state = [], [], first
+        for frame in keys.unbind(dim=1):
+            feature, scores = self(frame, state)
+            state = scores.argmax(-1)
+            features.append(feature)
+            logits.append(scores)
+        return torch.stack(features, dim=1), torch.stack(logits, dim=1)

@@ -1,0 +1,170 @@
+"""The sampler of motion: a small MLP that removes noise from one frame, conditioned on z (3.4, figure 9, A.2).
+
+Training: noise prediction, equation (3). Sampling: equation (4) over evenly spread noise levels (the spacing of
+Nichol and Dhariwal 2021, as the paper trains and samples with different step counts), or DDIM (Song et al. 2021).
+The sampler draws nothing itself: noise is an argument, so one seed gives one motion wherever it is drawn.
+
+The schedule is a cosine that ends at a signal share of 0.03 (of amplitude) instead of 0: predicting noise says nothing
+about motion where there is none, and with 15 steps the first of them would be wasted on that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sfms_robot import config
+from sfms_robot.listeners.arig.parts import Modulation
+from sfms_robot.listeners.layers import sinusoidal
+
+Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
+COSINE_END = 0.98  # share of the quarter turn that the schedule goes
+
+
+def signal_share(levels: int) -> Tensor:
+    """alpha-bar of every noise level (levels,), float64, falling from nearly 1."""
+    turn = torch.arange(1, levels + 1, dtype=torch.float64) / levels
+    return torch.cos(turn * COSINE_END * math.pi / 2) ** 2
+
+
+class Denoiser(nn.Module):
+    """epsilon_theta(M_t | t, z): MLP blocks modulated by noise level and condition. C channels, W width, K steps."""
+
+    low: Tensor
+    high: Tensor
+    share: Tensor
+    places: Tensor
+
+    def __init__(self, channels: int, condition: int, settings: config.Diffusion) -> None:
+        super().__init__()
+        width = settings.width
+        self.settings = settings
+        self.register_buffer("low", torch.full((channels,), -8.0))  # standardised motion that is possible at all
+        self.register_buffer("high", torch.full((channels,), 8.0))
+        self.register_buffer("share", signal_share(settings.train_steps).float(), persistent=False)
+        self.register_buffer("places", sinusoidal(settings.train_steps, width), persistent=False)
+        self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.condition = nn.Linear(condition, width)
+        self.modulation = Modulation(width, width, "scg" * settings.blocks + "sc")  # of every block, in one product
+        self.enter = nn.Linear(channels, width)
+        self.up = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
+        self.down = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
+        self.leave = nn.Linear(width, channels)
+        self.levels = torch.linspace(0, settings.train_steps - 1, settings.steps).round().long().tolist()
+        self.table = steps_of(self.levels, settings)
+
+    def level(self, t: Tensor) -> Tensor:
+        """Noise levels (K,) -> embeddings (K, W): fixed once the weights are."""
+        out: Tensor = self.time(self.places[t])
+        return out
+
+    def modulate(self, z: Tensor, level: Tensor) -> tuple[Tensor, ...]:
+        """Condition (N, D) and level embeddings (N, W) -> shift, scale and gate of every block, (N, 1, W) each."""
+        parts: tuple[Tensor, ...] = self.modulation(F.silu(self.condition(z) + level))
+        return parts
+
+    def forward(self, noisy: Tensor, parts: Parts) -> Tensor:
+        """noisy (N, 1, C), `modulate` of its level and condition -> the noise in it (N, 1, C)."""
+        return _denoise(noisy, parts, self._weights())
+
+    def _weights(self) -> list[tuple[Tensor, Tensor]]:
+        """Weight and bias of each layer in order, looked up once for all steps: a module call outweighs its product."""
+        blocks = [layer for pair in zip(self.up, self.down, strict=True) for layer in pair]
+        layers = [self.enter, *blocks, self.leave]
+        return [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
+
+    def loss(self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Equation (3) for z (N, D) and standardised motion (N, C): squared error of the noise, per sample (N,)."""
+        n = len(motion)
+        t = torch.randint(0, self.settings.train_steps, (n,), generator=generator).to(motion.device)
+        noise = torch.randn(motion.shape, generator=generator).to(motion.device)
+        share = self.share[t][:, None]
+        noisy = share.sqrt() * motion + (1 - share).sqrt() * noise
+        found = self(noisy[:, None], self.modulate(z, self.level(t)))[:, 0]
+        wrong: Tensor = (noise - found).square().mean(-1)
+        return wrong
+
+    def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
+        """Motion (N, C), standardised, of conditions (N, D).
+
+        Args:
+            z: conditions.
+            noise: (N, K, C) standard normal: the start, then what is added after each step but the last.
+            levels: `level` of `self.levels` (K, W), if it is at hand.
+        """
+        n, k = noise.shape[:2]
+        if k != len(self.levels):
+            raise ValueError(f"noise for {k} steps, the sampler takes {len(self.levels)}")
+        if levels is None:
+            levels = self.level(torch.tensor(self.levels, device=z.device))
+        # The modulation of every step in one product: (K, N) conditions.
+        told = F.silu(self.condition(z) + levels[:, None])
+        parts = [part.view(k, n, 1, -1).unbind(0) for part in self.modulation(told.flatten(0, 1))]
+        x, weights = noise[:, :1], self._weights()
+        for index, step in enumerate(self.table):
+            found = _denoise(x, [part[k - 1 - index] for part in parts], weights)
+            clean = torch.add(x * step.denoise[0], found, alpha=step.denoise[1]).clamp(self.low, self.high)
+            if self.settings.sampler == "ddim":  # what is not motion is the noise that stays
+                x = torch.add(clean * step.motion, torch.add(x, clean, alpha=-step.share), alpha=step.stay)
+            else:
+                x = torch.add(clean * step.motion, x, alpha=step.stay)
+                if step.spread:
+                    x = torch.add(x, noise[:, index + 1 : index + 2], alpha=step.spread)
+        return x[:, 0]
+
+
+def _denoise(noisy: Tensor, parts: Parts, weights: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """noisy (N, 1, C), modulation (N, 1, W) each, `Denoiser._weights` -> (N, 1, C)."""
+    x = F.linear(noisy, *weights[0])
+    size = x.shape[-1:]
+    for block in range(len(weights) // 2 - 1):
+        shift, scale, gate = parts[3 * block : 3 * block + 3]
+        y = torch.addcmul(shift, torch.layer_norm(x, size), scale)
+        y = F.linear(F.silu(F.linear(y, *weights[2 * block + 1])), *weights[2 * block + 2])
+        x = torch.addcmul(x, gate, y)
+    return F.linear(torch.addcmul(parts[-2], torch.layer_norm(x, size), parts[-1]), *weights[-1])
+
+
+@dataclass(frozen=True)
+class Step:
+    """Numbers of one step from level t to the next lower s.
+
+    Attributes:
+        denoise: M_0 = denoise[0] M_t + denoise[1] eps.
+        share: sqrt(alpha-bar_t).
+        motion, stay: M_s = motion M_0 + stay M_t (ddim: + stay (M_t - share M_0)).
+        spread: sigma_t, times the noise that is added.
+    """
+
+    denoise: tuple[float, float]
+    share: float
+    motion: float
+    stay: float
+    spread: float
+
+
+def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
+    """The steps over ascending `levels`, noisiest first.
+
+    Equation (4) written through the clean motion M_0 = (M_t - sqrt(1 - ab_t) eps) / sqrt(ab_t): its mean is
+    sqrt(ab_s) (1 - alpha) / (1 - ab_t) M_0 + sqrt(alpha) (1 - ab_s) / (1 - ab_t) M_t, alpha = ab_t / ab_s, and where
+    M_0 is not clamped the two are the same. sigma^2 = (1 - alpha) (1 - ab_s) / (1 - ab_t).
+    """
+    shares = signal_share(settings.train_steps)[list(levels)].tolist()
+    out = []
+    for index in reversed(range(len(shares))):
+        now, after = shares[index], shares[index - 1] if index else 1.0
+        alpha = now / after
+        denoise = (now**-0.5, -(((1 - now) / now) ** 0.5))
+        if settings.sampler == "ddim":
+            out.append(Step(denoise, now**0.5, after**0.5, ((1 - after) / (1 - now)) ** 0.5, 0.0))
+        else:
+            motion, stay = after**0.5 * (1 - alpha) / (1 - now), alpha**0.5 * (1 - after) / (1 - now)
+            spread = ((1 - alpha) * (1 - after) / (1 - now)) ** 0.5 * settings.temperature
+            out.append(Step(denoise, now**0.5, motion, stay, spread))
+    return out

@@ -1,0 +1,233 @@
+"""Interactive behaviour understanding (3.2): what both people did, a chunk at a time, and over a long range.
+
+Short range: the last c behaviours of both tracks, read anew for every frame in the light of the newest sounds, become
+one summary. Long range: summaries of whole chunks, and that of the chunk in progress, which every frame refreshes
+until the chunk is full; a causal decoder makes the cis-token of them. A token sees the w - 1 chunks before its own, in
+every layer, so what a stream keeps is w - 1 keys and values per layer: those of whole chunks never change.
+
+N samples, c frames of a chunk, D width, h heads; B batch, T frames.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sfms_robot.listeners.arig.parts import FeedForward, Modulation, join_heads, modulated, split_heads
+
+ROPE_BASE = 10_000.0
+
+
+class Merge(nn.Module):
+    """Sound and motion of one frame of one track -> its behaviour; sound alone without the visual modality."""
+
+    def __init__(self, width: int, visual: bool) -> None:
+        super().__init__()
+        self.visual = visual
+        self.mlp = nn.Sequential(nn.Linear((1 + visual) * width, width), nn.GELU(), nn.Linear(width, width))
+
+    def forward(self, sound: Tensor, motion: Tensor) -> Tensor:
+        """(..., D) and (..., D) -> (..., D)."""
+        out: Tensor = self.mlp(torch.cat([sound, motion], dim=-1) if self.visual else sound)
+        return out
+
+
+class Track(nn.Module):
+    """One track's side of a block of bidirectional learning (figure 7): own weights, attention with the other."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.modulation = Modulation(width, width, "scgscg")
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.ffn = FeedForward(width, hidden)
+
+    def ask(self, x: Tensor, condition: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """x (N, c, D), condition (N, D) -> queries, keys and values (N, c, 3D), and the modulation."""
+        parts = self.modulation(condition)
+        return self.qkv(modulated(x, parts[0], parts[1])), parts
+
+    def answer(self, x: Tensor, seen: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
+        """x (N, c, D) and what its queries saw (N, c, D) -> (N, c, D)."""
+        x = torch.addcmul(x, parts[2], self.out(seen))
+        return torch.addcmul(x, parts[5], self.ffn(modulated(x, parts[3], parts[4])))
+
+
+class Bidirectional(nn.Module):
+    """Each track reads itself, and both see each other through one attention, as in MMDiT."""
+
+    def __init__(self, width: int, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.agent = Track(width, hidden)
+        self.user = Track(width, hidden)
+
+    def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> tuple[Tensor, Tensor]:
+        """Tracks (N, c, D), newest sounds (N, D), SiLU applied -> tracks (N, c, D)."""
+        agent_qkv, agent_parts = self.agent.ask(agent, agent_sound)
+        user_qkv, user_parts = self.user.ask(user, user_sound)
+        seen = _attend(torch.cat([agent_qkv, user_qkv], dim=1), self.heads)
+        of_agent, of_user = seen.chunk(2, dim=1)
+        return self.agent.answer(agent, of_agent, agent_parts), self.user.answer(user, of_user, user_parts)
+
+
+class Integrated(nn.Module):
+    """Both tracks as one sequence; attention and feed-forward side by side (figure 8, Dehghani et al. 2023)."""
+
+    def __init__(self, width: int, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.split = [3 * width, hidden]
+        self.modulation = Modulation(width, width, "scg")
+        self.wide = nn.Linear(width, 3 * width + hidden)
+        self.narrow = nn.Linear(width + hidden, width)
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        """x (N, 2c, D), condition (N, D), SiLU applied -> (N, 2c, D)."""
+        shift, scale, gate = self.modulation(condition)
+        qkv, up = self.wide(modulated(x, shift, scale)).split(self.split, dim=-1)
+        both = torch.cat([_attend(qkv, self.heads), F.gelu(up)], dim=-1)
+        return torch.addcmul(x, gate, self.narrow(both))
+
+
+def _attend(qkv: Tensor, heads: int) -> Tensor:
+    """Full self-attention of (N, S, 3D) -> (N, S, D)."""
+    q, k, v = (split_heads(part, heads) for part in qkv.chunk(3, dim=-1))
+    return join_heads(F.scaled_dot_product_attention(q, k, v))
+
+
+class ShortRange(nn.Module):
+    """The last c behaviours of both tracks -> one summary, of the agent's part (A.1)."""
+
+    def __init__(self, width: int, hidden: int, heads: int, chunk: int, depths: tuple[int, int], linear: bool) -> None:
+        """`depths` of bidirectional and integrated learning; `linear`: plain layers in their place (table 4)."""
+        super().__init__()
+        self.places = nn.Parameter(torch.randn(2, chunk, width) * 0.02)
+        self.plain = nn.ModuleList(nn.Linear(width, width) for _ in range(2)) if linear else None
+        self.plain_both = nn.Linear(4 * width, width) if linear else None
+        counts = (0, 0) if linear else depths
+        self.bidirectional = nn.ModuleList(Bidirectional(width, hidden, heads) for _ in range(counts[0]))
+        self.integrated = nn.ModuleList(Integrated(width, hidden, heads) for _ in range(counts[1]))
+        self.norm = nn.LayerNorm(width)
+        self.compress = nn.Linear(chunk * width, width)
+
+    def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> Tensor:
+        """Behaviours (N, c, D), oldest first, and the newest sounds (N, D) -> summary (N, D)."""
+        c = agent.shape[1]
+        agent, user = agent + self.places[0], user + self.places[1]
+        if self.plain is not None and self.plain_both is not None:
+            sounds = [sound[:, None].expand(-1, c, -1) for sound in (agent_sound, user_sound)]
+            both = torch.cat([self.plain[0](agent), self.plain[1](user), *sounds], dim=-1)
+            summed: Tensor = self.compress(self.norm(self.plain_both(both)).flatten(1))
+            return summed
+        of_agent, of_user = F.silu(agent_sound), F.silu(user_sound)
+        for block in self.bidirectional:
+            agent, user = block(agent, user, of_agent, of_user)
+        # Which sound modulates the two tracks as one is left open: both do.
+        x, condition = torch.cat([agent, user], dim=1), F.silu(agent_sound + user_sound)
+        for block in self.integrated:
+            x = block(x, condition)
+        out: Tensor = self.compress(self.norm(x[:, :c]).flatten(1))
+        return out
+
+
+class ContextLayer(nn.Module):
+    """One layer of the causal decoder: a summary looks at itself and at whole chunks before it."""
+
+    def __init__(self, width: int, hidden: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.LayerNorm(width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.ffn_norm = nn.LayerNorm(width)
+        self.ffn = FeedForward(width, hidden)
+
+    def project(self, x: Tensor, turn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """x (B, T, D), turn (T, 2, D/h) -> queries, keys, values (B, h, T, D/h), turned to their places."""
+        q, k, v = (split_heads(part, self.heads) for part in self.qkv(self.norm(x)).chunk(3, dim=-1))
+        return _turned(q, turn), _turned(k, turn), v
+
+    def forward(self, x: Tensor, own: tuple[Tensor, Tensor, Tensor], past: Tensor, seen: Tensor | None) -> Tensor:
+        """x (B, T, D), `own` of `project`, past (2, B, h, S, D/h): keys and values of whole chunks -> (B, T, D).
+
+        `seen` (T, S): which of them each token may look at; None: all.
+        """
+        q, k, v = own
+        q = q * q.shape[-1] ** -0.5
+        scores = q @ past[0].transpose(-1, -2)  # (B, h, T, S)
+        if seen is not None:
+            scores = scores.masked_fill(~seen, -torch.inf)
+        self_score = (q * k).sum(-1, keepdim=True)  # the token itself stands beside the cache: nothing is copied
+        weights = torch.cat([scores, self_score], dim=-1).softmax(dim=-1)
+        y = weights[..., :-1] @ past[1] + weights[..., -1:] * v
+        x = x + self.out(join_heads(y))
+        out: Tensor = x + self.ffn(self.ffn_norm(x))
+        return out
+
+
+class LongRange(nn.Module):
+    """Causal decoder over the context cache -> cis-token."""
+
+    def __init__(self, width: int, hidden: int, heads: int, layers: int, chunk: int, capacity: int) -> None:
+        super().__init__()
+        self.chunk, self.capacity, self.head_width = chunk, capacity, width // heads
+        self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+
+    def _layers(self) -> list[ContextLayer]:
+        return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
+
+    def turn(self, chunks: Tensor) -> Tensor:
+        """Rotary places (Su et al. 2021): chunk numbers (T,) -> cosines and sines (T, 2, D/h).
+
+        Computed in double precision: after days of running the angles still differ by what the chunks do.
+        """
+        half = self.head_width // 2
+        rates = ROPE_BASE ** (-torch.arange(half, dtype=torch.float64, device=chunks.device) / half)
+        angles = (chunks.double()[:, None] * rates).repeat(1, 2)
+        return torch.stack([angles.cos(), angles.sin()], dim=1).float()
+
+    def forward(self, summaries: Tensor) -> Tensor:
+        """Summaries (B, T, D) of every frame from the start of a stream -> cis-tokens (B, T, D).
+
+        Frame t belongs to chunk t // c, and the last of its frames makes the summary that stays.
+        """
+        t = summaries.shape[1]
+        frame = torch.arange(t, device=summaries.device)
+        of = frame // self.chunk
+        whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
+        behind = of[:, None] - of[whole]
+        seen = (behind > 0) & (behind < self.capacity)  # (T, S)
+        turn, x = self.turn(of), summaries
+        for layer in self._layers():
+            own = layer.project(x, turn)
+            x = layer(x, own, torch.stack(own[1:])[:, :, :, whole], seen)
+        out: Tensor = self.norm(x)
+        return out
+
+    def step(self, summary: Tensor, past: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+        """One frame of one stream.
+
+        Args:
+            summary: (1, D) of the chunk in progress.
+            past: (L, 2, 1, h, S, D/h) keys and values of the S whole chunks in view, oldest first.
+            turn: (1, 2, D/h) of this chunk.
+
+        Returns:
+            cis-token (1, D), and keys and values (L, 2, 1, h, 1, D/h) of this summary, should it be the last of its
+            chunk.
+        """
+        x, made = summary[None], []
+        for layer, cached in zip(self._layers(), past, strict=True):
+            own = layer.project(x, turn)
+            x = layer(x, own, cached, None)
+            made.append(torch.stack(own[1:]))
+        return self.norm(x)[0], torch.stack(made)
+
+
+def _turned(x: Tensor, turn: Tensor) -> Tensor:
+    """x (B, h, T, D/h) turned by (T, 2, D/h)."""
+    first, second = x.chunk(2, dim=-1)
+    return torch.addcmul(x * turn[:, 0], torch.cat([-second, first], dim=-1), turn[:, 1])

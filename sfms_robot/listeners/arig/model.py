@@ -1,0 +1,250 @@
+"""ARIG put together: sounds and motions of two people up to now -> the agent's motion of the next frame, eq. (1).
+
+Frame T of the agent's motion is made from both people's sound and motion of frames 0..T-1 and the agent's own sound of
+frame T. Offline everything is parallel over T. For training:
+
+    dyad = Dyad(...)                                    # N aligned frames of both people, in plain units
+    losses = model.losses(dyad, states)                 # teacher forcing: frames 1..N-1 are predicted
+    (losses.motion.mean() + 0.1 * losses.state.mean()).backward()
+
+`condition` is the part before the sampler, `model.head.sample` the sampler, `generate` both with a given past (what
+`stream.ArigListener` computes frame by frame, the law its tests hold). Buffers that training sets from its data:
+`motion_mean`, `motion_std`, `sound_mean`, `sound_std`, and of the diffusion head `low`, `high`, the range of what it
+draws. Where that is steps (`draws: step`, ours), `step_std` and the range `motion_low`, `motion_high` that motion keeps
+to join them; `target` is what the sampler learns and `drawn` its inverse. Everything that goes in and out here is in
+plain units: motion of the listener's motion space, sound features of `sound.track`.
+
+B batch, N frames, C channels of the motion space, A sound features, D width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sfms_robot import config
+from sfms_robot.listeners.arig.codes import CodeHead
+from sfms_robot.listeners.arig.csu import FIRST, StateUnderstanding
+from sfms_robot.listeners.arig.diffusion import Denoiser
+from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
+from sfms_robot.listeners.arig.parts import windows
+from sfms_robot.listeners.arig.pmp import Progressive
+from sfms_robot.listeners.arig.sound import WIDTHS
+
+
+@dataclass(frozen=True)
+class Dyad:
+    """N aligned frames of a conversation; frame t of every array is the same 40 ms.
+
+    Attributes:
+        user_sound, agent_sound: (B, N, A) features of `sound.track`; anything where not heard.
+        user_heard, agent_heard: (B, N) bool.
+        user_motion: (B, N, C) motion of the listener's space; anything where not seen.
+        user_seen: (B, N) bool.
+        agent_motion: (B, N, C).
+        voiced: (B, N, 2) bool: speech of agent, user.
+    """
+
+    user_sound: Tensor
+    user_heard: Tensor
+    agent_sound: Tensor
+    agent_heard: Tensor
+    user_motion: Tensor
+    user_seen: Tensor
+    agent_motion: Tensor
+    voiced: Tensor
+
+    def check(self, sound: int, channels: int) -> None:
+        """Raise ValueError, naming the array, when one has another shape or there are fewer than two frames."""
+        b, n = self.agent_motion.shape[:2]
+        wanted = {
+            "user_sound": (b, n, sound), "agent_sound": (b, n, sound), "user_heard": (b, n), "agent_heard": (b, n),
+            "user_motion": (b, n, channels), "agent_motion": (b, n, channels), "user_seen": (b, n), "voiced": (b, n, 2),
+        }  # fmt: skip
+        for name, shape in wanted.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"{name} is {found}, not {shape}")
+        if n < 2:
+            raise ValueError(f"a dyad needs two frames or more, got {n}")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the sampler is told of frames 1..N-1.
+
+    Attributes:
+        z: (B, N-1, D).
+        states: the states' logits (B, N-1, 7) or None.
+        outline: (B, N-1, D) coarse motion.
+    """
+
+    z: Tensor
+    states: Tensor | None
+    outline: Tensor
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Of frames 1..N-1, (B, N-1) each: equation (3), or the codes' loss; cross-entropy of the states or None."""
+
+    motion: Tensor
+    state: Tensor | None
+
+
+class ArigModel(nn.Module):
+    """Weights of one listener, with the scales of its motion and sound."""
+
+    motion_mean: Tensor
+    motion_std: Tensor
+    motion_low: Tensor
+    motion_high: Tensor
+    step_std: Tensor
+    sound_mean: Tensor
+    sound_std: Tensor
+
+    def __init__(self, settings: config.Arig) -> None:
+        super().__init__()
+        d, hidden, heads = settings.width, settings.feedforward, settings.heads
+        self.settings = settings
+        self.channels, self.sound_width = len(settings.channels), WIDTHS[settings.sound]
+        self.register_buffer("motion_mean", torch.zeros(self.channels))
+        self.register_buffer("motion_std", torch.ones(self.channels))
+        self.register_buffer("motion_low", torch.full((self.channels,), -8.0))
+        self.register_buffer("motion_high", torch.full((self.channels,), 8.0))
+        self.register_buffer("step_std", torch.ones(self.channels))
+        self.register_buffer("sound_mean", torch.zeros(self.sound_width))
+        self.register_buffer("sound_std", torch.ones(self.sound_width))
+        self.sound_in = nn.Sequential(nn.Linear(self.sound_width, d), nn.GELU(), nn.Linear(d, d))
+        self.motion_in = nn.Linear(self.channels, d)
+        self.no_user_sound = nn.Parameter(torch.randn(d) * 0.02)
+        self.no_agent_sound = nn.Parameter(torch.randn(d) * 0.02)
+        self.no_face = nn.Parameter(torch.randn(d) * 0.02) if settings.visual else None
+        self.merge_agent = Merge(d, settings.visual)
+        self.merge_user = Merge(d, settings.visual)
+        depths = (settings.bidirectional_layers, settings.integrated_layers)
+        linear = settings.interaction == "linear"
+        self.short = ShortRange(d, hidden, heads, settings.chunk_frames, depths, linear)
+        self.long = LongRange(d, hidden, heads, settings.context_layers, settings.chunk_frames, settings.context_chunks)
+        self.states = StateUnderstanding(d, hidden, heads) if settings.state_guidance else None
+        self.progress = Progressive(
+            d, hidden, heads, settings.sound_frames, settings.motion_frames, settings.state_guidance
+        )
+        self.head: Denoiser | CodeHead = (
+            CodeHead(self.channels, d, settings.code_levels)
+            if settings.discrete
+            else Denoiser(self.channels, d, settings.diffusion)
+        )
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """Standard normal numbers that one frame takes: (steps, channels)."""
+        return (1, 1) if self.settings.discrete else (self.settings.diffusion.steps, self.channels)
+
+    def standardise(self, motion: Tensor) -> Tensor:
+        """Motion (..., C) of the motion space -> the units the model works in."""
+        return (motion - self.motion_mean) / self.motion_std
+
+    def restore(self, motion: Tensor) -> Tensor:
+        """The inverse of `standardise`."""
+        return motion * self.motion_std + self.motion_mean
+
+    def target(self, motion: Tensor, last: Tensor) -> Tensor:
+        """What the sampler is to draw: motion (..., C) after `last` (..., C), both standardised -> (..., C)."""
+        return motion if self.settings.draws == "motion" else (motion - last) / self.step_std
+
+    def drawn(self, sample: Tensor, last: Tensor) -> Tensor:
+        """The inverse of `target`; a step never leads out of the range of the motion."""
+        if self.settings.draws == "motion":
+            return sample
+        return torch.addcmul(last, sample, self.step_std).clamp(self.motion_low, self.motion_high)
+
+    def embed_sound(self, sound: Tensor, heard: Tensor, absent: Tensor) -> Tensor:
+        """Features (..., A), heard (...) bool, embedding (D,) or (..., D) of what is not heard -> (..., D)."""
+        out: Tensor = self.sound_in((sound - self.sound_mean) / self.sound_std)
+        return torch.where(heard[..., None], out, absent)
+
+    def embed_motion(self, motion: Tensor) -> Tensor:
+        """Standardised motion (..., C) -> (..., D)."""
+        out: Tensor = self.motion_in(motion)
+        return out
+
+    def embed_face(self, motion: Tensor, seen: Tensor) -> Tensor:
+        """Standardised motion (..., C) of the user, seen (...) bool -> (..., D)."""
+        embedded = self.embed_motion(motion)
+        return embedded if self.no_face is None else torch.where(seen[..., None], embedded, self.no_face)
+
+    def condition(self, dyad: Dyad, states: Tensor | None = None) -> Condition:
+        """Everything before the sampler, for frames 1..N-1 at once.
+
+        `states` (B, N): the state of every frame, of which each frame is told the one before. Without, each frame goes
+        on from the model's own answer, as a stream does. Raises ValueError for shapes that do not fit.
+        """
+        dyad.check(self.sound_width, self.channels)
+        user = self.embed_sound(dyad.user_sound, dyad.user_heard, self.no_user_sound)[:, :-1]
+        agent = self.embed_sound(dyad.agent_sound, dyad.agent_heard, self.no_agent_sound)
+        motion = self.embed_motion(self.standardise(dyad.agent_motion))[:, :-1]
+        face = self.embed_face(self.standardise(dyad.user_motion), dyad.user_seen)[:, :-1]
+        b, t, d = motion.shape  # frame t of what follows is made from frames 0..t and makes frame t + 1
+        c = self.settings.chunk_frames
+        now = agent[:, 1:].reshape(b * t, d)
+        summaries = self.short(
+            windows(self.merge_agent(agent[:, :-1], motion), c).reshape(b * t, c, d),
+            windows(self.merge_user(user, face), c).reshape(b * t, c, d),
+            now,
+            user.reshape(b * t, d),
+        )
+        cis = self.long(summaries.view(b, t, d)).reshape(b * t, d)
+        voiced = torch.stack([dyad.voiced[:, 1:, 0], dyad.voiced[:, :-1, 1]], dim=-1)
+        feature, logits = self._states(cis, voiced, states)
+        outline = self.progress.coarse(
+            motion.reshape(b * t, d),
+            windows(self.progress.coarse.keys(agent), self.settings.sound_frames)[:, 1:].flatten(0, 1),
+        )
+        z = self.progress.refine(
+            outline,
+            windows(self.progress.temporal.keys(motion), self.settings.motion_frames).flatten(0, 1),
+            now,
+            cis,
+            feature,
+        )
+        return Condition(z.view(b, t, d), logits, outline.view(b, t, d))
+
+    def _states(self, cis: Tensor, voiced: Tensor, states: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        """cis (B * T, D), voiced (B, T, 2) -> features (B * T, D), logits (B, T, 7)."""
+        if self.states is None:
+            return None, None
+        b, t = voiced.shape[:2]
+        keys = self.states.condition(cis, voiced.reshape(b * t, 2))
+        if states is None:
+            first = torch.full((b,), FIRST, device=cis.device)
+            features, logits = self.states.roll(keys.view(b, t, *keys.shape[1:]), first)
+            return features.flatten(0, 1), logits
+        feature, scores = self.states(keys, states[:, :-1].reshape(b * t))
+        return feature, scores.view(b, t, -1)
+
+    def losses(self, dyad: Dyad, states: Tensor | None = None, generator: torch.Generator | None = None) -> Losses:
+        """Losses of frames 1..N-1, every one told the true past.
+
+        `states` (B, N) int64, -1 where not labelled: such a frame has no state loss (0) and, as the previous state,
+        counts as `waiting`.
+        """
+        known = None if states is None else torch.where(states < 0, FIRST, states)
+        found = self.condition(dyad, known)
+        standard = self.standardise(dyad.agent_motion)
+        target = self.target(standard[:, 1:], standard[:, :-1])
+        motion = self.head.loss(found.z.flatten(0, 1), target.flatten(0, 1), generator).view(target.shape[:2])
+        if found.states is None or states is None:
+            return Losses(motion, None)
+        wrong = F.cross_entropy(found.states.transpose(1, 2), states[:, 1:], ignore_index=-1, reduction="none")
+        return Losses(motion, wrong)
+
+    def generate(self, dyad: Dyad, noise: Tensor) -> Tensor:
+        """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape)."""
+        z = self.condition(dyad).z
+        made = self.head.sample(z.flatten(0, 1), noise.flatten(0, 1))
+        last = self.standardise(dyad.agent_motion[:, :-1])
+        return self.restore(self.drawn(made.view(*z.shape[:2], -1), last))

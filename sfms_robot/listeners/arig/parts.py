@@ -1,0 +1,97 @@
+"""Blocks that the modules of ARIG share. N samples (frames of a batch, one when streaming), S tokens, D width."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def split_heads(x: Tensor, heads: int) -> Tensor:
+    """(N, S, D) -> (N, h, S, D/h)."""
+    n, s, d = x.shape
+    return x.view(n, s, heads, d // heads).transpose(1, 2)
+
+
+def join_heads(x: Tensor) -> Tensor:
+    """(N, h, S, D/h) -> (N, S, D)."""
+    n, h, s, d = x.shape
+    return x.transpose(1, 2).reshape(n, s, h * d)
+
+
+class FeedForward(nn.Module):
+    """Widen to `hidden`, GELU, narrow."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.up = nn.Linear(width, hidden)
+        self.down = nn.Linear(hidden, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.down(F.gelu(self.up(x)))
+        return out
+
+
+class Modulation(nn.Module):
+    """adaLN (Peebles and Xie 2023): shifts, scales and gates of a block, from a condition.
+
+    A fresh one leaves its block a plain one: shifts about 0, scales and gates about 1. DiT begins with gates of 0; at
+    these depths that only delays learning.
+    """
+
+    def __init__(self, width: int, size: int, kinds: str) -> None:
+        """Vectors of `size` from a condition of `width`, one per letter of `kinds`: s(hift), c (scale) or g(ate)."""
+        super().__init__()
+        self.parts = len(kinds)
+        self.linear = nn.Linear(width, self.parts * size)
+        nn.init.normal_(self.linear.weight, std=0.5 * width**-0.5)
+        with torch.no_grad():
+            self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(size))
+
+    def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
+        """Condition (N, D), SiLU already applied -> one (N, 1, size) per letter."""
+        return self.linear(condition)[:, None].chunk(self.parts, dim=-1)  # type: ignore[no-any-return]
+
+
+def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """LayerNorm of x (N, S, D) without weights of its own, then scale and shift (N, 1, D)."""
+    return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
+
+
+def windows(x: Tensor, size: int) -> Tensor:
+    """x (B, T, D) -> (B, T, size, D): each frame and those before it; the first one repeated before the start (A.2)."""
+    padded = torch.cat([x[:, :1].expand(-1, size - 1, -1), x], dim=1)
+    return padded.unfold(1, size, 1).transpose(-1, -2)
+
+
+class Look(nn.Module):
+    """A query looks at a few tokens, then a feed-forward; pre-norm, residual.
+
+    Keys and values of a token do not depend on its slot: what a slot means is added to the finished key. So a stream
+    projects every token once, however long it stays in view.
+    """
+
+    def __init__(self, width: int, hidden: int, heads: int, slots: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.slots = nn.Parameter(torch.randn(slots, 2 * width) * 0.02)
+        self.out = nn.Linear(width, width)
+        self.ffn_norm = nn.LayerNorm(width)
+        self.ffn = FeedForward(width, hidden)
+
+    def keys(self, tokens: Tensor) -> Tensor:
+        """Tokens (..., D) -> keys and values (..., 2D), for `forward`."""
+        out: Tensor = self.key_value(tokens)
+        return out
+
+    def forward(self, x: Tensor, keys: Tensor) -> Tensor:
+        """x (N, D) looking at keys (N, slots, 2D) -> (N, D)."""
+        q = split_heads(self.query(self.norm(x))[:, None], self.heads)
+        k, v = (keys + self.slots).chunk(2, dim=-1)
+        seen = F.scaled_dot_product_attention(q, split_heads(k, self.heads), split_heads(v, self.heads))
+        x = x + self.out(join_heads(seen)[:, 0])
+        out: Tensor = x + self.ffn(self.ffn_norm(x))
+        return out

@@ -1,0 +1,233 @@
+"""ARIG on half a minute of made-up conversation: it learns, repeats, resumes, and hears what it should."""
+
+import shutil
+import signal
+
+import numpy as np
+import pytest
+import torch
+from tiny_arig_training import HZ, dyad, settings, write
+
+from sfms_robot import config
+from sfms_robot.config import parse_training
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.learning.arig.corpus import SCENES, fit_scales, gather, open_scenes
+from sfms_robot.learning.arig.losses import Pupil, augment, loss_parts, previous_states
+from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
+from sfms_robot.learning.job import Run
+from sfms_robot.listeners import arig, checkpoint
+from sfms_robot.listeners.arig.csu import FIRST
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.sound import WIDTHS
+from sfms_robot.listeners.space import MotionSpace
+
+ARKIT = MotionSpace("arkit58", np.zeros(58))
+WINDOW = 24
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def corpus(data):
+    return gather(open_scenes(data, "train"), WINDOW, ARKIT, WIDTHS["mel"])
+
+
+def a_pupil(**changes) -> Pupil:
+    torch.manual_seed(0)
+    return Pupil(ArigModel(settings(listener=changes).listener))
+
+
+def quiet(**changes) -> config.ArigPhase:
+    """A phase that leaves windows as they are, but for `changes`."""
+    off = {"history_noise": 0, "state_noise": 0, "drop_audio": 0, "drop_face": 0, "drop_agent": 0, "gain_db": 0}
+    return settings(**(off | changes)).training
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"state_guidance": False}, {"visual": False}, {"discrete": True}, {"interaction": "linear"},
+     {"context_chunks": 4}],
+    ids=lambda changes: "-".join(changes) or "full",
+)  # fmt: skip
+def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, changes):
+    figures = train_arig(settings(listener=changes, steps=4), data, tmp_path)
+    assert figures["steps"] == 4 and np.isfinite(figures["held_out_noise"])
+    listener = arig.load(tmp_path)
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    plan, _ = listener.step(SpeakerFrame(0.04, silence, None, silence), listener.start(1))
+    assert plan.frames.shape == (1, 58) and np.isfinite(plan.frames).all()
+
+
+def test_losses_fall(data, tmp_path):
+    few = train_arig(settings(steps=2), data, tmp_path / "few")
+    more = train_arig(settings(steps=60), data, tmp_path / "more")
+    for part in ("noise", "state", "coarse"):
+        assert more[f"held_out_{part}"] < 0.9 * few[f"held_out_{part}"]
+
+
+def test_training_repeats_bit_for_bit(data, tmp_path):
+    for name in "ab":
+        train_arig(settings(steps=5), data, tmp_path / name)
+    assert (tmp_path / "a" / checkpoint.WEIGHTS).read_bytes() == (tmp_path / "b" / checkpoint.WEIGHTS).read_bytes()
+
+
+def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path):
+    def stop(report):
+        if report.position.step == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    train_arig(settings(steps=6), data, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt, match="--resume goes on"):
+        train_arig(settings(steps=6), data, tmp_path / "parts", Run(watch=stop))
+    train_arig(settings(steps=6), data, tmp_path / "parts", Run(resume=True))
+    whole, parts = ((tmp_path / name / checkpoint.WEIGHTS).read_bytes() for name in ("whole", "parts"))
+    assert whole == parts
+
+
+def test_the_curriculum_decides_where_windows_come_from(corpus):
+    phase = settings(steps=100).training
+    starts = corpus.starts(WINDOW)
+    generator = torch.Generator().manual_seed(0)
+    first_of = {scene: (int(starts[scene].min()), int(starts[scene].max())) for scene in SCENES}
+    early = draw(starts, weights_of(phase.stage(0), starts), 50, generator)
+    low, high = first_of["speaking"]
+    assert ((early >= low) & (early <= high)).all()
+    late = draw(starts, weights_of(phase.stage(99), starts), 300, generator)
+    shares = [((late >= low) & (late <= high)).float().mean() for low, high in first_of.values()]
+    assert min(shares) > 0.05 and sum(shares) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("step", [0, 14, 15, 49, 50, 99])
+def test_stages_follow_one_another(step):
+    phase = settings(steps=100).training
+    assert phase.stage(step) is phase.stages[0 if step < 15 else 1 if step < 50 else 2]
+
+
+def test_windows_never_cross_from_one_dyad_into_the_next(corpus):
+    ends = np.cumsum(corpus.lengths)
+    for start in torch.cat(list(corpus.starts(WINDOW).values())).tolist():
+        assert np.searchsorted(ends, start, side="right") == np.searchsorted(ends, start + WINDOW - 1, side="right")
+
+
+def test_without_the_sets_that_speak_the_curriculum_goes_on_with_listening(data, tmp_path, caplog):
+    shutil.copytree(data / "train", tmp_path / "train")
+    shutil.copytree(data / "validation", tmp_path / "validation")
+    whole = settings(steps=2, stages=[{"share": 1.0, "speaking": 1.0, "listening": 1.0}])
+    assert train_arig(whole, tmp_path, tmp_path / "out")["steps"] == 2
+    assert "no train, the curriculum goes on without it" in caplog.text
+    with pytest.raises(ConfigError, match="a stage draws from speaking alone, the data have listening"):
+        train_arig(settings(steps=2), tmp_path, tmp_path / "out2")
+
+
+def test_a_silent_agent_may_lack_its_track_but_one_that_speaks_never(corpus):
+    starts = corpus.starts(WINDOW)
+    told, _ = corpus.cut(torch.cat([starts["speaking"][:20], starts["listening"][:20]]), WINDOW)
+    found, _ = augment(told, a_pupil().model, quiet(drop_agent=1), torch.Generator().manual_seed(0))
+    speaks = told.voiced[..., 0].any(1)
+    assert speaks.any() and not speaks.all()
+    assert torch.equal(found.agent_heard.any(1), speaks)
+
+
+def test_dropping_takes_a_whole_modality_and_its_voice(corpus):
+    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:10], WINDOW)
+    model = a_pupil().model
+    found, _ = augment(told, model, quiet(drop_audio=1, drop_face=1), torch.Generator().manual_seed(0))
+    assert told.voiced[..., 1].any()
+    assert not (found.user_heard.any() or found.voiced[..., 1].any() or found.user_seen.any())
+    assert torch.equal(found.voiced[..., 0], told.voiced[..., 0])
+
+
+def test_without_augmentation_windows_stay_as_they_are(corpus):
+    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:5], WINDOW)
+    found, truth = augment(told, a_pupil().model, quiet(), torch.Generator().manual_seed(0))
+    assert torch.equal(truth, told.agent_motion)
+    for name in ("user_sound", "agent_sound", "user_heard", "agent_motion", "voiced"):
+        assert torch.equal(getattr(found, name), getattr(told, name))
+
+
+def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_back(corpus):
+    model = a_pupil().model
+    fit_scales(model, corpus, settings().listener.channels)
+    model.step_std.zero_()  # leaves the slow part alone
+    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    found, truth = augment(told, model, quiet(history_noise=0.4), torch.Generator().manual_seed(0))
+    off = (found.agent_motion - told.agent_motion) / model.motion_std
+    assert float((off.flatten(1).abs().amax(1) < 1e-4).float().mean()) == pytest.approx(0.67, abs=0.1)  # 0.3 never jump
+    after = (truth - told.agent_motion) / model.motion_std
+    assert torch.allclose(after[:, 1:], 0.9 * off[:, :-1], atol=1e-4)
+
+
+@pytest.mark.parametrize("draws", ["motion", "step"])
+def test_what_is_drawn_is_the_inverse_of_what_is_learned(corpus, draws):
+    model = a_pupil(draws=draws).model
+    fit_scales(model, corpus, settings().listener.channels)
+    motion = model.standardise(corpus.agent_motion)
+    last = motion.roll(1, 0)
+    assert torch.allclose(model.drawn(model.target(motion, last), last), motion, atol=1e-4)
+
+
+def test_steps_from_one_dyad_into_the_next_are_no_steps(corpus):
+    model = a_pupil(draws="step").model
+    fit_scales(model, corpus, settings().listener.channels)
+    motion = model.standardise(corpus.agent_motion).split(corpus.lengths)
+    largest = torch.stack([(one.diff(dim=0) / model.step_std).abs().amax(0) for one in motion]).amax(0)
+    assert torch.allclose(torch.maximum(model.head.high, -model.head.low), largest, atol=1e-3)
+
+
+def test_a_step_never_leads_out_of_the_range_of_the_motion():
+    model = a_pupil(draws="step").model
+    model.motion_high.fill_(0.5)
+    assert float(model.drawn(torch.full((1, 58), 9.0), torch.zeros(1, 58)).max()) == 0.5
+
+
+def test_lost_states_are_drawn_and_unknown_ones_wait():
+    states = torch.tensor([[3, -1] * 500])
+    assert torch.equal(previous_states(states, 0, torch.Generator())[0, :2], torch.tensor([3, FIRST]))
+    kept = previous_states(states, 0.7, torch.Generator().manual_seed(0))[:, ::2] == 3
+    assert float(kept.float().mean()) == pytest.approx(0.3 + 0.7 / 7, abs=0.05)
+
+
+def test_unlabelled_frames_have_no_state_loss(corpus):
+    pupil = a_pupil()
+    told, states = corpus.cut(corpus.starts(WINDOW)["listening"][:3], WINDOW)
+    unknown = torch.full_like(states, -1)
+    parts = loss_parts(
+        pupil, told, unknown, told.agent_motion, 1, torch.Generator().manual_seed(0), states.clamp(min=0)
+    )
+    assert float(parts.state) == 0
+
+
+def test_only_short_dyads_are_refused(data):
+    with pytest.raises(ConfigError, match=r"none of \d+ dyads is as long as a window of 9000 frames"):
+        gather(open_scenes(data, "train"), 9000, ARKIT, WIDTHS["mel"])
+
+
+def test_agent_and_user_keep_their_tracks():
+    one = dyad("a", "speaking", 0)
+    found = gather({"speaking": [one]}, WINDOW, ARKIT, WIDTHS["mel"])
+    assert found.agent_heard.all() and not found.user_heard.any() and not found.user_seen.any()
+    assert found.voiced[:, 0].any() and not found.voiced[:, 1].any()
+    assert len(found.states) == HZ * 12
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"),
+    [
+        ({"listener": {"kind": "tree"}}, "tiny: listener.kind = 'tree' is not a kind of listener (sfms, arig)"),
+        ({}, "tiny: listener.kind = '' is not a kind of listener (sfms, arig)"),
+        (3, "tiny: listener.kind = '' is not a kind of listener (sfms, arig)"),
+        ({"stages": [{"share": 0.5, "speaking": 1}]}, "shares of the stages add up to 0.5, not 1"),
+        ({"stages": [{"share": 1.0}]}, "a stage needs a weight above 0 (speaking, listening, interaction)"),
+        ({"history_noise": -1}, "history_noise"),
+    ],
+)
+def test_what_is_wrong_in_a_training_file_is_said(raw, said):
+    if isinstance(raw, dict) and raw and "listener" not in raw:
+        raw = {"listener": {"kind": "arig"}, "training": {"steps": 1, "batch": 1, "learning_rate": 1.0, **raw}}
+    with pytest.raises(ConfigError) as caught:
+        parse_training(raw, "tiny")
+    assert said in str(caught.value)

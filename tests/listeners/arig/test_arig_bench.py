@@ -1,0 +1,36 @@
+"""The parts of `sfms-robot bench listener` that judge rather than time."""
+
+from importlib import import_module
+
+import pytest
+from tiny_arig import arig_listener, talk
+
+from sfms_robot.app.bench.samplers import WAYS, samplers
+
+bench = import_module("sfms_robot.app.bench.listener")  # the package's own `listener` is the function
+MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8}
+
+
+def test_every_way_of_sampling_is_judged():
+    lost = samplers(arig_listener(diffusion={"width": 10, "train_steps": 60}), talk(4))
+    assert set(lost) == {f"{sampler}-{steps}" for sampler, steps in WAYS}
+    assert all(value > 0 for value in lost.values())
+    assert samplers(arig_listener(discrete=True), talk(4)) == {}
+
+
+def test_the_fast_path_is_compared_frame_by_frame():
+    one = arig_listener(**MIDDLE, precision="fp32")
+    other = arig_listener(**MIDDLE, precision="int8")
+    for listener in (one, other):
+        listener.model.motion_mean.fill_(0.5)
+        listener.model.motion_std.fill_(0.02)
+    assert bench._distance(one, one, talk(10)) == 0
+    assert 0 < bench._distance(other, one, talk(10)) < 0.05
+
+
+@pytest.mark.parametrize("minutes", [1, 60])
+def test_a_memory_minutes_old_goes_on(minutes: int):
+    listener = arig_listener()
+    memory = bench._after_minutes(listener, minutes)
+    assert memory.frames == minutes * 1500
+    assert len(bench._steps(listener, memory, talk(5), 12)) == 12

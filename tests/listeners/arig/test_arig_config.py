@@ -1,0 +1,68 @@
+import pytest
+from tiny_arig import RAW
+
+from sfms_robot import config
+from sfms_robot.config.kinds import KINDS, parse_listener
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.arig import load
+from sfms_robot.listeners.arig.model import ArigModel
+
+LISTENERS = data_dir("configs") / "listeners"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"width": 20, "heads": 4}, "width 20 is not a multiple of twice heads"),
+        ({"diffusion": {"steps": 2000}}, "steps 2000 is above train_steps 1000"),
+        ({"diffusion": {"width": 9}}, "diffusion.width = 9"),
+        ({"diffusion": {"sampler": "euler"}}, "diffusion.sampler = 'euler'.*'ddpm' or 'ddim'"),
+        ({"context_chunks": 1}, "context_chunks = 1"),
+        ({"sound": "mfcc"}, "sound = 'mfcc'.*'mel' or 'wav2vec2'"),
+        ({"chunks": 6}, "'chunks' is not a known key.*chunk_frames"),
+        ({"code_levels": []}, "code_levels"),
+        ({"kind": "argi"}, "kind = 'argi' is not a kind of listener.*arig"),
+    ],
+)
+def test_what_is_wrong_is_named(changes, said: str):
+    with pytest.raises(ConfigError, match=said):
+        parse_listener(RAW | changes, "listener.yaml")
+
+
+def test_arig_is_a_kind():
+    assert isinstance(parse_listener(RAW, "x"), config.Arig) and KINDS["arig"] is config.Arig
+
+
+@pytest.mark.parametrize("name", ["arig-small", "arig-paper"])
+def test_shipped_sizes_hold_the_papers_numbers(name: str):
+    settings = config.load(config.Arig, LISTENERS / name / "config.yaml")
+    assert (settings.chunk_frames, settings.context_chunks, settings.diffusion.steps) == (6, 512, 15)
+    assert (settings.bidirectional_layers, settings.diffusion.blocks) == (2, 3)
+    if name == "arig-paper":
+        assert (settings.width, settings.feedforward, settings.diffusion.width) == (512, 2048, 262)
+
+
+def test_the_small_one_fits_in_12_megabytes(tmp_path):
+    model = ArigModel(config.load(config.Arig, LISTENERS / "arig-small" / "config.yaml"))
+    checkpoint.save_weights(tmp_path / "model.safetensors", model)
+    assert (tmp_path / "model.safetensors").stat().st_size < 12e6
+
+
+def test_a_folder_is_loaded_again_as_it_was_saved(tmp_path):
+    settings = config.parse(config.Arig, RAW, "x")
+    checkpoint.save_config(tmp_path, settings)
+    model = ArigModel(settings)
+    checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, model)
+    loaded = load(tmp_path)
+    assert loaded.settings == settings
+    assert all((loaded.model.state_dict()[name] == value).all() for name, value in model.state_dict().items())
+
+
+def test_weights_of_another_size_are_refused(tmp_path):
+    checkpoint.save_config(tmp_path, config.parse(config.Arig, RAW, "x"))
+    other = ArigModel(config.parse(config.Arig, RAW | {"width": 32}, "x"))
+    checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, other)
+    with pytest.raises(ModelError, match="has shape"):
+        load(tmp_path)

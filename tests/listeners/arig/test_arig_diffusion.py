@@ -1,0 +1,135 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot import config
+from sfms_robot.listeners.arig.codes import CodeHead
+from sfms_robot.listeners.arig.diffusion import Denoiser, signal_share, steps_of
+
+
+def denoiser(**changes) -> Denoiser:
+    raw = {"width": 12, "steps": 5, "train_steps": 40} | changes
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = Denoiser(3, 8, config.parse(config.Diffusion, raw, "tiny"))
+    with torch.no_grad():
+        model.low.fill_(-1e6)
+        model.high.fill_(1e6)
+    return model
+
+
+@torch.no_grad()
+def test_sampling_is_equation_4_where_nothing_is_clamped():
+    model = denoiser()
+    z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
+    share = signal_share(40)[model.levels]
+    x = noise[:, 0]
+    for step, level in enumerate(reversed(model.levels)):
+        index = len(model.levels) - 1 - step
+        before = share[index - 1] if index else torch.tensor(1.0)
+        alpha = share[index] / before
+        found = model(x[:, None], model.modulate(z, model.level(torch.full((4,), level))))[:, 0]
+        mean = (x - (1 - alpha) / (1 - share[index]).sqrt() * found) / alpha.sqrt()
+        sigma = ((1 - alpha) * (1 - before) / (1 - share[index])).sqrt()
+        x = (mean + (sigma * noise[:, step + 1] if index else 0)).float()
+    torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
+
+
+@torch.no_grad()
+def test_ddim_keeps_the_noise_it_found():
+    model = denoiser(sampler="ddim")
+    z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
+    share = signal_share(40)[model.levels].float()
+    x = noise[:, 0]
+    for index in reversed(range(5)):
+        level = model.level(torch.full((4,), model.levels[index]))
+        found = model(x[:, None], model.modulate(z, level))[:, 0]
+        clean = (x - (1 - share[index]).sqrt() * found) / share[index].sqrt()
+        before = share[index - 1] if index else torch.tensor(1.0)
+        x = before.sqrt() * clean + (1 - before).sqrt() * found
+    torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
+def test_levels_worked_out_beforehand_change_nothing(sampler: str):
+    model = denoiser(sampler=sampler)
+    z, noise = torch.randn(2, 8), torch.randn(2, 5, 3)
+    levels = model.level(torch.tensor(model.levels))
+    torch.testing.assert_close(model.sample(z, noise, levels), model.sample(z, noise))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("changes", [{"sampler": "ddim"}, {"temperature": 0.0}])
+def test_without_added_noise_the_start_decides(changes):
+    model = denoiser(**changes)
+    z, noise = torch.randn(2, 8), torch.randn(2, 5, 3)
+    other = torch.cat([noise[:, :1], torch.randn(2, 4, 3)], dim=1)
+    torch.testing.assert_close(model.sample(z, noise), model.sample(z, other))
+    assert not torch.allclose(model.sample(z, noise), model.sample(z, noise + 1))
+
+
+@torch.no_grad()
+@given(seed=st.integers(0, 1000), sampler=st.sampled_from(["ddpm", "ddim"]), steps=st.integers(1, 8))
+@settings(max_examples=25, deadline=None)
+def test_no_sample_leaves_the_range_that_was_set(seed: int, sampler: str, steps: int):
+    model = denoiser(sampler=sampler, steps=steps)
+    model.low.fill_(-0.5)
+    model.high.copy_(torch.tensor([0.0, 0.5, 1.0]))
+    drawn = torch.Generator().manual_seed(seed)
+    out = model.sample(torch.randn(6, 8, generator=drawn), 5 * torch.randn(6, steps, 3, generator=drawn))
+    assert bool(((out >= model.low - 1e-5) & (out <= model.high + 1e-5)).all())
+
+
+@given(steps=st.integers(1, 40), sampler=st.sampled_from(["ddpm", "ddim"]))
+def test_the_last_step_returns_clean_motion(steps: int, sampler: str):
+    settings = config.Diffusion(width=12, steps=steps, train_steps=40, sampler=sampler)
+    levels = torch.linspace(0, 39, steps).round().long().tolist()
+    last = steps_of(levels, settings)[-1]
+    assert (last.motion, last.stay, last.spread) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("levels", [2, 40, 1000])
+def test_noise_grows_and_motion_never_quite_goes(levels: int):
+    share = signal_share(levels)
+    assert bool((share.diff() < 0).all()) and share[0] < 1 and share[-1] > 5e-4
+
+
+@torch.no_grad()
+def test_noise_for_another_number_of_steps_is_refused():
+    with pytest.raises(ValueError, match="noise for 4 steps, the sampler takes 5"):
+        denoiser().sample(torch.randn(1, 8), torch.randn(1, 4, 3))
+
+
+def test_a_trained_sampler_draws_what_it_was_shown():
+    """Two clusters, one per condition: place and spread come back."""
+    torch.manual_seed(0)
+    settings = config.Diffusion(width=32, steps=15, train_steps=200)
+    model = Denoiser(2, 1, settings)
+    optimizer = torch.optim.Adam(model.parameters(), 5e-3)
+    centre = torch.tensor([[1.0, -1.0], [-0.5, 0.5]])
+    for _ in range(400):
+        which = torch.randint(0, 2, (256,))
+        motion = centre[which] + 0.3 * torch.randn(256, 2)
+        loss = model.loss(which[:, None].float(), motion).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    with torch.no_grad():
+        for which in (0, 1):
+            drawn = model.sample(torch.full((2000, 1), float(which)), torch.randn(2000, 15, 2))
+            torch.testing.assert_close(drawn.mean(0), centre[which], rtol=0, atol=0.12)
+            torch.testing.assert_close(drawn.std(0), torch.full((2,), 0.3), rtol=0, atol=0.12)
+
+
+@torch.no_grad()
+def test_codes_are_drawn_by_their_probability():
+    torch.manual_seed(0)
+    head = CodeHead(3, 8, (3, 2))
+    z = torch.randn(1, 8)
+    drawn = head.sample(z.expand(4000, 8), torch.randn(4000, 1, 1))
+    kinds, counts = drawn.unique(dim=0, return_counts=True)
+    assert len(kinds) <= 6
+    share = torch.softmax(head.classify(z), -1)[0].sort().values
+    torch.testing.assert_close(counts.sort().values / 4000, share[-len(kinds) :], rtol=0, atol=0.03)

@@ -1,0 +1,184 @@
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_arig import arig_model
+
+from sfms_robot.listeners.arig.csu import FIRST, STATES
+from sfms_robot.listeners.arig.ibu import LongRange
+from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.parts import windows
+from sfms_robot.listeners.arig.sound import WIDTHS
+
+ABLATIONS = [
+    {},
+    {"context_chunks": 2},
+    {"state_guidance": False},
+    {"visual": False},
+    {"discrete": True},
+    {"interaction": "linear"},
+    {"motion_space": "deca56"},
+    {"sound": "wav2vec2"},
+]
+
+
+@pytest.fixture(scope="module")
+def tiny() -> ArigModel:
+    return arig_model()
+
+
+def random_dyad(model: ArigModel, frames: int = 14, batch: int = 2, seed: int = 0) -> Dyad:
+    drawn = torch.Generator().manual_seed(seed)
+    sound, motion = (batch, frames, model.sound_width), (batch, frames, model.channels)
+
+    def chance(*shape):
+        return torch.rand(shape, generator=drawn) > 0.3
+
+    return Dyad(
+        user_sound=torch.randn(sound, generator=drawn),
+        user_heard=chance(batch, frames),
+        agent_sound=torch.randn(sound, generator=drawn),
+        agent_heard=chance(batch, frames),
+        user_motion=torch.randn(motion, generator=drawn),
+        user_seen=chance(batch, frames),
+        agent_motion=torch.randn(motion, generator=drawn),
+        voiced=chance(batch, frames, 2),
+    )
+
+
+def states_of(dyad: Dyad, seed: int = 0) -> torch.Tensor:
+    return torch.randint(0, len(STATES), dyad.user_heard.shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("changes", ABLATIONS, ids=str)
+def test_gradients_reach_every_parameter(changes):
+    model = arig_model(**changes)
+    dyad = random_dyad(model)
+    losses = model.losses(dyad, states_of(dyad), torch.Generator().manual_seed(1))
+    total = losses.motion.mean() + (losses.state.mean() if losses.state is not None else 0.0)
+    total.backward()
+    unmoved = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert unmoved == []
+
+
+@pytest.mark.parametrize("changes", ABLATIONS, ids=str)
+def test_losses_are_one_per_predicted_frame(changes):
+    model = arig_model(**changes)
+    dyad = random_dyad(model)
+    losses = model.losses(dyad, states_of(dyad))
+    assert losses.motion.shape == (2, 13) and bool(losses.motion.isfinite().all())
+    assert (losses.state is None) == (not model.settings.state_guidance)
+
+
+@given(frame=st.integers(1, 13), field=st.sampled_from([field.name for field in dataclasses.fields(Dyad)]))
+@settings(max_examples=40, deadline=None)
+def test_a_frame_is_made_from_what_equation_1_allows(tiny, frame: int, field: str):
+    """Both people up to T - 1, and of T the agent's sound: nothing of that or later changes z of T."""
+    first = frame + 1 if field.startswith(("agent_sound", "agent_heard")) else frame
+    dyad, other = random_dyad(tiny), random_dyad(tiny, seed=7)
+    mixed = torch.cat([getattr(dyad, field)[:, :first], getattr(other, field)[:, first:]], dim=1)
+    if field == "voiced":  # of the agent now, of the user one frame before
+        mixed[:, frame, 0] = dyad.voiced[:, frame, 0]
+    with torch.no_grad():
+        z = tiny.condition(dyad).z
+        after = tiny.condition(dataclasses.replace(dyad, **{field: mixed})).z
+    torch.testing.assert_close(after[:, :frame], z[:, :frame], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(Dyad)])
+def test_everything_that_is_told_counts(tiny, field: str):
+    dyad, other = random_dyad(tiny), random_dyad(tiny, seed=7)
+    with torch.no_grad():
+        z = tiny.condition(dyad).z
+        after = tiny.condition(dataclasses.replace(dyad, **{field: getattr(other, field)})).z
+    assert not torch.allclose(after, z)
+
+
+def test_a_batch_is_its_rows(tiny):
+    dyad = random_dyad(tiny)
+    second = Dyad(**{field.name: getattr(dyad, field.name)[1:] for field in dataclasses.fields(Dyad)})
+    with torch.no_grad():
+        torch.testing.assert_close(tiny.condition(dyad).z[1:], tiny.condition(second).z)
+
+
+def test_the_answer_of_a_stream_is_its_own_previous_state(tiny):
+    """Told the states it found itself, the parallel pass finds the same."""
+    dyad = random_dyad(tiny)
+    with torch.no_grad():
+        rolled = tiny.condition(dyad)
+        found = torch.cat([torch.full((2, 1), FIRST), rolled.states.argmax(-1)], dim=1)
+        told = tiny.condition(dyad, found)
+    torch.testing.assert_close(told.states, rolled.states)
+    torch.testing.assert_close(told.z, rolled.z)
+
+
+def test_a_frame_without_a_label_has_no_state_loss(tiny):
+    dyad = random_dyad(tiny)
+    states = states_of(dyad)
+    states[:, 5] = -1
+    losses = tiny.losses(dyad, states)
+    assert losses.state[:, 4].tolist() == [0, 0] and bool((losses.state[:, :4] > 0).all())
+
+
+@pytest.mark.parametrize(
+    ("field", "shape"),
+    [("user_sound", (2, 14, 5)), ("agent_motion", (2, 14, 56)), ("voiced", (2, 14)), ("user_seen", (2, 13))],
+)
+def test_shapes_that_do_not_fit_are_refused_by_name(tiny, field: str, shape):
+    dyad = dataclasses.replace(random_dyad(tiny), **{field: torch.zeros(shape)})
+    with pytest.raises(ValueError, match=field if field != "agent_motion" else "user_motion|agent_motion"):
+        tiny.condition(dyad)
+
+
+def test_one_frame_is_no_dyad(tiny):
+    with pytest.raises(ValueError, match="two frames or more, got 1"):
+        tiny.condition(random_dyad(tiny, frames=1))
+
+
+def test_widths_follow_space_and_sound():
+    model = arig_model(motion_space="deca56", sound="wav2vec2")
+    assert (model.channels, model.sound_width) == (56, 768 + 21)
+    assert WIDTHS["mel"] == 4 * 128 + 21
+
+
+def test_windows_repeat_the_first_frame():
+    x = torch.arange(4.0).view(1, 4, 1)
+    assert windows(x, 3)[0, :, :, 0].tolist() == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]
+
+
+@torch.no_grad()
+def test_a_summary_sees_the_chunks_before_it_and_no_frame_of_its_own():
+    """Frames 0..2 are chunk 0; of it frame 4 sees the summary of frame 2 alone."""
+    torch.manual_seed(0)
+    long = LongRange(8, 16, 2, 1, chunk=3, capacity=2)
+    x = torch.randn(1, 9, 8)
+
+    def changed_by(frame: int) -> list[bool]:
+        other = x.clone()
+        other[:, frame] = torch.randn(8)
+        return (long(other) - long(x)).abs().amax(-1)[0].gt(1e-6).tolist()
+
+    assert changed_by(1) == [frame == 1 for frame in range(9)]
+    assert changed_by(2) == [frame in (2, 3, 4, 5) for frame in range(9)]  # capacity 2: this chunk and one before
+
+
+@torch.no_grad()
+def test_context_depends_on_how_far_apart_chunks_are_not_on_when():
+    torch.manual_seed(0)
+    long = LongRange(8, 16, 2, 2, chunk=1, capacity=4)
+    past, summary = torch.randn(3, 1, 8), torch.randn(1, 8)
+
+    def cis(first: int) -> torch.Tensor:
+        cache = torch.zeros(2, 2, 1, 2, 0, 4)
+        for index, each in enumerate([*past, summary]):
+            made, keys = long.step(each, cache, long.turn(torch.tensor([first + index])))
+            cache = torch.cat([cache, keys], dim=-2)
+        return made
+
+    torch.testing.assert_close(cis(0), cis(500_000), rtol=1e-4, atol=1e-5)  # days later
+
+
+def test_states_have_the_papers_seven_names():
+    assert len(STATES) == len(set(STATES)) == 7 and 0 <= FIRST < 7

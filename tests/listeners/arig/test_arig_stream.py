@@ -1,0 +1,214 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
+
+from sfms_robot import config
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ModelError
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.listeners.arig.csu import STATES
+from sfms_robot.listeners.arig.diffusion import Denoiser
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.stream import ArigListener
+
+ABLATIONS = [
+    {},
+    {"context_chunks": 2},
+    {"state_guidance": False},
+    {"visual": False},
+    {"discrete": True},
+    {"interaction": "linear"},
+    {"sound_frames": 1, "motion_frames": 1, "chunk_frames": 1},
+]
+
+
+@pytest.fixture(scope="module")
+def tiny() -> ArigListener:
+    return arig_listener()
+
+
+def soft(listener: ArigListener) -> ArigListener:
+    """Whose motion is small: what it shows is what it made, nothing is clipped to a blendshape's 0..1."""
+    with torch.no_grad():
+        listener.model.motion_std.fill_(0.02)
+        listener.model.motion_mean.fill_(0.5)
+    return listener
+
+
+def assert_stream_is_offline(listener: ArigListener, frames: int, atol: float) -> None:
+    speaker = talk(frames)
+    made = torch.from_numpy(streamed(listener, speaker, seed=3))
+    with torch.no_grad():
+        offline = listener.model.generate(dyad_of(listener, speaker, made), noise_of(listener, frames, seed=3))
+    assert 0 < made[:, 6:].min() and made[:, 6:].max() < 1
+    np.testing.assert_allclose(made, offline[0], atol=atol)
+
+
+@pytest.mark.parametrize("changes", ABLATIONS, ids=str)
+def test_stream_equals_offline(changes):
+    assert_stream_is_offline(soft(arig_listener(**changes)), 31, 1e-5)
+
+
+@pytest.mark.parametrize("name", ["arig-small", pytest.param("arig-paper", marks=pytest.mark.slow)])
+def test_stream_equals_offline_at_the_shipped_sizes(name: str):
+    file = data_dir("configs") / "listeners" / name / "config.yaml"
+    settings = config.load(config.Arig, file).model_copy(update={"precision": "fp32"})
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        listener = soft(ArigListener(settings, ArigModel(settings)))
+    assert_stream_is_offline(listener, 20, 1e-4)
+
+
+@pytest.mark.parametrize("changed_from", [1, 8, 22])
+def test_later_frames_never_change_earlier_plans(tiny, changed_from: int):
+    speaker = talk(26)
+    other = speaker[:changed_from] + talk(26, seed=9)[changed_from:]
+    before, after = streamed(tiny, speaker), streamed(tiny, other)
+    np.testing.assert_array_equal(before[:changed_from], after[:changed_from])
+    assert not np.array_equal(before[changed_from:], after[changed_from:])
+
+
+def bytes_of(value) -> int:
+    if dataclasses.is_dataclass(value):
+        return sum(bytes_of(getattr(value, field.name)) for field in dataclasses.fields(value))
+    if isinstance(value, torch.Tensor):
+        return value.untyped_storage().nbytes()
+    return value.nbytes if isinstance(value, np.ndarray) else 0
+
+
+def test_memory_takes_the_same_room_at_every_step(tiny):
+    """The context of the tiny model is full after twelve."""
+    memory, speaker, room = tiny.start(1), talk(10), {}
+    room[0] = bytes_of(memory)
+    for index in range(1, 301):
+        _, memory = tiny.step(speaker[index % 10], memory)
+        room[index] = bytes_of(memory)
+    assert room[0] > 0 and set(room.values()) == {room[0]}
+
+
+def test_memory_is_not_changed(tiny):
+    speaker = talk(13)
+    memory = tiny.start(1)
+    for frame in speaker[:12]:
+        _, memory = tiny.step(frame, memory)
+    tensors = {n: v for n, v in vars(memory).items() if isinstance(v, torch.Tensor)}
+    copies = {name: value.clone() for name, value in tensors.items()}
+    first, _ = tiny.step(speaker[12], memory)
+    second, _ = tiny.step(speaker[12], memory)
+    np.testing.assert_array_equal(first.frames, second.frames)
+    assert all(torch.equal(tensors[name], copy) for name, copy in copies.items())
+
+
+def test_a_plan_is_one_frame_ahead_in_our_units(tiny):
+    memory = tiny.start(1)
+    for frame in talk(8):
+        plan, memory = tiny.step(frame, memory)
+        assert plan.frames.shape == (1, 58) and plan.frames.dtype == np.float32
+        assert plan.made_at_s == frame.time_s
+        np.testing.assert_allclose(plan.times_s, [frame.time_s + FRAME_S])
+        assert 0 <= plan.frames[:, 6:].min() and plan.frames[:, 6:].max() <= 1
+    assert (tiny.hop, tiny.horizon) == (1, 1)
+    assert 0 <= memory.state < len(STATES)
+
+
+def test_one_seed_repeats_and_two_differ(tiny):
+    speaker = talk(12)
+    one, again, other = (streamed(tiny, speaker, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one, other)
+
+
+def test_two_streams_of_one_listener_do_not_meet(tiny):
+    a, b = talk(12), talk(12, seed=5)
+    memory_a, memory_b, woven = tiny.start(1), tiny.start(2), []
+    for of_a, of_b in zip(a, b, strict=True):
+        plan, memory_a = tiny.step(of_a, memory_a)
+        _, memory_b = tiny.step(of_b, memory_b)
+        woven.append(plan.frames[0])
+    np.testing.assert_array_equal(woven, streamed(tiny, a, 1))
+
+
+@pytest.mark.parametrize("space", ["faceverse58", "deca56"])
+def test_every_motion_space_is_streamed(space: str):
+    out = streamed(arig_listener(motion_space=space), talk(8))
+    assert out.shape == (8, 58) and np.isfinite(out).all()
+
+
+@given(has=st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=1, max_size=12))
+@settings(max_examples=25, deadline=None)
+def test_any_mix_of_missing_modalities_is_normal(tiny, has):
+    speaker = []
+    for index, (face, audio, agent) in enumerate(has):
+        whole = talk(index + 1)[-1]
+        sound = whole.audio if audio else whole.audio[:0]
+        speaker.append(
+            SpeakerFrame(whole.time_s, sound, whole.face if face else None, whole.agent_audio if agent else None)
+        )
+    assert np.isfinite(streamed(tiny, speaker)).all()
+
+
+@pytest.mark.parametrize("part", ["face", "audio", "agent_audio"])
+def test_each_modality_is_used(tiny, part: str):
+    speaker = talk(8)
+    gone = {"face": None, "audio": np.zeros(0, np.float32), "agent_audio": None}[part]
+    without = [dataclasses.replace(frame, **{part: gone}) for frame in speaker]
+    assert not np.array_equal(streamed(tiny, speaker), streamed(tiny, without))
+
+
+def test_what_is_not_finite_is_a_face_not_seen_and_silence(tiny):
+    speaker = talk(10)
+    lost = [dataclasses.replace(f, face=dataclasses.replace(f.face, pose=f.face.pose * np.nan)) for f in speaker]
+    blind = [dataclasses.replace(f, face=None) for f in speaker]
+    np.testing.assert_array_equal(streamed(tiny, lost), streamed(tiny, blind))
+    broken = [dataclasses.replace(f, audio=f.audio * np.nan, agent_audio=f.agent_audio * np.inf) for f in speaker]
+    silent = [dataclasses.replace(f, audio=f.audio * 0, agent_audio=f.agent_audio * 0) for f in speaker]
+    np.testing.assert_array_equal(streamed(tiny, broken), streamed(tiny, silent))
+
+
+def test_a_robot_that_falls_silent_listens_on(tiny):
+    """Agent audio shorter than the run, its last frame cut short."""
+    speaker = talk(20)
+    cut = [dataclasses.replace(f, agent_audio=f.agent_audio if i < 9 else None) for i, f in enumerate(speaker)]
+    cut[9] = dataclasses.replace(cut[9], agent_audio=speaker[9].agent_audio[:100])
+    out, whole = streamed(tiny, cut), streamed(tiny, speaker)
+    np.testing.assert_array_equal(out[:9], whole[:9])
+    assert np.isfinite(out).all()
+
+
+@pytest.mark.parametrize("samples", [639, 641])
+def test_a_clock_that_drifts_costs_the_agent_track_a_sample(tiny, samples: int):
+    drifting = [dataclasses.replace(f, agent_audio=np.resize(f.agent_audio, samples)) for f in talk(10)]
+    assert np.isfinite(streamed(tiny, drifting)).all()
+
+
+def test_frames_of_another_length_are_refused(tiny):
+    with pytest.raises(ValueError, match="640 samples or none, got 100"):
+        tiny.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), tiny.start(1))
+
+
+def test_silence_leaves_the_face_where_it_may_be():
+    """Whatever the weights say: standardised motion stays inside the range that was set."""
+    listener = arig_listener()
+    assert isinstance(listener.model.head, Denoiser)
+    with torch.no_grad():
+        listener.model.head.low.fill_(-2.0)
+        listener.model.head.high.fill_(2.0)
+        listener.model.motion_std.fill_(0.1)
+        listener.model.motion_mean.fill_(0.5)
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    memory, out = listener.start(1), []
+    for index in range(200):
+        plan, memory = listener.step(SpeakerFrame((index + 1) * FRAME_S, silence, None, silence), memory)
+        out.append(plan.frames[0])
+    assert 0.29 < np.min(out) and np.max(out) < 0.71
+
+
+def test_features_that_nothing_here_computes_cannot_be_run():
+    model = arig_model(sound="wav2vec2")
+    with pytest.raises(ModelError, match="'wav2vec2': such a model can be trained and evaluated, not run"):
+        ArigListener(model.settings, model)

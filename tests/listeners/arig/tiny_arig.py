@@ -1,0 +1,87 @@
+"""An ARIG small enough to build in every test, and a stream computed from whole arrays."""
+
+import numpy as np
+import torch
+
+from sfms_robot import config
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
+from sfms_robot.listeners.arig import sound
+from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.stream import ArigListener
+
+RAW = {
+    "kind": "arig",
+    "width": 16,
+    "feedforward": 24,
+    "heads": 2,
+    "chunk_frames": 3,
+    "context_chunks": 4,
+    "context_layers": 2,
+    "diffusion": {"width": 10, "steps": 4, "train_steps": 50},
+}
+
+
+def arig_model(**changes) -> ArigModel:
+    settings = config.parse(config.Arig, RAW | changes, "tiny")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return ArigModel(settings)
+
+
+def arig_listener(**changes) -> ArigListener:
+    model = arig_model(**changes)
+    return ArigListener(model.settings, model)
+
+
+def talk(frames: int, seed: int = 0, face: bool = True, audio: bool = True, agent: bool = True) -> list[SpeakerFrame]:
+    """Both tracks speak in turns of some frames."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for index in range(frames):
+        time_s = (index + 1) * FRAME_S
+        level = np.where(np.sin(index / np.array([4.0, 5.0]) + seed) > 0, 0.2, 0.001)
+        mine, theirs = (rng.normal(0, each, FRAME_SAMPLES).astype(np.float32) for each in level)
+        shown = FaceFrame.of(time_s, rng.uniform(0, 0.3, 58)) if face else None
+        out.append(SpeakerFrame(time_s, theirs if audio else theirs[:0], shown, mine if agent else None))
+    return out
+
+
+def streamed(listener: ArigListener, speaker: list[SpeakerFrame], seed: int = 1) -> np.ndarray:
+    """(T, 58): frame t is the plan made at the speaker's frame t."""
+    memory, out = listener.start(seed), []
+    for frame in speaker:
+        plan, memory = listener.step(frame, memory)
+        out.append(plan.frames[0])
+    return np.stack(out)
+
+
+def noise_of(listener: ArigListener, frames: int, seed: int = 1) -> torch.Tensor:
+    """What a stream of that seed draws: (1, frames, steps, channels)."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.stack([torch.randn(listener.model.noise_shape, generator=generator) for _ in range(frames)])[None]
+
+
+def dyad_of(listener: ArigListener, speaker: list[SpeakerFrame], agent_motion: torch.Tensor) -> Dyad:
+    """Frames 0..T of a stream of T steps; agent_motion (T, C) is what it made of frames 1..T.
+
+    The agent says nothing in frame 0; what it says at step t belongs to frame t + 1. Nothing looks at the user's last.
+    """
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+
+    def samples(track):
+        return np.concatenate([s if s is not None and len(s) else silence for s in track])
+
+    user, user_voiced = sound.track(samples([frame.audio for frame in speaker] + [None]))
+    agent, agent_voiced = sound.track(samples([frame.agent_audio for frame in speaker]))
+    faces = [frame.face.motion if frame.face else np.zeros(58, np.float32) for frame in speaker]
+    still = torch.tensor(listener.space.neutral, dtype=torch.float32)[None]
+    return Dyad(
+        user_sound=torch.from_numpy(user)[None],
+        user_heard=torch.tensor([[len(frame.audio) > 0 for frame in speaker] + [False]]),
+        agent_sound=torch.from_numpy(np.concatenate([agent[:1], agent]))[None],
+        agent_heard=torch.tensor([[False] + [frame.agent_audio is not None for frame in speaker]]),
+        user_motion=torch.from_numpy(np.stack([*faces, faces[-1]]))[None],
+        user_seen=torch.tensor([[frame.face is not None for frame in speaker] + [False]]),
+        agent_motion=torch.cat([still, agent_motion])[None],
+        voiced=torch.from_numpy(np.stack([np.r_[False, agent_voiced], user_voiced], axis=-1))[None],
+    )

@@ -1,0 +1,70 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.listeners.sfms.inpainter import Inpainter
+from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Neighbours
+from sfms_robot.listeners.sfms.quantizer import Quantizer
+
+MEMBER = torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+
+def parts(residual: bool = True, layers: int = 1) -> tuple[Quantizer, Inpainter]:
+    torch.manual_seed(0)
+    quantizer = Quantizer(MEMBER, [[5, 5], [5, 5]])
+    return quantizer, Inpainter(quantizer, 8, 2, layers, residual).eval()
+
+
+def some_mask(frames: int, seed: int = 0) -> torch.Tensor:
+    drawn = torch.Generator().manual_seed(seed)
+    return (torch.rand(2, frames, 2, generator=drawn) < 0.3).float()
+
+
+def test_an_untrained_residual_inpainter_draws_straight_lines_between_decoded_keyframes():
+    quantizer, inpainter = parts()
+    codes, mask = quantizer.encode(torch.randn(2, 20, 3)), some_mask(20)
+    mask[:, [0, -1]] = 1.0
+    found = inpainter(codes, mask, quantizer)
+    decoded = quantizer.decode(codes)
+    for channel, group in enumerate((0, 1, 0)):
+        near = Neighbours.in_mask(mask[..., group : group + 1])
+        line = near.interpolate((decoded[..., channel] * mask[..., group])[..., None, None])[..., 0, 0]
+        torch.testing.assert_close(found[..., channel], line)
+
+
+@pytest.mark.parametrize("residual", [True, False])
+@pytest.mark.parametrize("layers", [1, 3])
+def test_only_keyframes_reach_the_output(residual, layers):
+    quantizer, inpainter = parts(residual, layers)
+    torch.nn.init.normal_(inpainter.out.weight)
+    codes, mask = quantizer.encode(torch.randn(2, 20, 3)), some_mask(20)
+    noise = torch.where(mask[..., None] > 0, codes, torch.randn_like(codes))
+    assert torch.equal(inpainter(codes, mask, quantizer), inpainter(noise, mask, quantizer))
+
+
+def test_every_keyframe_and_every_mask_entry_gets_a_gradient():
+    quantizer, inpainter = parts()
+    torch.nn.init.normal_(inpainter.out.weight)
+    codes, mask = quantizer.encode(torch.randn(2, 12, 3)).detach(), some_mask(12)
+    codes.requires_grad_(), mask.requires_grad_()
+    inpainter(codes, mask, quantizer).square().sum().backward()
+    assert (codes.grad.abs().sum(-1)[mask > 0] > 0).all()
+    assert (codes.grad.abs().sum(-1)[mask == 0] == 0).all()
+    assert (mask.grad != 0).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sets(st.integers(0, 39), min_size=1))
+def test_positions_are_the_distances_to_the_neighbours_in_binary(frames):
+    mask = torch.zeros(1, 40, 1)
+    mask[0, sorted(frames)] = 1.0
+    near = Neighbours.in_mask(mask)
+    positions = near.positions()[0, :, 0]
+    powers = 2.0 ** torch.arange(POSITION_BITS)
+    for frame in range(40):
+        before = max((f for f in frames if f <= frame), default=None)
+        after = min((f for f in frames if f >= frame), default=None)
+        assert positions[frame, :POSITION_BITS] @ powers == (0 if before is None else frame - before)
+        assert positions[frame, POSITION_BITS : 2 * POSITION_BITS] @ powers == (0 if after is None else after - frame)
+        assert positions[frame, 2 * POSITION_BITS].item() == (before is not None)
