@@ -36,7 +36,7 @@ class Size:
 
 
 SIZES: Final[dict[str, Size]] = {
-    "small": Size(64, 1, 2, 32, {"steps": 1200, "batch": 16, "learning_rate": 2e-3, "score_tracks": 16}),
+    "small": Size(64, 1, 2, 32, {"steps": 1000, "batch": 16, "learning_rate": 2e-3, "score_tracks": 16}),
     "paper": Size(
         256, 4, 12, 128, {"steps": 20_000, "batch": 128, "learning_rate": 3e-4, "precision": "bf16", "score_tracks": 64}
     ),
