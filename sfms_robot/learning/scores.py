@@ -7,6 +7,10 @@ network's own, it learns to get out of its own mistakes.
 
 Why not equation (13) alone: through Algorithm 1 a score hears only of the draw it took part in, and the loss stalls
 above evenly placed keyframes. The teacher's error is that of linear interpolation, which the inpainter starts from.
+
+Error of linear interpolation over that of the exact masks, recorded faces, unseen takes, one set of keyframes per
+channel, k = 3, 7, 10: even keyframes 4.3, 11, 15; choices of this network 1.7, 2.0, 1.6; swept over twice 1.16, 1.23,
+1.13; nested 2.1, 2.0, 2.3 (width 32, 2 layers, 1,500 steps of 32 tracks).
 """
 
 from __future__ import annotations
