@@ -23,7 +23,8 @@ def run(
         "auto", help="The speaker's face: FILE.csv[.gz], 'none', or 'auto': the shipped speaker's own, else none."
     ),
     agent_audio: str = typer.Option(
-        "none", help="What the robot itself says: FILE.wav, a shipped speaker or 'none'. An ARIG listener's lips follow it."
+        "none",
+        help="What the robot itself says: FILE.wav, a shipped speaker or 'none'. An ARIG listener's lips follow it.",
     ),
     duration: float | None = typer.Option(None, min=0.04, help="Seconds; default: as long as the recording."),
     fast: bool = typer.Option(False, help="Virtual time: as fast as it goes, bit-identical for one --seed."),

@@ -2,6 +2,9 @@
 
 Frame i covers (i, i + 1) x 40 ms and carries the face at its end. A missing voice is empty audio, a missing face is
 None: both are normal. A voice shorter than the run starts again after one second of silence.
+
+What the robot itself says is told one frame early, as a program that speaks knows it: frame i carries the samples of
+frame i + 1, for which a listener plans its lips while it hears frame i. When it ends, silence follows.
 """
 
 from __future__ import annotations
@@ -34,16 +37,22 @@ class Recording:
     """
 
     def __init__(
-        self, audio: Floats | None, track: Track | None, duration_s: float | None = None, loop: bool = True
+        self,
+        audio: Floats | None,
+        track: Track | None,
+        duration_s: float | None = None,
+        loop: bool = True,
+        agent_audio: Floats | None = None,
     ) -> None:
         if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
             raise ConfigError(f"--duration = {duration_s:g}: a run lasts longer than 0 s")
         self._audio = audio
+        self._agent_audio = agent_audio
         self._faces = None if track is None else resample(track, FRAME_HZ, start_s=FRAME_S).motion
         self._loop = loop
         self._given = 0
         self._recorded = _frames_recorded(audio, self._faces)
-        recorded_s = self._recorded * FRAME_S if self._recorded else None
+        recorded_s = (self._recorded or _frames_recorded(agent_audio, None)) * FRAME_S or None
         self._duration_s = recorded_s if duration_s is None else duration_s
 
     @property
@@ -69,15 +78,17 @@ class Recording:
         face = None
         if self._faces is not None and place < len(self._faces) and np.isfinite(self._faces[place]).all():
             face = FaceFrame.of(time_s, self._faces[place])
-        return SpeakerFrame(time_s, self._samples(place), face)
+        heard = np.zeros(0, dtype=np.float32) if self._audio is None else _samples(self._audio, place)
+        says = None if self._agent_audio is None else _samples(self._agent_audio, index + 1)
+        return SpeakerFrame(time_s, heard, face, says)
 
-    def _samples(self, place: int) -> Floats:
-        if self._audio is None:
-            return np.zeros(0, dtype=np.float32)
-        out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-        part = self._audio[place * FRAME_SAMPLES : (place + 1) * FRAME_SAMPLES]
-        out[: len(part)] = part
-        return out
+
+def _samples(audio: Floats, frame: int) -> Floats:
+    """(640,) of a frame, filled up with silence."""
+    out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+    part = audio[frame * FRAME_SAMPLES : (frame + 1) * FRAME_SAMPLES]
+    out[: len(part)] = part
+    return out
 
 
 def _frames_recorded(audio: Floats | None, faces: Floats | None) -> int:
@@ -111,9 +122,13 @@ def shipped_speaker(name: str) -> Speaker:
 
 
 def open_source(
-    audio: str = "default", face: str = "auto", duration_s: float | None = None, loop: bool = True
+    audio: str = "default",
+    face: str = "auto",
+    duration_s: float | None = None,
+    loop: bool = True,
+    agent_audio: str = "none",
 ) -> Recording:
-    """What `--audio FILE|SPEAKER|none|default` and `--face FILE|none|auto` ask for.
+    """What `--audio FILE|SPEAKER|none|default`, `--face FILE|none|auto` and `--agent-audio FILE|none` ask for.
 
     `default` is `DEFAULT_SPEAKER`, or no voice when a face file is given. A face `auto` is the shipped speaker's
     own, or none beside somebody's sound file. Raises ConfigError for a kind of input that is not there and for files
@@ -123,11 +138,13 @@ def open_source(
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     voice, own_face = _voice(audio)
     seen = own_face if face == "auto" else _face(face)
+    said = _agent_voice(agent_audio)
     return Recording(
         None if voice is None else read_audio(voice),
         None if seen is None else read_track(seen),
         duration_s,
         loop,
+        None if said is None else read_audio(said),
     )
 
 
@@ -144,6 +161,19 @@ def _voice(name: str) -> tuple[Path | None, Path | None]:
     if not Path(name).exists():
         raise ConfigError(f"--audio {name}: no such file ({choices})")
     return Path(name), None
+
+
+def _agent_voice(name: str) -> Path | None:
+    choices = f"FILE.wav, none, {', '.join(speakers())}"
+    if name == "loopback":
+        raise ConfigError(f"--agent-audio {name}: not available yet ({choices})")
+    if name == "none":
+        return None
+    if name in speakers() and not Path(name).is_file():
+        return shipped_speaker(name).audio
+    if not Path(name).exists():
+        raise ConfigError(f"--agent-audio {name}: no such file ({choices})")
+    return Path(name)
 
 
 def _face(name: str) -> Path | None:

@@ -106,3 +106,34 @@ def test_files_are_opened_by_path(tmp_path):
 def test_what_cannot_be_opened_is_said_with_the_choices(audio, face, message):
     with pytest.raises(ConfigError, match=message):
         open_source(audio, face)
+
+
+def test_what_the_robot_says_is_told_one_frame_early_and_silence_follows():
+    frames = Recording(voice(5), None, duration_s=0.4, agent_audio=voice(3)).read(1.0)
+    assert [float(frame.agent_audio[0]) * 1000 for frame in frames] == pytest.approx([2, 3] + [0] * 8)
+    assert all(len(frame.agent_audio) == FRAME_SAMPLES for frame in frames)
+
+
+def test_a_robot_that_says_nothing_has_no_track():
+    assert all(frame.agent_audio is None for frame in Recording(voice(3), None).read(1.0))
+
+
+def test_the_robots_voice_does_not_start_again_with_the_persons():
+    frames = Recording(voice(5), None, duration_s=3.0, agent_audio=voice(5)).read(3.0)
+    assert frames[30].audio.any() and not any(frame.agent_audio.any() for frame in frames[5:])
+
+
+def test_a_robots_voice_alone_lasts_as_long_as_it_speaks():
+    assert Recording(None, None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
+    assert Recording(voice(3), None, agent_audio=voice(7)).duration_s == pytest.approx(0.12)
+
+
+@pytest.mark.parametrize(("name", "said"), [("gone.wav", "no such file"), ("loopback", "not available yet")])
+def test_a_robots_voice_that_is_not_there_is_named(name, said):
+    with pytest.raises(ConfigError, match=f"--agent-audio {name}: {said}"):
+        open_source("none", "none", agent_audio=name)
+
+
+def test_a_shipped_speaker_lends_the_robot_its_voice():
+    source = open_source("none", "none", agent_audio=speakers()[0])
+    assert any(frame.agent_audio.any() for frame in source.read(5.0))
