@@ -86,6 +86,16 @@ ORDERS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 
 
+# Of every order: its columns that are blendshapes, and where these stand among ours.
+_PLACES: Final[Mapping[str, tuple[list[int], list[int]]]] = {
+    order: (
+        [column for column, name in enumerate(names) if name != "_neutral"],
+        [BLENDSHAPES.index(name) for name in names if name != "_neutral"],
+    )
+    for order, names in ORDERS.items()
+}
+
+
 def reorder(values: NDArray[np.floating], order: str) -> Floats:
     """Blendshapes (..., n) in the named outside order -> (..., 52) alphabetical; missing ones are 0.
 
@@ -95,9 +105,8 @@ def reorder(values: NDArray[np.floating], order: str) -> Floats:
     if values.shape[-1] != len(names):
         raise ValueError(f"order {order!r} has {len(names)} channels, got {values.shape[-1]}")
     out = np.zeros((*values.shape[:-1], len(BLENDSHAPES)), dtype=np.float32)
-    for column, name in enumerate(names):
-        if name != "_neutral":
-            out[..., BLENDSHAPES.index(name)] = values[..., column]
+    columns, places = _PLACES[order]
+    out[..., places] = values[..., columns]
     return out
 
 

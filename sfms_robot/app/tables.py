@@ -63,7 +63,10 @@ def evaluate_table(options: TableOptions) -> dict[str, Any]:
     _train_missing(options, wanted, folder, recorded)
     loaded = {name: models.read(folder / name) for name in wanted}
     _same_scales(loaded, folder)
-    seen = Windows.of(held_out, next(iter(loaded.values())).window)
+    window = next(iter(loaded.values())).window
+    seen = Windows.of(held_out, window)
+    if options.data is not None:
+        _tell_short(held_out, window)
     with Console(stderr=True).status("scoring"), torch.inference_mode():
         tables = [build(name, loaded, seen) for name in chosen]
     if options.plots is not None:
@@ -102,6 +105,17 @@ def _same_scales(loaded: dict[str, TableModel], folder: Path) -> None:
     for name, model in loaded.items():
         if not torch.allclose(model.motion_std, first.motion_std, rtol=1e-2) or model.window != first.window:
             raise ConfigError(f"{folder}: {name} and {first_name} were trained on different motion: --train anew")
+
+
+def _tell_short(stretches: Sequence[Take], window: int) -> None:
+    """Somebody's own tracks: what is too short for a window is not left out in silence."""
+    short = [take.name for take in stretches if len(take.motion) < window]
+    if short:
+        named = ", ".join(dict.fromkeys(short))
+        log.warning(
+            "%d of %d stretches with a face are shorter than a window of %d frames and left out: %s",
+            len(short), len(stretches), window, named,
+        )  # fmt: skip
 
 
 def _report(options: TableOptions, tables: Sequence[Table], seen: Windows) -> dict[str, Any]:

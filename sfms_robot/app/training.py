@@ -17,6 +17,7 @@ from sfms_robot.config import load_training, parse_training
 from sfms_robot.errors import ConfigError
 from sfms_robot.learning import listener, tokenizer
 from sfms_robot.learning.arig.trainer import train_arig
+from sfms_robot.learning.datasets.collection import Order
 from sfms_robot.learning.job import Run
 from sfms_robot.learning.watch import Watch, progress_bar, tensorboard, together
 
@@ -25,7 +26,10 @@ DEVICES = ("auto", "cpu", "cuda")
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What the command line says. `steps` and `placement` replace the file's; `tensorboard` None: if installed."""
+    """What the command line says. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
+
+    `order` is that of the channels in the data, if not its layout's own.
+    """
 
     file: Path
     data: Path
@@ -35,6 +39,7 @@ class TrainOptions:
     steps: int | None = None
     placement: str | None = None
     tensorboard: bool | None = None
+    order: Order | None = None
 
 
 def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
@@ -44,17 +49,19 @@ def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
         raise ConfigError(f"{options.file}: listener.kind = 'arig' has no tokenizer; `train listener` is all of it")
     with run_of(options) as run:
         began_s = time.monotonic()
-        return _timed(tokenizer.train_tokenizer(settings, options.data, options.out, run), began_s)
+        return _timed(tokenizer.train_tokenizer(settings, options.data, options.out, run, options.order), began_s)
 
 
 def train_listener(options: TrainOptions) -> dict[str, Any]:
     """SFMS: phase 2, on the tokenizer in `options.out`. ARIG: all of it. Returns its figures and minutes."""
     settings = train_settings(options, "predictor")
+    if isinstance(settings, config.ArigTraining) and options.order is not None:
+        raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
     with run_of(options) as run:
         began_s = time.monotonic()
         if isinstance(settings, config.ArigTraining):
             return _timed(train_arig(settings, options.data, options.out, run), began_s)
-        return _timed(listener.train_listener(settings, options.data, options.out, run), began_s)
+        return _timed(listener.train_listener(settings, options.data, options.out, run, options.order), began_s)
 
 
 def device_of(name: str) -> torch.device:

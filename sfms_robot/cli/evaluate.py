@@ -10,7 +10,8 @@ from typing import Any
 
 import typer
 
-from sfms_robot.cli.train import interruptible
+from sfms_robot.cli.data import Order
+from sfms_robot.cli.train import ORDER, interruptible
 
 app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 
@@ -49,6 +50,7 @@ def tokenizer(
     steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the size's."),
     jobs: int = typer.Option(1, min=1, help="Tokenizers trained at once."),
     plots: Path | None = typer.Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
+    order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
@@ -57,7 +59,7 @@ def tokenizer(
 
         if data is None:
             raise typer.BadParameter("--data is needed without --table")
-        _print(evaluate_tokenizer(listener, data), json)
+        _print(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
     from sfms_robot.app.tables import TableOptions, evaluate_table
 
@@ -84,21 +86,24 @@ def listener_(
     config: Path | None = typer.Option(None, help="How ablations are trained: configs/training/arig.yaml."),
     steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
     seed: int = typer.Option(1, min=0, help="Of the sampling."),
+    order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
     from sfms_robot.app.learn import evaluate_listener, listener_table
 
     if table is None:
-        _print(evaluate_listener(listener, data, seed), json)
+        _print(evaluate_listener(listener, data, seed, order.value if order else None), json)
         return
     if table.value.startswith("arig"):
+        if order is not None:
+            raise typer.BadParameter("--order is for --table 1 and 2, or none")
         from sfms_robot.app.arig import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
         _print(interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations)), json)
         return
-    result = listener_table(int(table.value), listener, data, samples, clips, seed)
+    result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None)
     if json:
         print(json_module.dumps(result))
     else:

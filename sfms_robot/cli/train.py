@@ -11,6 +11,8 @@ from typing import Any
 
 import typer
 
+from sfms_robot.cli.data import Order
+
 INTERRUPTED = 130
 
 app = typer.Typer(help="Train a listener: first its tokenizer, then its predictor.", no_args_is_help=True)
@@ -36,6 +38,7 @@ RESUME = typer.Option(False, "--resume", help="Go on from the checkpoint in --ou
 DEVICE = typer.Option(Device.auto, help="auto: the GPU if there is one.")
 STEPS = typer.Option(None, min=1, help="Another number of steps than the file's.")
 TENSORBOARD = typer.Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
+ORDER = typer.Option(None, help="Order of the channels in the files, if not their layout's own.")
 JSON = typer.Option(False, "--json", help="Print the figures as one JSON object.")
 
 
@@ -49,13 +52,16 @@ def tokenizer(
     steps: int | None = STEPS,
     placement: Placement | None = typer.Option(None, help="Another keyframe placement than the file's, to compare."),
     tensorboard: bool | None = TENSORBOARD,
+    order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
     from sfms_robot.app.training import TrainOptions, train_tokenizer
 
     placed = placement.value if placement else None
-    options = TrainOptions(config, data, out, resume, device.value, steps, placed, tensorboard)
+    options = TrainOptions(
+        config, data, out, resume, device.value, steps, placed, tensorboard, order.value if order else None
+    )
     _print(interruptible(lambda: train_tokenizer(options)), json)
 
 
@@ -68,12 +74,15 @@ def listener(
     device: Device = DEVICE,
     steps: int | None = STEPS,
     tensorboard: bool | None = TENSORBOARD,
+    order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
     from sfms_robot.app.training import TrainOptions, train_listener
 
-    options = TrainOptions(config, data, out, resume, device.value, steps, None, tensorboard)
+    options = TrainOptions(
+        config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None
+    )
     _print(interruptible(lambda: train_listener(options)), json)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,8 +14,8 @@ import torch
 from torch import Tensor
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, Floats
-from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, Floats
+from sfms_robot.learning.datasets.clips import Dyad, at_rate
 from sfms_robot.learning.datasets.collection import usable
 from sfms_robot.listeners.sfms.hearing import Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -78,18 +79,26 @@ def gather(dyads: Sequence[Dyad], window: int, space: MotionSpace, hearing: Hear
     Raises ConfigError when none is left, or one is in a space that cannot be turned into the wanted one.
     """
     listeners, faces, sound, phase = [], [], [], []
+    short = 0
     for dyad in usable(dyads):
-        if len(dyad.listener) >= window:
+        if len(dyad.listener) < window:
+            short += 1
+        else:
             listeners.append(_in_space(dyad, dyad.listener, space))
             faces.append(_in_space(dyad, dyad.speaker, space))
             rows, place = _heard(dyad, hearing)
             sound.append(rows)
             phase.append(place)
     if not listeners:
-        raise ConfigError(f"none of {len(dyads)} dyads is as long as a window of {window} frames")
+        raise ConfigError(
+            f"none of {len(dyads)} dyads can be used: {short} are shorter than a window of {window} frames, "
+            f"{len(dyads) - short} cannot be read"
+        )
     if len(listeners) < len(dyads):
-        log.warning("%d of %d dyads are learned from: the others are under %d frames or cannot be used",
-                    len(listeners), len(dyads), window)  # fmt: skip
+        log.warning(
+            "%d of %d dyads are used: %d are shorter than a window of %d frames, %d cannot be read",
+            len(listeners), len(dyads), short, window, len(dyads) - len(listeners) - short,
+        )  # fmt: skip
     face = torch.cat(faces)
     known = face.isfinite().all(-1)
     return Corpus(
@@ -126,16 +135,23 @@ def _heard(dyad: Dyad, hearing: Hearing | None) -> tuple[Tensor, Tensor]:
     if found is None and hearing.audio == "mel" and (audio is not None or dyad.mel is not None):
         found = dyad.mel_rows()
     elif found is None and audio is not None:
-        found = hearing.rows(audio)
+        found = at_rate(hearing.rows(_whole(audio)), FRAME_HZ, frames, dyad.fps)
     phase = np.zeros((frames, hearing.phase_features), np.float32)
     if hearing.phased and audio is not None:
-        phase = phases.of_audio(audio)
+        phase = at_rate(phases.of_audio(_whole(audio)), FRAME_HZ, frames, dyad.fps)
     elif hearing.phased and dyad.mel is not None:
-        phase = phases.of_mel(dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
+        rows = dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS)
+        ours = at_rate(rows, dyad.fps, math.ceil(frames * FRAME_HZ / dyad.fps), FRAME_HZ)  # phases count our frames
+        phase = at_rate(phases.of_mel(ours), FRAME_HZ, frames, dyad.fps)
     sound = (
         torch.zeros(frames, *hearing.shape) if found is None else torch.from_numpy(found).view(frames, *hearing.shape)
     )
     return sound.half(), torch.from_numpy(phase)
+
+
+def _whole(audio: Floats) -> Floats:
+    """Samples up to a whole number of our frames, the last one ending in silence."""
+    return np.pad(audio, (0, -len(audio) % FRAME_SAMPLES))
 
 
 def fit_scales(model: SfmsModel, corpus: Corpus, channels: Sequence[str]) -> None:

@@ -14,7 +14,9 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.learning.calibrate import calibrated
 from sfms_robot.learning.corpus import Corpus, context, fit_hearing, gather, windows
-from sfms_robot.learning.datasets.formats import open_dataset
+from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.learning.datasets.collection import Dataset, Order, usable
+from sfms_robot.learning.datasets.formats import open_for
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.losses import next_tokens
@@ -40,17 +42,20 @@ def train_listener(
     data: Path,
     out: Path,
     run: Run = Run(),  # noqa: B008
+    order: Order | None = None,
 ) -> dict[str, Any]:
     """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
+
+    `order`: of the channels in the files, if not the layout's own (`open_dataset`).
 
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on; the weights
     are written when the run is finished.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
-    dyads = open_dataset(data, "train")
+    dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
     hearing = Hearing.of(listener)
     corpus = gather(dyads, listener.window_frames, space, hearing)
-    held_out = gather(open_dataset(data, "validation"), listener.window_frames, space, hearing)
+    held_out = gather(unseen, listener.window_frames, space, hearing)
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
@@ -60,11 +65,18 @@ def train_listener(
     last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
     checkpoint.save_config(out, corrected(settings))
     checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
-    some = dyads[:: max(1, len(dyads) // CALIBRATION_DYADS)][:CALIBRATION_DYADS]  # of the training set
+    some = _some(dyads, listener.window_frames)
     model.cpu()  # roll-outs go frame by frame, which no GPU makes faster
     checkpoint.save_config(out, calibrated(corrected(settings), model, some, settings.predictor))
     scores = keyframe_scores(model, held_out, listener)
     return {**asdict(outcome), "held_out_loss": last, **scores}
+
+
+def _some(dyads: Dataset, window: int) -> list[Dyad]:
+    """A few dyads of a set, spread over it, that are as long as a window; if none of those is, the first that is."""
+    chosen = [*usable(dyads[:: max(1, len(dyads) // CALIBRATION_DYADS)])][:CALIBRATION_DYADS]
+    long = [dyad for dyad in chosen if len(dyad.listener) >= window]
+    return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
 
 
 def listener_job(

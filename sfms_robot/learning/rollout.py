@@ -123,22 +123,27 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> Behaviour:
         phrase_end_ratio=timing.ratio_of([float(count) for count in counts]),
         blinks=blinks / total,
         smiles=smiles / total,
-        still_share=float(np.mean([_still(motion) for motion in motions])),
+        still_share=_still(motions),
         speed_deg_s=_differences(motions, 1),
         acceleration_deg_s2=_differences(motions, 2),
         jerk_deg_s3=_differences(motions, 3),
     )
 
 
-def _still(motion: Floats) -> float:
-    seconds = len(motion) // FRAME_HZ
-    turns = np.degrees(motion[: seconds * FRAME_HZ, ROTATIONS]).reshape(seconds, FRAME_HZ, 3)
-    return float((np.ptp(turns, axis=1).max(axis=1) < 0.1).mean())
+def _still(motions: Sequence[Floats]) -> float:
+    """Share of seconds, mean over the motions; NaN when none lasts a second."""
+    shares = []
+    for motion in motions:
+        if seconds := len(motion) // FRAME_HZ:
+            turns = np.degrees(motion[: seconds * FRAME_HZ, ROTATIONS]).reshape(seconds, FRAME_HZ, 3)
+            shares.append((np.ptp(turns, axis=1).max(axis=1) < 0.1).mean())
+    return float(np.mean(shares)) if shares else float("nan")
 
 
 def _differences(motions: Sequence[Floats], order: int) -> float:
     values = [np.linalg.norm(np.diff(motion[:, ROTATIONS].astype(float), order, axis=0), axis=1) for motion in motions]
-    return float(np.degrees(np.percentile(np.concatenate(values), 99.9)) * FRAME_HZ**order)
+    pooled = np.concatenate(values)
+    return float(np.degrees(np.percentile(pooled, 99.9)) * FRAME_HZ**order) if len(pooled) else float("nan")
 
 
 def evaluate_rollout(

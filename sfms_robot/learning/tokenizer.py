@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,8 +12,10 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
+from sfms_robot.frames import FRAME_HZ
 from sfms_robot.learning.corpus import Corpus, fit_scales, gather, windows
-from sfms_robot.learning.datasets.formats import open_dataset
+from sfms_robot.learning.datasets.collection import Order
+from sfms_robot.learning.datasets.formats import open_for
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.losses import masking, reconstruction
@@ -29,21 +32,32 @@ WEIGHTS = "tokenizer.safetensors"
 DRAWS = 2  # placements tried per window; the better one is the target of the masking loss
 CHUNK = 32  # windows placed and encoded at a time
 
+log = logging.getLogger(__name__)
+
 
 def train_tokenizer(
     settings: config.Training,
     data: Path,
     out: Path,
     run: Run = Run(),  # noqa: B008
+    order: Order | None = None,
 ) -> dict[str, Any]:
     """Train on `data`/train and write `out`/tokenizer.safetensors; its predictor is as good as new.
+
+    `order`: of the channels in the files, if not the layout's own (`open_dataset`).
 
     Returns the figures of the run and the held-out error. Ctrl-C leaves a checkpoint in `out`, from which
     `run.resume` goes on; the weights are written when the run is finished.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
-    corpus = gather(open_dataset(data, "train"), listener.window_frames, space)
-    held_out = gather(open_dataset(data, "validation"), listener.window_frames, space)
+    dyads = open_for(space.name, data, "train", order)
+    if dyads.fps != FRAME_HZ:
+        log.warning(
+            "%s has %g frames a second and is learned as it is; streamed, a listener shows %d a second",
+            data, dyads.fps, FRAME_HZ,
+        )  # fmt: skip
+    corpus = gather(dyads, listener.window_frames, space)
+    held_out = gather(open_for(space.name, data, "validation", order), listener.window_frames, space)
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     fit_scales(model, corpus, listener.channels)

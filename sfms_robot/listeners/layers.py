@@ -6,14 +6,17 @@ Shapes: B batch, T frames of the query, S frames of the memory, D width.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 
+@lru_cache(maxsize=16)
+@torch.inference_mode(False)  # what is kept has to serve training as well
 def sinusoidal(length: int, width: int) -> Tensor:
-    """Sinusoidal positions (length, width) of Vaswani et al. 2017; `width` is even."""
+    """Sinusoidal positions (length, width) of Vaswani et al. 2017, not to be changed; `width` is even."""
     position = torch.arange(length, dtype=torch.float32)[:, None]
     rate = torch.exp(torch.arange(0, width, 2, dtype=torch.float32) * (-math.log(10_000.0) / width))
     return torch.cat([torch.sin(position * rate), torch.cos(position * rate)], dim=-1)
@@ -86,10 +89,15 @@ class Block(nn.Module):
         memory: Tensor | Keys | None = None,
         seen: Tensor | None = None,
         memory_seen: Tensor | None = None,
+        last: int | None = None,
     ) -> Tensor:
-        """x (B, T, D) -> (B, T, D); `seen` masks x (B, T), `memory_seen` the memory (B, S)."""
+        """x (B, T, D) -> (B, T, D); `seen` masks x (B, T), `memory_seen` the memory (B, S).
+
+        `last`: only so many frames at the end of x are wanted (B, last, D); they look at all of it nevertheless.
+        """
         y = self.norm(x)
-        x = x + self.attention(y, y, seen)
+        wanted = slice(None if last is None else -last, None)
+        x = x[:, wanted] + self.attention(y[:, wanted], y, seen)
         if self.cross is not None and self.cross_norm is not None and memory is not None:
             x = x + self.cross(self.cross_norm(x), memory, memory_seen)
         out: Tensor = x + self.forward_part(x)

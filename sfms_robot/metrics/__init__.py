@@ -4,6 +4,7 @@ FRRea, a distance between rendered images, is out of scope: nothing here renders
 """
 
 from sfms_robot.metrics.dim import (
+    cluster_centres,
     frechet_distance,
     l2,
     paired_frechet_distance,
@@ -18,6 +19,7 @@ from sfms_robot.metrics.react import ccc, dtw, frc, frd, frdiv, frdvs, frsyn, fr
 
 __all__ = [
     "ccc",
+    "cluster_centres",
     "dtw",
     "faceverse_rotation",
     "frc",

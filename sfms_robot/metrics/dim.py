@@ -8,6 +8,7 @@ evonneng/learning2listen @ a0825d58 (definitions only). Float64 throughout.
 from __future__ import annotations
 
 import logging
+import warnings
 from typing import Final, Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from sfms_robot.frames import Doubles
 
 SID_EPS: Final = 1e-6  # inside the logarithm, as in DIM
 STS_DT: Final = 0.1
+KMEANS_ROUNDS: Final = 100  # scipy's 10 stop well before the centres do
 _log = logging.getLogger(__name__)
 
 
@@ -115,15 +117,23 @@ def shannon_index(
     another k-means differ, so numbers compare only with the same centres.
     """
     guess, truth = _clips(pred), _clips(reference)
-    frames = truth.reshape(-1, truth.shape[-1])
-    if centres is None:
-        found, _ = kmeans2(frames, k, minit="++", seed=np.random.default_rng(0))
-    else:
-        found = np.asarray(centres, dtype=np.float64)
-        if found.shape != (k, frames.shape[1]):
-            raise ValueError(f"centres are {found.shape}, not ({k}, {frames.shape[1]})")
+    found = cluster_centres(truth, k) if centres is None else np.asarray(centres, dtype=np.float64)
+    if found.shape != (k, truth.shape[-1]):
+        raise ValueError(f"centres are {found.shape}, not ({k}, {truth.shape[-1]})")
     sets = list(guess) if per_clip else [guess.reshape(-1, guess.shape[-1])]
     return float(np.mean([_entropy(vq(one, found)[0], k, unit, eps) for one in sets]))
+
+
+def cluster_centres(reference: ArrayLike, k: int) -> Doubles:
+    """(k, D) k-means of the pooled frames of clips, with a fixed seed. Raises ValueError for fewer frames than k."""
+    clips = _clips(reference)
+    frames = clips.reshape(-1, clips.shape[-1])
+    if len(frames) < k:
+        raise ValueError(f"{len(frames)} frames make no {k} clusters")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a cluster that nothing falls into counts 0 in the entropy
+        found, _ = kmeans2(frames, k, iter=KMEANS_ROUNDS, minit="++", seed=np.random.default_rng(0))
+    return np.asarray(found, np.float64)
 
 
 def _entropy(labels: ArrayLike, k: int, unit: str, eps: float) -> float:

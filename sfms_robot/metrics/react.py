@@ -16,6 +16,7 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.distance import cdist
 
 from sfms_robot.frames import Doubles
 
@@ -49,17 +50,17 @@ def _clips(x: ArrayLike, like: Doubles, name: str) -> Doubles:
 
 
 def ccc(a: ArrayLike, b: ArrayLike, eps: float = CCC_EPS) -> float:
-    """Concordance correlation of two tracks (T, D): per channel, then the mean.
+    """Concordance correlation of two tracks (..., T, D): per channel, then the mean over these and the axes before T.
 
     A channel that is constant in either track counts 0, also when both are equal: so truth against truth may be < 1.
     """
     x, y = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    if x.shape != y.shape or x.ndim != 2:
-        raise ValueError(f"two tracks (T, D) of one shape are needed, got {x.shape} and {y.shape}")
-    mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
-    covariance = ((x - mean_x) * (y - mean_y)).mean(axis=0)  # rho * s_x * s_y
-    constant = (np.ptp(x, axis=0) == 0) | (np.ptp(y, axis=0) == 0)
-    spread = x.var(axis=0) + y.var(axis=0) + (mean_x - mean_y) ** 2 + eps
+    if x.shape != y.shape or x.ndim < 2:
+        raise ValueError(f"two tracks (..., T, D) of one shape are needed, got {x.shape} and {y.shape}")
+    mean_x, mean_y = x.mean(axis=-2, keepdims=True), y.mean(axis=-2, keepdims=True)
+    covariance = ((x - mean_x) * (y - mean_y)).mean(axis=-2, keepdims=True)  # rho * s_x * s_y
+    constant = (np.ptp(x, axis=-2, keepdims=True) == 0) | (np.ptp(y, axis=-2, keepdims=True) == 0)
+    spread = x.var(axis=-2, keepdims=True) + y.var(axis=-2, keepdims=True) + (mean_x - mean_y) ** 2 + eps
     return float(np.where(constant, 0.0, 2 * covariance / spread).mean())
 
 
@@ -69,7 +70,7 @@ def dtw(a: ArrayLike, b: ArrayLike) -> float:
     Full window, steps (1, 0), (0, 1), (1, 1). Worked out along anti-diagonals, so that numpy does the inner loop.
     """
     x, y = np.atleast_2d(np.asarray(a, dtype=np.float64)), np.atleast_2d(np.asarray(b, dtype=np.float64))
-    cost = np.maximum((x**2).sum(1)[:, None] + (y**2).sum(1)[None] - 2 * x @ y.T, 0.0)
+    cost = cdist(x, y, "sqeuclidean")
     rows, columns = cost.shape
     before, last = np.full(rows + 1, np.inf), np.full(rows + 1, np.inf)  # of diagonals d - 2 and d - 1, by row + 1
     before[0] = 0.0

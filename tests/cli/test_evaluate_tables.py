@@ -24,7 +24,7 @@ def command(*arguments: object) -> int:
 
 @pytest.fixture
 def tracks(tmp_path: Path) -> Path:
-    """A folder with one plain and one gzipped face track, and a face that is lost for a while."""
+    """A folder with one plain and one gzipped face track, a face that is lost for a while, and a short track."""
     folder = tmp_path / "faces"
     (folder / "deeper").mkdir(parents=True)
     drawn = np.random.default_rng(1)
@@ -32,16 +32,19 @@ def tracks(tmp_path: Path) -> Path:
         motion = np.clip(0.3 + drawn.normal(0, 0.02, (frames, 58)).cumsum(0), 0, 1).astype(np.float32)
         motion[50:52] = np.nan
         write_track(folder / name, Track(FRAME_S * np.arange(frames), motion, frozenset(CHANNELS)))
+    short = Track(FRAME_S * np.arange(20), np.zeros((20, 58), np.float32), frozenset(CHANNELS))
+    write_track(folder / "short.csv", short)
     return folder
 
 
 @pytest.mark.slow
 def test_a_table_trains_what_is_missing_keeps_it_and_scores_any_folder(
-    tmp_path: Path, tracks: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, tracks: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     options = (*TABLE, "4", "--models", tmp_path / "m", "--data", tracks, "--json")
     assert command(*options, "--train", "--steps", 2, "--plots", tmp_path / "p") == 0
     first = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert "1 of 5 stretches with a face are shorter than a window of 48 frames and left out: short.csv" in caplog.text
     assert first["table"] == 4 and first["windows"] == 4
     assert [row["name"] for row in first["rows"]][-1] == "Sparse-FSQ-256"
     for row in first["rows"]:

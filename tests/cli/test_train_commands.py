@@ -221,6 +221,11 @@ def test_the_shipped_configuration_is_valid():
         assert config.load(config.Training, file).tokenizer.steps > 0
 
 
+def test_an_order_of_channels_where_there_is_none_to_choose(fails, arguments):
+    code, told = fails("tokenizer", *arguments(), "--order", "pose-first")
+    assert code == 2 and "--order pose-first: composed files name their channels" in told
+
+
 def test_a_gpu_that_is_not_there(fails, arguments):
     import torch
 

@@ -15,7 +15,8 @@ from sfms_robot.learning.corpus import gather
 from sfms_robot.learning.datasets import clips, formats, l2l, react
 from sfms_robot.learning.datasets.clips import WIDTHS, Dyad
 from sfms_robot.learning.datasets.collection import ClipError
-from sfms_robot.learning.datasets.formats import LAYOUTS, detect, looks_like, open_dataset, split_names
+from sfms_robot.learning.datasets.formats import LAYOUTS, detect, looks_like, open_dataset, open_for, split_names
+from sfms_robot.listeners.sfms.hearing import Hearing
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.metrics.l2l import l2l_bilateral
 from sfms_robot.signals.spaces import rest_of
@@ -178,6 +179,26 @@ def test_react_attributes_are_those_of_the_listener_under_either_name(tmp_path):
     np.testing.assert_array_equal(dataset[2].features["speaker_attributes"], novice)
 
 
+def test_a_listener_is_given_data_in_its_own_space_or_in_one_that_becomes_it(tmp_path):
+    faces, deca = write.react(tmp_path / "react"), write.l2l(tmp_path / "l2l")
+    for space, given in (("faceverse58", "faceverse58"), ("arkit58", "arkit58")):
+        dataset = open_for(space, faces, "validation")
+        assert dataset.space == dataset[0].space == given
+    assert open_for("deca56", deca, "train")[0].space == "deca56"
+    with pytest.raises(ConfigError, match="l2l is in deca56, which cannot become arkit58"):
+        open_for("arkit58", deca, "train")
+
+
+def test_a_listener_is_given_the_features_that_its_data_ship(tmp_path):
+    write.react2025(tmp_path)
+    shipped, *_ = open_for("arkit58", tmp_path, "train", features=["wav2vec2"])
+    assert shipped.space == "arkit58" and shipped.features["wav2vec2"].shape == (len(shipped.listener), 768)
+    hearing = Hearing("wav2vec2")
+    sound = gather([shipped], 48, MotionSpace("arkit58", rest_of("arkit58")), hearing).sound
+    np.testing.assert_allclose(sound[:, 0], shipped.features["wav2vec2"], rtol=1e-3, atol=1e-4)
+    assert not open_for("arkit58", tmp_path, "train", features=["mel"])[0].features
+
+
 def test_react_centred_and_arkit_spaces(tmp_path):
     write.react(tmp_path, frames=60)
     mean = np.arange(58, dtype=np.float32)
@@ -315,4 +336,4 @@ def test_a_corpus_leaves_out_what_cannot_be_used_and_says_so(tmp_path, caplog):
     np.save(file, values)
     corpus = gather(open_dataset(tmp_path, "train"), 48, MotionSpace("faceverse58", rest_of("faceverse58")))
     assert corpus.lengths == (60,)
-    assert "1 of 3 clips cannot be used" in caplog.text and "1 of 3 dyads are learned from" in caplog.text
+    assert "1 of 3 clips cannot be used" in caplog.text and "1 of 3 dyads are used" in caplog.text

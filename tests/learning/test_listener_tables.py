@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
 from sfms_robot.learning.answers import answers, heard_by
 from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.learning.datasets.collection import Clip, Dataset
 from sfms_robot.learning.rollout import roll_out, speaker_frames
 from sfms_robot.learning.tables.answers import collect, shared_space, spread
 from sfms_robot.learning.tables.listeners import TABLE_1, TABLE_2, Clips, cut, table
@@ -99,7 +101,14 @@ def test_clips_are_cut_one_behind_the_other():
 
 
 def test_some_dyads_are_spread_over_all():
-    assert spread(list(range(10)), 3) == [0, 3, 6] and spread(list(range(4)), None) == [0, 1, 2, 3]
+    one = dyad("one", 60)
+    clips = tuple(Clip(str(row), 60, row, lambda row=row: replace(one, name=str(row))) for row in range(10))
+    clips = (*clips[:3], Clip("broken", 60, 3, lambda: open("gone")), *clips[4:])
+    whole = Dataset("composed", "train", "arkit58", 25.0, clips)
+    assert [each.name for each in spread(whole, 4)] == ["0", "2", "5", "7"]
+    assert [each.name for each in spread(whole, None)] == [*"012456789"], "what cannot be read is left out"
+    with pytest.raises(ConfigError, match="none of 1 clips can be read"):
+        spread(whole[3:4], None)
 
 
 def test_listeners_of_several_spaces_have_no_common_table():

@@ -166,7 +166,7 @@ def test_windows_never_cross_from_one_dyad_into_the_next():
 
 
 def test_only_short_dyads_are_refused():
-    with pytest.raises(ConfigError, match="none of 1 dyads is as long as a window of 48"):
+    with pytest.raises(ConfigError, match="none of 1 dyads can be used: 1 are shorter than a window of 48"):
         gather([dyad("short", 40)], 48, ARKIT)
 
 

@@ -63,6 +63,31 @@ def test_shannon_index_of_even_use_is_log_k_and_of_one_cluster_nothing():
     assert metrics.shannon_index(even, even, 8) == pytest.approx(np.log(8), abs=0.4)  # own k-means
 
 
+def test_shannon_index_counts_nearest_centres_pooled_or_clip_by_clip():
+    reference, pred = RNG.normal(size=(4, 50, 3)), RNG.normal(size=(4, 50, 3))
+    centres = metrics.cluster_centres(reference, 6)
+
+    def entropy(frames):
+        nearest = [int(np.argmin([np.linalg.norm(frame - centre) for centre in centres])) for frame in frames]
+        shares = [nearest.count(label) / len(nearest) for label in set(nearest)]
+        return -sum(share * np.log2(share + 1e-6) for share in shares)
+
+    assert metrics.shannon_index(pred, reference, 6, unit="bits") == pytest.approx(entropy(pred.reshape(-1, 3)))
+    each = metrics.shannon_index(pred, reference, 6, unit="bits", centres=centres, per_clip=True)
+    assert each == pytest.approx(np.mean([entropy(clip) for clip in pred]))
+    with pytest.raises(ValueError, match="200 frames make no 201 clusters"):
+        metrics.cluster_centres(reference, 201)
+
+
+def test_centres_are_the_means_of_what_is_nearest_to_them():
+    frames = RNG.normal(size=(2, 400, 2))
+    centres = metrics.cluster_centres(frames, 5)
+    pooled = frames.reshape(-1, 2)
+    nearest = np.linalg.norm(pooled[:, None] - centres, axis=2).argmin(axis=1)
+    means = np.stack([pooled[nearest == label].mean(axis=0) for label in range(5)])
+    np.testing.assert_allclose(centres, means, atol=0.02)
+
+
 def test_rpcc():
     speaker = RNG.normal(size=(3, 200, 2))
     target, pred = 2 * speaker, RNG.normal(size=(3, 200, 2))
@@ -92,6 +117,23 @@ def test_the_bilateral_filter_is_the_five_tap_kernel_on_small_values():
     expected = sum(w * padded[:, i : i + 50] for i, w in enumerate(kernel))
     np.testing.assert_allclose(metrics.l2l_bilateral(x), expected, atol=2e-3)
     np.testing.assert_allclose(metrics.l2l_bilateral(np.full((3, 7, 1), 4.0)), 4.0)
+
+
+def test_the_bilateral_filter_equals_the_loop_over_a_circle_of_pixels():
+    x = 30 * RNG.normal(size=(2, 9, 3))
+    expected = np.zeros_like(x)
+    for clip, frame, channel in np.ndindex(x.shape):
+        total = weights = 0.0
+        for down in range(-2, 3):
+            for across in range(-2, 3):  # an image one pixel wide: reflection finds the same column
+                if down**2 + across**2 > 4:
+                    continue
+                at = abs(frame + down)
+                value = x[clip, min(at, 2 * 8 - at), channel]
+                far = (down**2 + across**2 + (value - x[clip, frame, channel]) ** 2) / (2 * 20.0**2)
+                total, weights = total + np.exp(-far) * value, weights + np.exp(-far)
+        expected[clip, frame, channel] = total / weights
+    np.testing.assert_allclose(metrics.l2l_bilateral(x), expected, rtol=1e-10)
 
 
 def test_faceverse_rotation_is_zyx_and_a_rotation():

@@ -45,6 +45,36 @@ def test_ccc_equals_its_definition_and_counts_constant_channels_as_zero():
     assert metrics.ccc(x, x) == pytest.approx(4 / 5, abs=1e-6)
 
 
+def test_ccc_of_many_tracks_is_the_mean_of_theirs():
+    x, y = RNG.normal(size=(2, 3, 40, 5)), RNG.normal(size=(2, 3, 40, 5))
+    each = [metrics.ccc(a, b) for a, b in zip(x.reshape(6, 40, 5), y.reshape(6, 40, 5), strict=True)]
+    assert metrics.ccc(x, y) == pytest.approx(np.mean(each), rel=1e-12)
+
+
+@pytest.mark.parametrize("nan_policy", ["reference", "skip"])
+@pytest.mark.parametrize("samples", ["first", "all"])
+def test_frsyn_equals_the_loop_over_lags(nan_policy, samples):
+    pred, speaker = RNG.normal(size=(2, 3, 70, 4)).cumsum(axis=2), RNG.normal(size=(2, 70, 4)).cumsum(axis=1)
+    pred[1, :, :, 2] = 0.25
+    offsets = []
+    for clip, person in zip(pred[:, :1] if samples == "first" else pred, speaker, strict=True):
+        for sample in clip:
+            means = []
+            for lag in range(-49, 50):
+                late, early = (sample[lag:], person[: 70 - lag]) if lag >= 0 else (sample[:lag], person[-lag:])
+                of = [
+                    np.corrcoef(a, b)[0, 1] if np.ptp(a) > 0 else np.nan for a, b in zip(late.T, early.T, strict=True)
+                ]
+                means.append(np.mean(of) if nan_policy == "reference" else np.nanmean(of))
+            offsets.append(abs(49 - int(np.argmax(means))))
+    assert metrics.frsyn(pred, speaker, nan_policy, samples) == pytest.approx(np.mean(offsets))
+
+
+def test_dtw_of_a_track_with_itself_is_exactly_zero_wherever_it_lies():
+    x = np.pi + 1e-3 * RNG.normal(size=(40, 3))
+    assert metrics.dtw(x, x) == 0.0
+
+
 def test_frc_and_frd_take_the_best_appropriate_truth_and_sum_over_samples():
     pred, target = RNG.random((3, 2, 12, 25)), RNG.random((3, 12, 25))
     matrix = np.array([[1, 1, 0], [0, 1, 0], [1, 0, 1]])

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ UNREADABLE: Final = (
     tokenize.TokenError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 _FEATURE: Final = "feature."  # key prefix on disk
+_Number = TypeVar("_Number", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -97,12 +98,19 @@ class Dyad:
             return self.mel
         rows, _ = log_mel.log_mel(self.audio, log_mel.start())
         wanted = log_mel.ROWS_PER_FRAME * len(self.listener)
-        if self.fps == FRAME_HZ:
-            return rows
-        ratio = AUDIO_HZ / log_mel.HOP / (log_mel.ROWS_PER_FRAME * self.fps)
-        newest = np.floor((np.arange(wanted) + 1) * ratio + 1e-6).astype(int) - 1
-        chosen: Floats = rows[newest.clip(0, len(rows) - 1)]
-        return chosen
+        return at_rate(rows, AUDIO_HZ / log_mel.HOP, wanted, log_mel.ROWS_PER_FRAME * self.fps)
+
+
+def at_rate(rows: NDArray[_Number], rate_hz: float, wanted: int, wanted_hz: float) -> NDArray[_Number]:
+    """Rows (M, ...) at one rate -> (wanted, ...) at another: of each time the newest that is complete by then.
+
+    Nothing is complete by the first few times where they come sooner than the first row: that one stands there.
+    """
+    if rate_hz == wanted_hz:
+        return rows[:wanted]
+    newest = np.floor((np.arange(wanted) + 1) * rate_hz / wanted_hz + 1e-6).astype(int) - 1
+    chosen: NDArray[_Number] = rows[newest.clip(0, len(rows) - 1)]
+    return chosen
 
 
 def samples_of(frames: int, fps: float) -> int:

@@ -96,6 +96,20 @@ def open_dataset(
     return _in_space(dataset, place, space or dataset.space)
 
 
+def open_for(space: str, folder: Path, split: str, order: Order | None = None, features: Iterable[str] = ()) -> Dataset:
+    """`open_dataset` for a listener that works in `space`: the data in that space, or in ours, which becomes any.
+
+    Every dyad carries those of `features` that its data ship; what they do not is made from the sound.
+    """
+    dataset = open_dataset(folder, split, order=order)
+    dataset = replace(dataset, features=tuple(name for name in features if name in dataset.clips[0].features))
+    if dataset.space in (space, "arkit58"):
+        return dataset
+    if dataset.space != "faceverse58":
+        raise ConfigError(f"{folder}: {dataset.layout} is in {dataset.space}, which cannot become {space}")
+    return dataset.map(_as_arkit, "arkit58")
+
+
 def scan_split(layout: Layout, place: Path, split: str, order: Order | None = None) -> Dataset:
     """One split as it is, empty or in the wrong order: for `data check`."""
     return _split(layout, place, split, _checked(order, layout))

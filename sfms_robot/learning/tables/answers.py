@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import torch
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import FRAME_HZ, Doubles
 from sfms_robot.learning.answers import answers, heard_by
 from sfms_robot.learning.corpus import gather
 from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.learning.datasets.collection import Dataset, usable
 from sfms_robot.learning.rollout import roll_out_many, speaker_frames
 from sfms_robot.learning.tables.listeners import FRAMES, NEEDED_FRAMES, Clips, cut
 from sfms_robot.listeners.sfms.stream import SfmsListener
@@ -33,10 +35,17 @@ def shared_space(listeners: Mapping[str, Listener]) -> MotionSpace:
     return next(iter(spaces.values()))
 
 
-def spread(dyads: Sequence[Dyad], most: int | None) -> list[Dyad]:
-    """At most that many, evenly from first to last."""
+def spread(dyads: Dataset, most: int | None) -> list[Dyad]:
+    """At most that many, evenly from first to last; those that cannot be read are left out, named in a warning.
+
+    Raises ConfigError when none can be read.
+    """
     step = 1.0 if most is None else max(1.0, len(dyads) / most)
-    return [dyads[int(at)] for at in np.arange(0, len(dyads), step)]
+    chosen = replace(dyads, clips=tuple(dyads.clips[int(at)] for at in np.arange(0, len(dyads), step)))
+    found = list(usable(chosen))
+    if not found:
+        raise ConfigError(f"{dyads.layout} {dyads.split}: none of {len(chosen)} clips can be read")
+    return found
 
 
 def collect(
@@ -81,6 +90,10 @@ def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequenc
     if dyad.space != "arkit58":
         raise ConfigError(
             f"dyad {dyad.name} is in {dyad.space}: a listener of another kind than sfms takes faces alone"
+        )
+    if dyad.fps != FRAME_HZ:
+        raise ConfigError(
+            f"dyad {dyad.name} has {dyad.fps:g} frames a second: such a listener is streamed at {FRAME_HZ}"
         )
     shown = roll_out_many(listener, speaker_frames(dyad), seeds)
     return np.stack([space.encode(one) for one in shown])

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from sfms_robot import metrics
 from sfms_robot.errors import ConfigError
@@ -118,11 +117,12 @@ def _table_1(clips: Clips) -> Callable[[Doubles], dict[str, Any]]:
     """Every metric is the mean over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
     scaled = _scale(clips)
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
+    most = max(CLUSTERS.values())
+    if (frames := truth.shape[0] * truth.shape[1]) < most:
+        raise ConfigError(f"table 1 needs {most} frames for the clusters of SI, the clips have {frames} in all")
     centres = {
-        part: kmeans2(truth[..., where].reshape(-1, truth[..., where].shape[-1]), CLUSTERS[part], minit="++",
-                      seed=np.random.default_rng(0))[0]
-        for part, where in PARTS[clips.space].items()
-    }  # fmt: skip
+        part: metrics.cluster_centres(truth[..., where], CLUSTERS[part]) for part, where in PARTS[clips.space].items()
+    }
 
     def score(pred: Doubles) -> dict[str, Any]:
         row: dict[str, Any] = {}

@@ -29,8 +29,9 @@ def draw(
     groups = list(settings.groups.values())
     bias = torch.tensor([group.transition_bias for group in groups])
     nucleus = torch.tensor([group.nucleus or settings.sampling.nucleus for group in groups])
-    slots = predictor(seen)  # (B, H, W)
-    trail = Trail(*(part[:, -1] for part in trails(tokens[:, :first])))
+    past = trails(tokens)
+    slots = predictor(seen, past)  # (B, H, W)
+    trail = Trail(*(part[:, first - 1] for part in past))
     left = tokens.shape[1] - first
     chances = torch.stack([torch.rand(left, len(groups), generator=one) for one in generators], dim=1)
     for frame, chance in enumerate(chances, first):

@@ -38,8 +38,11 @@ class Inpainter(nn.Module):
             nn.init.zeros_(self.out.weight)
             nn.init.zeros_(self.out.bias)
 
-    def forward(self, codes: Tensor, mask: Tensor, quantizer: Quantizer) -> Tensor:
-        """codes (B, T, G, D), read where mask (B, T, G) is 1 -> motion (B, T, C), standardised."""
+    def forward(self, codes: Tensor, mask: Tensor, quantizer: Quantizer, last: int | None = None) -> Tensor:
+        """codes (B, T, G, D), read where mask (B, T, G) is 1 -> motion (B, T, C), standardised.
+
+        `last`: only so many frames at the end are wanted, (B, last, C).
+        """
         neighbours = Neighbours.in_mask(mask)
         places = sinusoidal(mask.shape[1], self.width).to(codes)
         # Multiplying by the mask is where learned placement gets its gradient: forward it changes nothing.
@@ -47,20 +50,28 @@ class Inpainter(nn.Module):
         z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places
         seen = (mask > 0.5).any(-1)
         seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
+        # Other frames are neither looked at nor kept; but a gradient, which learned placement needs, passes there.
+        keys = slice(None) if torch.is_grad_enabled() else seen.any(0).nonzero()[:, 0]
+        seen, z_keys = seen[:, keys], z_kf[:, keys]
         for block in self.keyframe_encoder:
-            z_kf = block(z_kf, seen=seen)
+            z_keys = block(z_keys, seen=seen)
+        z_kf = torch.zeros_like(z_kf)
+        z_kf[:, keys] = z_keys * mask[:, keys].amax(-1, keepdim=True)
         between = neighbours.interpolate(keyed)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
         z_tf = self.transition_in(query) + places
         for block in self.transition_encoder:
-            z_tf = block(z_tf, memory=z_kf, memory_seen=seen)
-        joined = self.join(torch.cat([z_kf * mask.amax(-1, keepdim=True), z_tf], dim=-1))
-        for block in self.decoder:
+            z_tf = block(z_tf, memory=z_keys, memory_seen=seen)
+        joined = self.join(torch.cat([z_kf, z_tf], dim=-1))
+        *inner, outer = self.decoder
+        for block in inner:
             joined = block(joined)
-        out: Tensor = self.out(self.norm(joined))
-        return out + self._straight(keyed, neighbours, quantizer) if self.residual else out
+        out: Tensor = self.out(self.norm(outer(joined, last=last)))
+        if not self.residual:
+            return out
+        return out + self._straight(keyed, neighbours if last is None else neighbours.last(last), quantizer)
 
     @staticmethod
     def _straight(codes: Tensor, neighbours: Neighbours, quantizer: Quantizer) -> Tensor:
         """Lines between the decoded keyframes (B, T, C), each channel between those of its own group."""
-        return neighbours.of(quantizer.owner).interpolate(quantizer.decode(codes)[..., None])[..., 0]
+        return quantizer.by_channel(neighbours.interpolate(quantizer.decoder(codes)))

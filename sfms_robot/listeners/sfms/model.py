@@ -70,14 +70,14 @@ class Tokenizer(nn.Module):
         indices = self.quantizer.indices(self.quantizer.encode(motion))
         return torch.where(mask > 0.5, indices + 1, 0)
 
-    def decode(self, tokens: Tensor) -> Tensor:
-        """Motion (B, T, C) of tokens (B, T, G); a token below 0 counts as transition."""
+    def decode(self, tokens: Tensor, last: int | None = None) -> Tensor:
+        """Motion (B, T, C) of tokens (B, T, G), or of the `last` frames alone; a token below 0 counts as transition."""
         codes = self.quantizer.codes((tokens - 1).clamp(min=0))
-        return self.inpaint(codes, (tokens > 0).float())
+        return self.inpaint(codes, (tokens > 0).float(), last)
 
-    def inpaint(self, codes: Tensor, mask: Tensor) -> Tensor:
-        """Motion (B, T, C) of codes (B, T, G, D) at a mask (B, T, G)."""
-        out: Tensor = self.inpainter(codes, mask, self.quantizer)
+    def inpaint(self, codes: Tensor, mask: Tensor, last: int | None = None) -> Tensor:
+        """Motion (B, T, C) of codes (B, T, G, D) at a mask (B, T, G), or of the `last` frames alone."""
+        out: Tensor = self.inpainter(codes, mask, self.quantizer, last)
         return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -17,10 +18,12 @@ class Neighbours:
     Ahead of the first and behind the last keyframe the nearest one is held.
 
     Attributes:
+        frame: (T, 1) number of each frame.
         before, after: (B, T, G) frames of the two.
         has_before, has_after: (B, T, G) bool.
     """
 
+    frame: Tensor
     before: Tensor
     after: Tensor
     has_before: Tensor
@@ -30,42 +33,42 @@ class Neighbours:
     def in_mask(cls, mask: Tensor) -> Neighbours:
         """From a mask (B, T, G)."""
         t = mask.shape[1]
-        frame = _frames(mask)
+        frame = torch.arange(t, device=mask.device)[:, None]
         key = mask > 0.5
         before = torch.where(key, frame, -1).cummax(1).values
         after = torch.where(key, frame, t).flip(1).cummin(1).values.flip(1)
         has_before, has_after = before >= 0, after < t
         return cls(
+            frame,
             torch.where(has_before, before, after).clamp(0, t - 1),
             torch.where(has_after, after, before).clamp(0, t - 1),
             has_before,
             has_after,
         )
 
-    def of(self, group: Tensor) -> Neighbours:
-        """The neighbours of `group` (C,), one group per channel: (B, T, C)."""
-        return Neighbours(
-            self.before[..., group], self.after[..., group], self.has_before[..., group], self.has_after[..., group]
-        )
+    def last(self, frames: int) -> Neighbours:
+        """Of so many frames at the end alone."""
+        rest = (part[:, -frames:] for part in (self.before, self.after, self.has_before, self.has_after))
+        return Neighbours(self.frame[-frames:], *rest)
 
     @property
     def since(self) -> Tensor:
         """(B, T, G) frames since the keyframe before."""
-        return (_frames(self.before) - self.before).clamp(min=0)
+        return (self.frame - self.before).clamp(min=0)
 
     @property
     def until(self) -> Tensor:
         """(B, T, G) frames until the keyframe after."""
-        return (self.after - _frames(self.after)).clamp(min=0)
+        return (self.after - self.frame).clamp(min=0)
 
-    @property
+    @cached_property
     def weight(self) -> Tensor:
         """(B, T, G): 0 at the keyframe before, 1 at the one after."""
         span = (self.after - self.before).clamp(min=1)
-        return ((_frames(self.before) - self.before) / span).clamp(0.0, 1.0)
+        return ((self.frame - self.before) / span).clamp(0.0, 1.0)
 
     def interpolate(self, values: Tensor) -> Tensor:
-        """(B, T, G, D) at keyframes -> (B, T, G, D) on the straight lines between them."""
+        """(B, S, G, D) at keyframes -> (B, T, G, D) on the straight lines between them, T the frames in here."""
         index = [i[..., None].expand(-1, -1, -1, values.shape[-1]) for i in (self.before, self.after)]
         first, second = (values.gather(1, i) for i in index)
         return first + (second - first) * self.weight[..., None]
@@ -73,10 +76,6 @@ class Neighbours:
     def positions(self) -> Tensor:
         """Binary sliding positions (B, T, G, 2 * bits + 3): T^tf of equation (10)."""
         powers = 2 ** torch.arange(POSITION_BITS, device=self.before.device)
-        bits = [(d[..., None] // powers % 2).float() for d in (self.since, self.until)]
-        ends = torch.stack([self.has_before.float(), self.has_after.float(), self.weight], dim=-1)
-        return torch.cat([*bits, ends], dim=-1)
-
-
-def _frames(like: Tensor) -> Tensor:
-    return torch.arange(like.shape[1], device=like.device)[None, :, None].expand(like.shape)
+        bits = (torch.stack([self.since, self.until], dim=-1)[..., None] & powers) > 0
+        ends = torch.stack([self.has_before, self.has_after, self.weight], dim=-1)
+        return torch.cat([bits.flatten(-2), ends], dim=-1)

@@ -55,8 +55,9 @@ class Trail(NamedTuple):
 
     def then(self, drawn: Tensor, frame: int) -> Trail:
         """After the tokens (..., G) `drawn` for `frame`."""
-        key = (drawn > 0)[..., None]
-        newer = torch.stack([drawn, self.tokens[..., 0]], dim=-1)
+        drawn = drawn[..., None]
+        key = drawn > 0
+        newer = torch.cat([drawn, self.tokens[..., :1]], dim=-1)
         newer_at = torch.nn.functional.pad(self.at[..., :1], (1, 0), value=frame)
         return Trail(torch.where(key, newer, self.tokens), torch.where(key, newer_at, self.at))
 
@@ -120,10 +121,13 @@ class Predictor(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.classify = nn.Linear(width, int(classes.sum()))
 
-    def forward(self, context: Context) -> Tensor:
-        """What is known about every future frame without knowing those before it: (B', H, W)."""
+    def forward(self, context: Context, trail: Trail | None = None) -> Tensor:
+        """What is known about every future frame without knowing those before it: (B', H, W).
+
+        `trail`: what `trails` finds in the context's tokens, for those who need it themselves.
+        """
         speaker = self.speaker(context.face, context.face_known, context.voice, context.heard, context.phase)
-        own = self._own(context.tokens)
+        own = self._own(context.tokens, trails(context.tokens) if trail is None else trail)
         speaker = speaker + self.role[:2].repeat_interleave(context.heard.shape[1], dim=0)
         memory = torch.cat([speaker.expand(len(own), -1, -1), own + self.role[2]], dim=1)  # (B', 2P + P + H, W)
         x = self.slots + own[:, -self.future :]
@@ -134,9 +138,9 @@ class Predictor(nn.Module):
             x = block(x, memory=memory)
         return x
 
-    def _own(self, tokens: Tensor) -> Tensor:
-        """Tokens (B, P + H, G) -> (B, P + H, W)."""
-        features = torch.cat([self.describe(trails(tokens), _frames(tokens)), (tokens > 0).float()], dim=-1)
+    def _own(self, tokens: Tensor, trail: Trail) -> Tensor:
+        """Tokens (B, P + H, G) and their trail -> (B, P + H, W)."""
+        features = torch.cat([self.describe(trail, _frames(tokens)), (tokens > 0).float()], dim=-1)
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
         x = x + sinusoidal(x.shape[1], x.shape[2]).to(x)
         for block in self.own:

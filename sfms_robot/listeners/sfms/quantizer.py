@@ -54,10 +54,15 @@ class Grid(nn.Module):
     """The fixed codebook of finite scalar quantization: nothing to learn."""
 
     levels: Tensor
+    table: Tensor
+    group: Tensor
 
     def __init__(self, levels: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.register_buffer("levels", as_levels(levels), persistent=False)
+        every = torch.arange(max(map(math.prod, levels)))[:, None].expand(-1, len(levels))
+        self.register_buffer("table", indices_to_codes(every, self.levels), persistent=False)  # (V, G, D)
+        self.register_buffer("group", torch.arange(len(levels)), persistent=False)
         self.dims = len(levels[0])
 
     def nearest(self, latent: Tensor) -> Tensor:
@@ -70,7 +75,7 @@ class Grid(nn.Module):
 
     def codes(self, indices: Tensor) -> Tensor:
         """(..., G) -> (..., G, D)."""
-        return indices_to_codes(indices, self.levels)
+        return self.table[indices, self.group]
 
     def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
         """The stop-gradient terms of equation (13): a grid cannot move, and rounding is never far."""
@@ -208,8 +213,11 @@ class Quantizer(nn.Module):
 
     def decode(self, codes: Tensor) -> Tensor:
         """(B, T, G, D) -> (B, T, C): each channel from its own group's code."""
-        out: Tensor = self.decoder(codes)[..., self.owner, self.slot]
-        return out
+        return self.by_channel(self.decoder(codes))
+
+    def by_channel(self, slots: Tensor) -> Tensor:
+        """What `decoder` makes, (..., G, slots of a group), in the order of channels (..., C)."""
+        return slots[..., self.owner, self.slot]
 
     def indices(self, codes: Tensor) -> Tensor:
         """Codes (..., G, D) -> (..., G) from 0."""

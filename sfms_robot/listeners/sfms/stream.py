@@ -169,7 +169,7 @@ class SfmsListener:
     def plan(self, seen: Context, path: Tensor, generators: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
         """New plans of B streams: tokens (B, P + H, G), path (B, 2 + H, C). `path` is the old one, as played so far."""
         tokens = draw(self.model, self.settings, self.reach, seen, generators)
-        decoded = self.model.tokenizer.decode(tokens)[:, -self.horizon - 2 :]
+        decoded = self.model.tokenizer.decode(tokens, last=self.horizon + 2)
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
     def _hear(self, speaker: SpeakerFrame, before: Heard) -> Heard:

@@ -43,6 +43,29 @@ def test_only_keyframes_reach_the_output(residual, layers):
     assert torch.equal(inpainter(codes, mask, quantizer), inpainter(noise, mask, quantizer))
 
 
+@pytest.mark.parametrize("residual", [True, False])
+@pytest.mark.parametrize("layers", [1, 3])
+@pytest.mark.parametrize("last", [1, 5, 20])
+def test_the_last_frames_alone_are_those_of_the_whole_window(residual, layers, last):
+    quantizer, inpainter = parts(residual, layers)
+    torch.nn.init.normal_(inpainter.out.weight)
+    codes, mask = quantizer.encode(torch.randn(2, 20, 3)), some_mask(20)
+    whole = inpainter(codes, mask, quantizer)
+    torch.testing.assert_close(inpainter(codes, mask, quantizer, last), whole[:, -last:])
+
+
+@pytest.mark.parametrize("keyframes", [[], [3], [0, 7, 19]])
+def test_without_a_gradient_frames_that_are_no_keyframes_are_left_out_and_nothing_changes(keyframes):
+    quantizer, inpainter = parts(layers=2)
+    torch.nn.init.normal_(inpainter.out.weight)
+    codes, mask = quantizer.encode(torch.randn(2, 20, 3)), torch.zeros(2, 20, 2)
+    mask[0, keyframes, 0] = 1.0
+    mask[1, keyframes[1:], 1] = 1.0
+    whole = inpainter(codes, mask, quantizer)
+    with torch.no_grad():
+        torch.testing.assert_close(inpainter(codes, mask, quantizer), whole)
+
+
 def test_every_keyframe_and_every_mask_entry_gets_a_gradient():
     quantizer, inpainter = parts()
     torch.nn.init.normal_(inpainter.out.weight)
