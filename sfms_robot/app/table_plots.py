@@ -68,8 +68,8 @@ def _error_bits(table: Table) -> Figure:
         bits, errors = np.array([row.bits for row in rows]), np.array([row.score.mse for row in rows])
         axes.plot(bits, errors, "o", color=color, markersize=4, alpha=0.6, markeredgewidth=0)
         axes.step(bits, np.minimum.accumulate(errors), where="post", color=color, linewidth=1.6, label=label)
-        for row in rows:
-            if family == "sparse":
+        for row, least in zip(rows, np.minimum.accumulate(errors), strict=True):
+            if family == "sparse" and row.score.mse == least:
                 _name(axes, row)
     axes.axvline(GOAL_FROM_BITS, color=FAINT, linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
