@@ -59,6 +59,9 @@ class PlanFeed(Protocol):
     def step_times_ms(self) -> Sequence[float]:
         """Duration of every listener step so far; empty in virtual time."""
 
+    def unheard(self) -> int:
+        """Frames left out so far because the listener could not keep up."""
+
     def close(self) -> None: ...
 
 

@@ -32,7 +32,8 @@ def check_data(folder: Path, layout: str = "auto", order: Order | None = None, w
     Raises ConfigError where there is no data set at all.
     """
     found, place = formats.detect(folder, layout)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         splits = [_split(found, place, name, order, window, progress) for name in formats.split_names(found, place)]
     swapped = any(problem["kind"] == "swapped order" for split in splits for problem in split["problems"])
     return {

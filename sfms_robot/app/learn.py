@@ -28,6 +28,8 @@ def _stderr() -> Console:
 
 def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str, Any]:
     """Compose into out/train and out/validation. Returns the minutes written per split."""
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
     with _stderr().status(f"composing {minutes:g} minutes of dyads"):
         return dict(composed.compose_folder(data, out, seed, minutes))
 

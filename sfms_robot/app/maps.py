@@ -52,7 +52,14 @@ def _row(each: FirmwareMap) -> dict[str, Any]:
 
 
 def _expand(more: Iterable[Path]) -> list[Path]:
-    return [file for path in more for file in (sorted(path.glob("**/*.yaml")) if path.is_dir() else [path])]
+    """Files, and those in folders. Raises ConfigError for a folder without any: nothing looked at is not sound."""
+    files = []
+    for path in more:
+        found = sorted(path.glob("**/*.yaml")) if path.is_dir() else [path]
+        if not found:
+            raise ConfigError(f"{path}: holds no firmware map (*.yaml)")
+        files += found
+    return files
 
 
 def _load(files: Sequence[Path]) -> tuple[Loaded, list[Finding]]:

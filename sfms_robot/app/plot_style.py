@@ -1,4 +1,4 @@
-"""How the pictures of the tables look, and how they reach a file."""
+"""How the pictures of the tables look, and how pictures reach a file."""
 
 from __future__ import annotations
 
@@ -19,6 +19,17 @@ KINDS: Final = {
     "grouped": (SERIES[1], "grouped, codes every 8 frames"),
 }
 _DPI: Final = 110
+
+
+def checked_png(png: Path, option: str) -> Path:
+    """The file, before anybody has worked for it. Raises ConfigError where no PNG can be written there."""
+    if png.suffix.lower() != ".png":
+        raise ConfigError(f"{option} {png}: is no name of a picture (FILE.png)")
+    if png.is_dir():
+        raise ConfigError(f"{option} {png}: cannot be written: is a folder")
+    if not png.parent.is_dir():
+        raise ConfigError(f"{option} {png}: cannot be written: no folder {png.parent}")
+    return png
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

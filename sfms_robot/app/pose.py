@@ -174,6 +174,9 @@ class Nobody:
     def step_times_ms(self) -> Sequence[float]:
         return ()
 
+    def unheard(self) -> int:
+        return 0
+
     def close(self) -> None:
         """Nothing is open."""
 

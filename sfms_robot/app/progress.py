@@ -16,9 +16,10 @@ class RunProgress:
     """ports.Observer that moves a rich progress bar on stderr."""
 
     def __init__(self, duration_s: float | None) -> None:
+        console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("listening"), BarColumn(), TextColumn("{task.completed:.0f} s  {task.description}"),
-            console=Console(stderr=True), transient=True, refresh_per_second=4,
+            console=console, transient=True, refresh_per_second=4, disable=not console.is_terminal,
         )  # fmt: skip
         self._task = self._bar.add_task("", total=duration_s)
         self._ticks = 0

@@ -52,6 +52,6 @@ def run_report(
             "blinks": len(find_blinks(listened[1], rate_hz)),
             "smiles": len(find_smiles(listened[2], rate_hz)),
         },
-        "plans": {"refused": log.refused_plans},
+        "plans": {"refused": log.refused_plans, "unheard_frames": feed.unheard()},
         "priority": priority,
     }

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
+from sfms_robot.cli.screen import screen
 from sfms_robot.cli.tables import print_rows
 
 
@@ -23,4 +23,4 @@ def print_interaction(result: Mapping[str, Any]) -> None:
         total = sum(row)
         shares = (f"{100 * count / total:.0f}" if total else "-" for count in row)
         table.add_row(name.replace("_", " "), *shares, str(total))
-    Console().print(table)
+    screen().print(table)

@@ -30,6 +30,9 @@ def compose(
     figures = compose_dyads(data, out, minutes, seed)
     if json:
         print(json_module.dumps(figures))
+    else:
+        for key, value in figures.items():
+            print(f"{key}: {value}")
 
 
 @app.command()

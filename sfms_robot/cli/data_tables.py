@@ -8,12 +8,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from sfms_robot.cli.screen import screen
+
 _SHOWN = 3  # names of a problem; --json has them all
 
 
 def print_check(report: Mapping[str, Any], channels: bool) -> None:
     """Splits, what is wrong with them, and on request the range of every channel."""
-    console = Console()
+    console = screen()
     order = f", {report['order']}" if report["order"] else ""
     first = report["splits"][0]
     table = Table(title=f"{report['layout']}{order}: {first['space']} at {first['fps']:g} fps")

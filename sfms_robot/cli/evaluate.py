@@ -11,6 +11,7 @@ from typing import Any
 import typer
 
 from sfms_robot.cli.data import Order
+from sfms_robot.cli.run import MAX_SEED
 from sfms_robot.cli.train import ORDER, interruptible
 
 app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
@@ -85,7 +86,7 @@ def listener_(
     models: Path | None = typer.Option(None, help="Folder of the ablations' listeners; those missing are trained."),
     config: Path | None = typer.Option(None, help="How ablations are trained: configs/training/arig.yaml."),
     steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
-    seed: int = typer.Option(1, min=0, help="Of the sampling."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
@@ -124,7 +125,7 @@ def timing(
     people: int | None = typer.Option(12, min=1, help="At most this many people, spread over the meetings."),
     minutes: float | None = typer.Option(5.0, min=0.5, help="Of each, from the middle of the meeting."),
     everything: bool = typer.Option(False, "--all", help="All people, whole meetings: many hours."),
-    seed: int = typer.Option(1, min=0, help="Of voices and sampling."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices and sampling."),
     jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
     fit_table: Path | None = typer.Option(
         None, metavar="FILE", help="Only fit the table of nod rates on DIR and write it."
@@ -146,7 +147,7 @@ def interaction(
     listener: str = typer.Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
     data: Path = typer.Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
     clips: int | None = typer.Option(None, min=1, help="At most this many dyads of each set; all of them."),
-    seed: int = typer.Option(1, min=0, help="Of the sampling."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
     json: bool = JSON,
 ) -> None:
     """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""

@@ -14,7 +14,7 @@ from sfms_robot.errors import ConfigError
 
 INTERRUPTED = 130
 
-app = typer.Typer(help="Heads: list, check, show, calibrate, pose, solve.", no_args_is_help=True)
+app = typer.Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_args_is_help=True)
 app.command("fit")(fit)
 
 
@@ -42,7 +42,10 @@ def check(
 ) -> None:
     """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
     from sfms_robot.app.head_check import check as check_head
+    from sfms_robot.app.plot_style import checked_png
 
+    if plot is not None:
+        checked_png(plot, "--plot")
     checked = check_head(name, data, listener)
     if plot is not None and not checked.problems:
         from sfms_robot.app.head_plot import plot as draw

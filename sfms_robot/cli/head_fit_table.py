@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from sfms_robot.app.fit import HeadFit
+from sfms_robot.cli.screen import screen
 
 
 def print_fit(result: HeadFit) -> None:
     """Error per joint before and after, on held-out frames."""
-    console = Console(highlight=False)
+    console = screen(highlight=False)
     table = Table(title=f"{result.head}: {result.frames} frames, tracker {1e3 * result.delay_s:.0f} ms late")
     table.box = box.SIMPLE_HEAD
     for heading in ("joint", "moved", "before", "after"):

@@ -6,18 +6,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from sfms_robot.app.calibrate import Outcome
 from sfms_robot.app.head_check import HeadCheck
+from sfms_robot.cli.screen import screen
 
 _OVER = "bold red"
 
 
 def print_heads(heads: Sequence[Mapping[str, Any]]) -> None:
     """Two lines per shipped head."""
-    console = Console(highlight=False)
+    console = screen(highlight=False)
     for head in heads:
         neck, families = head["neck"] or "no", ", ".join(head["buses"].values())
         console.print(f"[bold]{head['name']}[/]  {head['joints']} joints, {neck} neck, {families}")
@@ -26,7 +26,7 @@ def print_heads(heads: Sequence[Mapping[str, Any]]) -> None:
 
 def print_check(checked: HeadCheck) -> None:
     """The table of `head check`, or the problems, one line each."""
-    console = Console()
+    console = screen()
     if checked.problems:
         for problem in checked.problems:
             console.print(problem, style="red", markup=False, highlight=False, soft_wrap=True)
@@ -76,7 +76,7 @@ def print_check(checked: HeadCheck) -> None:
 
 def print_origins(name: str, joints: Mapping[str, Mapping[str, tuple[Any, str]]], refused: Sequence[str] = ()) -> None:
     """Every value of every joint with its origin, and what is known of this build but does not hold any more."""
-    console = Console()
+    console = screen()
     for joint, values in joints.items():
         table = Table("key", "value", "from", title=f"{name}: {joint}", title_justify="left")
         for key, (value, origin) in values.items():
@@ -118,7 +118,7 @@ def print_pose(told: Mapping[str, Any]) -> None:
     for joint, row in told["joints"].items():
         reached = "" if row["reached_deg"] is None else f"{row['reached_deg']:+.1f}"
         table.add_row(joint, f"{row['sent_deg']:+.1f}", reached)
-    console = Console()
+    console = screen()
     console.print(table)
     if told["blind"]:
         console.print("cannot show: " + ", ".join(told["blind"]))

@@ -9,7 +9,7 @@ import typer
 
 from sfms_robot import __version__
 from sfms_robot.cli import bench, data, doctor, emulate, evaluate, head, replay, run, servo, train
-from sfms_robot.errors import RobotError
+from sfms_robot.errors import ConfigError, RobotError
 
 app = typer.Typer(
     name="sfms-robot",
@@ -49,9 +49,14 @@ def _common(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point: a RobotError is one line on stderr and its own exit code."""
+    """Entry point: a RobotError is one line on stderr and its own exit code; so is a file that cannot be used."""
     try:
         app(arguments)
     except RobotError as error:
         print(f"sfms-robot: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+    except OSError as error:
+        if error.filename is None:  # not about a file that somebody named: ours to repair
+            raise
+        print(f"sfms-robot: {error.filename}: {error.strerror}", file=sys.stderr)
+        sys.exit(ConfigError.exit_code)

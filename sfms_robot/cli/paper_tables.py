@@ -8,6 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from sfms_robot.cli.screen import screen
+
 TITLES = {
     "3": "Table III: where keyframes go",
     "4": "Table IV: kinds of codes",
@@ -18,7 +20,7 @@ TITLES = {
 
 def print_tables(result: Mapping[str, Any]) -> None:
     """What `evaluate tokenizer --table` found."""
-    console = Console()
+    console = screen()
     for table in result.get("tables", [result]):
         _print(console, table)
     console.print(f"{result['windows']} windows of {result['data']}; MSE is the {result['unit']}. "

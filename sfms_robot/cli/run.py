@@ -9,6 +9,7 @@ from pathlib import Path
 import typer
 
 INTERRUPTED = 130
+MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 
 
 def run(
@@ -28,7 +29,9 @@ def run(
     ),
     duration: float | None = typer.Option(None, min=0.04, help="Seconds; default: as long as the recording."),
     fast: bool = typer.Option(False, help="Virtual time: as fast as it goes, bit-identical for one --seed."),
-    seed: int = typer.Option(0, min=0, help="Two seeds listen differently, one seed repeats (with --fast)."),
+    seed: int = typer.Option(
+        0, min=0, max=MAX_SEED, help="Two seeds listen differently, one seed repeats (with --fast)."
+    ),
     record: Path | None = typer.Option(None, help="Folder to write the run to, for `sfms-robot replay`."),
     dry_run: bool = typer.Option(False, "--dry-run", help="Open and read the servos, never switch torque on."),
     yes: bool = typer.Option(

@@ -13,6 +13,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from sfms_robot.cli.screen import screen
+
 _SHORT = {
     "model_number": "number", "firmware": "fw", "voltage_V": "V", "temperature_degC": "degC", "position_deg": "deg",
     "return_delay_us": "delay us", "current_mA": "mA", "load_percent": "load %", "before": "was",
@@ -22,7 +24,7 @@ _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 def print_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) -> None:
     """Rows that share their keys; columns that say nothing are left out."""
-    console = Console()
+    console = screen()
     if title is not None:
         console.print(Text(title, style="bold"), soft_wrap=True)
     if rows:
@@ -31,7 +33,7 @@ def print_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) -> 
 
 def live(samples: Iterable[Sequence[Mapping[str, Any]]], title: str) -> None:
     """One table that is drawn anew with every sample, until they end or somebody presses Ctrl-C."""
-    console = Console()
+    console = screen()
     rows: Sequence[Mapping[str, Any]] = []
     try:
         with Live(console=console, auto_refresh=False, transient=console.is_terminal) as view:
@@ -59,7 +61,7 @@ def bar(text: str, hidden: bool) -> Iterator[Callable[[int, int, str], None]]:
 
 def print_doctor(report: Mapping[str, Any]) -> None:
     """Every bus: adapter, servos, budget, findings."""
-    console = Console()
+    console = screen()
     for bus in report["buses"]:
         for part in _bus(bus):
             console.print(part, soft_wrap=isinstance(part, Text))  # a command that is broken up cannot be pasted
@@ -115,7 +117,12 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for key in keys:
         numbers = all(isinstance(row[key], (int, float, type(None))) for row in rows)
-        table.add_column(_SHORT.get(key, key.replace("_", " ")), justify="right" if numbers else "left", no_wrap=True)
+        table.add_column(
+            _SHORT.get(key, key.replace("_", " ")),
+            justify="right" if numbers else "left",
+            no_wrap=numbers,  # in a narrow terminal texts are folded, numbers stay whole
+            overflow="fold",
+        )
     for row in rows:
         table.add_row(*(_cell(row[key]) for key in keys))
     return table

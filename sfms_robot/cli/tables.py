@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
+
+from sfms_robot.cli.screen import screen
 
 
 def print_run(report: Mapping[str, Any], record: Path | None) -> None:
@@ -18,8 +19,7 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
     motion, tick, limits, bus = report["motion"], report["tick"], report["limits"], report["bus"]
     rows = [
         ("face", f"{motion['nods']} nods, {motion['blinks']} blinks, {motion['smiles']} smiles"),
-        ("ticks", f"{report['ticks']} at {_or(tick['achieved_hz'], 'virtual')} Hz of {tick['target_hz']:g}, "
-                  f"{_or(tick['late'], 'no')} late, jitter p99 {_or(tick['jitter_ms']['p99'], '-')} ms"),
+        ("ticks", _ticks(report["ticks"], tick)),
         ("latency", f"frame to wire p50 {_or(report['latency_ms']['frame_to_wire']['p50'], '-')} ms, "
                     f"speech to wire p50 {_or(report['latency_ms']['speech_to_wire']['p50'], '-')} ms"),
         ("listener", f"{report['listener']}, a plan in p50 {_or(report['listener_step_ms']['p50'], '-')} ms, "
@@ -30,7 +30,7 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
     ]  # fmt: skip
     for name, text in rows:
         table.add_row(name, text)
-    console = Console()
+    console = screen()
     console.print(table)
     if report.get("priority", "").startswith("refused"):
         console.print(f"real-time priority {report['priority']}", style="dim")
@@ -40,12 +40,21 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
         )
 
 
+def _ticks(count: int, tick: Mapping[str, Any]) -> str:
+    if tick["achieved_hz"] is None:
+        return f"{count} in virtual time, {tick['target_hz']:g} a second"
+    return (
+        f"{count} at {tick['achieved_hz']:.4g} Hz of {tick['target_hz']:g}, "
+        f"{tick['late']} late, jitter p99 {_or(tick['jitter_ms']['p99'], '-')} ms"
+    )
+
+
 def print_dry_run(report: Mapping[str, Any]) -> None:
     """Where every joint stands; torque was not touched."""
     table = Table("joint", "rad", "fault", title=f"{report['head']} on {report['port']}: torque untouched")
     for name, reading in report["readings"].items():
         table.add_row(name, _or(reading["position_rad"], "no answer"), reading["fault"] or "")
-    Console().print(table)
+    screen().print(table)
 
 
 def print_bench(result: Mapping[str, Mapping[str, Any]]) -> None:
@@ -55,7 +64,7 @@ def print_bench(result: Mapping[str, Mapping[str, Any]]) -> None:
         table.add_row(
             name, f"{row['median']:.4g} {row['unit']}", _or(row.get("p99"), "-"), f"{row['ratio']:.3g}", row["peer"]
         )
-    Console().print(table)
+    screen().print(table)
 
 
 def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -63,7 +72,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
     table = Table(*rows[0])
     for row in rows:
         table.add_row(*(_or(row.get(key), "-") for key in rows[0]))
-    Console().print(table)
+    screen().print(table)
 
 
 def print_listener_table(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -78,7 +87,7 @@ def print_listener_table(rows: Sequence[Mapping[str, Any]]) -> None:
             table = Table("", "from", *(key.removeprefix(part).strip() for key in keys), title=part or None)
             for row in rows:
                 table.add_row(row["name"], row["source"], *(_or(row.get(key), "-") for key in keys))
-            Console().print(table)
+            screen().print(table)
 
 
 def _or(value: object, otherwise: str) -> str:

@@ -30,5 +30,8 @@ class InlineFeed:
     def step_times_ms(self) -> Sequence[float]:
         return ()
 
+    def unheard(self) -> int:
+        return 0
+
     def close(self) -> None:
         """Nothing to give back."""

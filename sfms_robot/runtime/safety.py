@@ -56,15 +56,23 @@ def come_to_rest(
         logger.error("could not ease to rest: %s", error)
 
 
+_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a terminal or connection that closes
+
+
 @contextmanager
 def interrupt_flag() -> Iterator[Callable[[], bool]]:
-    """SIGINT and SIGTERM set a flag instead of raising, so that no write is cut in half. Restored on exit."""
+    """SIGINT, SIGTERM and SIGHUP set a flag instead of raising, so that no write is cut in half. Restored on exit.
+
+    SIGHUP only where it is not ignored: under nohup a lost terminal ends nothing.
+    """
     caught: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
         caught.append(number)
 
-    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    heeded = [each for each in _ENDINGS if each != signal.SIGHUP or not nohup]
+    previous = {number: signal.signal(number, note) for number in heeded}
     try:
         yield lambda: bool(caught)
     finally:

@@ -29,7 +29,7 @@ from sfms_robot.ports import StopPolicy, TickConversion
 from sfms_robot.servo.care import Care, Told
 from sfms_robot.servo.contact import Contact
 from sfms_robot.servo.link import RegisterLink
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.policy import Absences, BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field, Table
 from sfms_robot.servo.roster import Roster
@@ -89,6 +89,7 @@ class ChainBus(WireBus[L], Generic[L, S]):
         self._tables = [Table.of(servo.map) for servo in servos]
         self._index = {servo.id: i for i, servo in enumerate(servos)}
         self._telemetry = self._state()
+        self._absences = Absences([f"{servo.joint} (id {servo.id})" for servo in servos])
         self._care = Care(servos, self._tables, faults or Faults(), self._telemetry)
         self._places: NDArray[np.intp] = np.zeros(0, np.intp)  # who gets goals
         self._stale = True  # that list

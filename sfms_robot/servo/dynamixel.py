@@ -7,7 +7,6 @@ before every clean end.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
@@ -29,8 +28,6 @@ from sfms_robot.servo.registers import Field, Table
 from sfms_robot.servo.roster import Roster
 from sfms_robot.servo.sweep import Sweep
 from sfms_robot.servo.telemetry import Telemetry, common
-
-log = logging.getLogger(__name__)
 
 _WATCHDOG_TICK_S: Final = 0.02
 _STALL: Final = 0.8  # of the watchdog's time without a goal: it may have tripped
@@ -103,12 +100,13 @@ class DynamixelBus(ChainBus[Dxl2Link, Telemetry]):
         care = self._care
         heard = self._sweep.tick(link, now_s)
         for servo in heard.newly_silent:
-            log.warning("%s (id %d) is silent", self.joints[self._index[servo]], servo)
+            self._absences.gone(self._index[servo], now_s)
         for servo in heard.probed_in_vain:
+            self._absences.gone(self._index[servo], now_s, again=False)
             care.gone(self._index[servo], "silent")
         for servo in heard.came_back:
             index = self._index[servo]
-            log.warning("%s (id %d) answers again", self.joints[index], servo)
+            self._absences.back(index)
             care.answers(index, now_s)
         for servo, alert in heard.alerts.items():
             if not alert:

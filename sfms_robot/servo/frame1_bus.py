@@ -114,7 +114,7 @@ class Frame1Bus(ChainBus[Frame1Link, Frame1Telemetry]):
             self._roster.answered(servo)
             self._take(self._index[servo], answer, now_s)
         for servo in self._roster.blame(bool(sweep.answers), sweep.gaps, sweep.missed, now_s):
-            log.warning("%s (id %d) is silent", self.joints[self._index[servo]], servo)
+            self._absences.gone(self._index[servo], now_s)
         self._look_closer(link, [servo for servo in listed if servo in sweep.answers], now_s)
         return self._probe(link, now_s) or bool(sweep.answers)
 
@@ -161,11 +161,12 @@ class Frame1Bus(ChainBus[Frame1Link, Frame1Telemetry]):
         answer = link.read(servo, *self._telemetry.block)
         if answer is None:
             self._roster.probe_failed(servo, now_s)
+            self._absences.gone(index, now_s, again=False)
             self._care.gone(index, "silent")
             return False
         self._roster.answered(servo)
         self._roster.hurry(now_s)
-        log.warning("%s (id %d) answers again", self.joints[index], servo)
+        self._absences.back(index)
         self._take(index, answer, now_s)
         self._care.answers(index, now_s)
         self._check_torque(link, index, now_s)

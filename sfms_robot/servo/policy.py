@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 PINCH_SHARE: Final = 0.6  # of the servo's own current limit
 PINCH_S: Final = 0.5
+SAID_EVERY_S: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,37 @@ class Voice:
 
     def about(self, index: int) -> str:
         return f"{self._servos[index].joint} (id {self._servos[index].id})"
+
+
+class Absences:
+    """Says which servo falls silent and which is back, each at most once in ten seconds.
+
+    A loose contact comes and goes many times a second. What is held back is counted into the next line, and who stays
+    away is told as soon as the ten seconds are over, at the next `gone`.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._said_s: dict[int, float] = {}
+        self._held_back: dict[int, int] = {}
+        self._away: set[int] = set()  # who was said to be away
+
+    def gone(self, index: int, now_s: float, again: bool = True) -> None:
+        """`again` is False when the servo was away already, and still is."""
+        if index in self._away:
+            return
+        if now_s < self._said_s.get(index, -SAID_EVERY_S) + SAID_EVERY_S:
+            self._held_back[index] = self._held_back.get(index, 0) + again
+            return
+        before = self._held_back.pop(index, 0)
+        log.warning("%s is silent%s", self._names[index], f" ({before} times since the last word)" if before else "")
+        self._said_s[index] = now_s
+        self._away.add(index)
+
+    def back(self, index: int) -> None:
+        if index in self._away:
+            self._away.remove(index)
+            log.warning("%s answers again", self._names[index])
 
 
 def register_of(table: FirmwareMap, role: Role) -> str | None:

@@ -235,7 +235,7 @@ def _open(device: str, baud: int) -> serial.Serial:
 
 def _claim(port: serial.Serial, device: str) -> None:
     """Nobody else may open it from now on; nobody else may have it open already. pyserial's lock is only advice."""
-    if not device.startswith("/"):
+    if _is_url(device):
         return  # a socket has no other users
     if os.path.realpath(device).startswith(_TERMINALS):
         return  # an emulator holds the near end of its pseudo terminal open, and with it the lock of a dead host
@@ -247,7 +247,7 @@ def _claim(port: serial.Serial, device: str) -> None:
 
 def _check_baud(port: serial.Serial, device: str) -> None:
     """Drivers take the nearest rate they can do, and say which one only when asked."""
-    if not device.startswith("/"):
+    if _is_url(device):
         return
     settings = array("I", [0] * 64)
     try:
@@ -259,6 +259,11 @@ def _check_baud(port: serial.Serial, device: str) -> None:
         raise PortError(f"{device}: the adapter cannot do {port.baudrate} baud (the nearest it has is {actual})")
 
 
+def _is_url(device: str) -> bool:
+    """socket://, rfc2217:// and the like; everything else is a path, relative ones too."""
+    return "://" in device
+
+
 def _low_latency(port: serial.Serial) -> None:
     try:
         port.set_low_latency_mode(True)
@@ -267,7 +272,7 @@ def _low_latency(port: serial.Serial) -> None:
 
 
 def _reason(device: str, error: Exception) -> str:
-    if device.startswith("/"):
+    if not _is_url(device):
         if not os.path.exists(device):
             return "no such device"
         if os.path.isdir(device):

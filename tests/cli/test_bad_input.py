@@ -45,6 +45,37 @@ def test_a_missing_sound_file(fails):
     assert code == 2 and "nowhere.wav" in told and "no such file" in told and "none" in told
 
 
+def test_a_seed_that_is_too_large():
+    with pytest.raises(SystemExit) as ended:
+        main(["run", "--fast", "--duration", "0.2", "--seed", str(2**64)])
+    assert ended.value.code == 2
+
+
+@pytest.mark.parametrize("option", ["--plot", "--sheet"])
+def test_a_picture_that_cannot_be_one(fails, tmp_path, option):
+    (tmp_path / "folder.png").mkdir()
+    for file, why in (("x.jpg", "FILE.png"), ("folder.png", "is a folder"), ("none/x.png", "no folder")):
+        code, told = fails("replay", tmp_path, option, tmp_path / file)
+        assert code == 2 and option in told and file in told and why in told
+
+
+@pytest.mark.parametrize("option", ["--audio", "--face", "--head", "--listener"])
+def test_a_name_that_no_file_can_have(fails, option):
+    code, told = fails("run", option, "x" * 300)
+    assert code == 2 and "x" * 300 in told
+
+
+def test_a_folder_without_maps_is_not_sound(fails, tmp_path):
+    code, told = fails("servo", "maps", "--check", tmp_path)
+    assert code == 2 and "no firmware map" in told
+
+
+def test_dyads_into_a_file(fails, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    code, told = fails("data", "compose", "--data", tmp_path, "--out", tmp_path / "file")
+    assert code == 2 and "--out" in told and (tmp_path / "file").read_text() == "mine"
+
+
 def test_an_empty_sound_file(fails, tmp_path):
     soundfile.write(tmp_path / "empty.wav", [], 16_000)
     code, told = fails("run", "--audio", tmp_path / "empty.wav")

@@ -7,7 +7,7 @@ import pytest
 from sfms_robot.runtime.safety import interrupt_flag, realtime_priority, smooth
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_sets_the_flag_and_raises_nothing(number: signal.Signals) -> None:
     before = signal.getsignal(number)
     with interrupt_flag() as interrupted:
@@ -15,6 +15,17 @@ def test_a_signal_sets_the_flag_and_raises_nothing(number: signal.Signals) -> No
         signal.raise_signal(number)
         assert interrupted()
     assert signal.getsignal(number) is before
+
+
+def test_a_signal_that_is_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupt_flag() as interrupted:
+            signal.raise_signal(signal.SIGHUP)
+            assert not interrupted()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_easing_starts_and_ends_at_rest_and_never_turns_back() -> None:

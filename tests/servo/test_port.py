@@ -58,6 +58,21 @@ def test_port_is_ours_alone():
         SerialPort(device, 57600, Frozen()).close()
 
 
+def test_a_relative_path_is_a_path_like_any_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    with terminal() as (_, device):
+        (tmp_path / "head").symlink_to(device)
+        port = SerialPort("head", 57600, Frozen())
+        with pytest.raises(PortError, match="^head: is held by another program"):
+            SerialPort("head", 57600, Frozen())
+        port.close()
+    with pytest.raises(PortError, match="^folder: is a directory"):
+        SerialPort("folder", 57600, Frozen())
+    with pytest.raises(PortError, match="^nowhere: no such device"):
+        SerialPort("nowhere", 57600, Frozen())
+
+
 @pytest.mark.parametrize("baud", [250_000, 1_234_567, 4_500_000])
 def test_any_baud_rate_will_do(baud):
     with terminal() as (far, device):

@@ -80,6 +80,9 @@ class Waves:
     def step_times_ms(self) -> Sequence[float]:
         return []
 
+    def unheard(self) -> int:
+        return 0
+
     def close(self) -> None: ...
 
 

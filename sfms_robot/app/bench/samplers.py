@@ -15,7 +15,16 @@ if TYPE_CHECKING:
     from sfms_robot.listeners.arig.stream import ArigListener
 
 REFERENCE_STEPS: Final = 50
-WAYS: Final = (("ddpm", 50), ("ddpm", 15), ("ddpm", 8), ("ddim", 15), ("ddim", 8), ("ddim", 4))
+WAYS: Final = (
+    ("ddpm", 50),
+    ("ddpm", 15),
+    ("ddpm", 12),
+    ("ddpm", 10),
+    ("ddpm", 8),
+    ("ddim", 15),
+    ("ddim", 8),
+    ("ddim", 4),
+)
 DRAWS: Final = 32
 EVERY: Final = 4  # frames between the conditions that are looked at
 

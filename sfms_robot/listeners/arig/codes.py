@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sfms_robot.listeners.arig.parts import Linear
 from sfms_robot.listeners.sfms.quantizer import as_levels, codes_to_indices, indices_to_codes, quantize
 
 
@@ -23,9 +24,9 @@ class CodeHead(nn.Module):
     def __init__(self, channels: int, width: int, levels: tuple[int, ...]) -> None:
         super().__init__()
         self.register_buffer("levels", as_levels([levels]), persistent=False)
-        self.encode = nn.Sequential(nn.Linear(channels, width), nn.GELU(), nn.Linear(width, len(levels)))
-        self.decode = nn.Sequential(nn.Linear(len(levels), width), nn.GELU(), nn.Linear(width, channels))
-        self.classify = nn.Linear(width, math.prod(levels))
+        self.encode = nn.Sequential(Linear(channels, width), nn.GELU(), Linear(width, len(levels)))
+        self.decode = nn.Sequential(Linear(len(levels), width), nn.GELU(), Linear(width, channels))
+        self.classify = Linear(width, math.prod(levels))
 
     def loss(self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """z (N, D), standardised motion (N, C) -> cross-entropy of its code plus squared error of the code, (N,)."""

@@ -19,13 +19,13 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from sfms_robot.listeners.arig.parts import Look
+from sfms_robot.listeners.arig.parts import LayerNorm, Linear, Look, Part
 
 STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
 FIRST: Final = STATES.index("waiting")  # of a stream: nobody has spoken yet
 
 
-class StateUnderstanding(nn.Module):
+class StateUnderstanding(Part):
     """The previous state asks voice activity and cis-token what the state is now."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
@@ -33,8 +33,8 @@ class StateUnderstanding(nn.Module):
         self.previous = nn.Embedding(len(STATES), width)
         self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
         self.look = Look(width, hidden, heads, slots=3)
-        self.norm = nn.LayerNorm(width)
-        self.classify = nn.Linear(width, len(STATES))
+        self.norm = LayerNorm(width)
+        self.classify = Linear(width, len(STATES))
 
     def condition(self, cis: Tensor, voiced: Tensor) -> Tensor:
         """cis (N, D), voiced (N, 2) bool: agent now, user one frame before -> keys (N, 3, 2D)."""

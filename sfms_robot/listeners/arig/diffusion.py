@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.arig.parts import Modulation
+from sfms_robot.listeners.arig.parts import Linear, Modulation, modulated
 from sfms_robot.listeners.layers import sinusoidal
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
@@ -48,13 +48,13 @@ class Denoiser(nn.Module):
         self.register_buffer("high", torch.full((channels,), 8.0))
         self.register_buffer("share", signal_share(settings.train_steps).float(), persistent=False)
         self.register_buffer("places", sinusoidal(settings.train_steps, width), persistent=False)
-        self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
-        self.condition = nn.Linear(condition, width)
+        self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))
+        self.condition = Linear(condition, width)
         self.modulation = Modulation(width, width, "scg" * settings.blocks + "sc")  # of every block, in one product
-        self.enter = nn.Linear(channels, width)
-        self.up = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
-        self.down = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
-        self.leave = nn.Linear(width, channels)
+        self.enter = Linear(channels, width)
+        self.up = nn.ModuleList(Linear(width, width) for _ in range(settings.blocks))
+        self.down = nn.ModuleList(Linear(width, width) for _ in range(settings.blocks))
+        self.leave = Linear(width, channels)
         self.levels = torch.linspace(0, settings.train_steps - 1, settings.steps).round().long().tolist()
         self.table = steps_of(self.levels, settings)
 
@@ -64,12 +64,12 @@ class Denoiser(nn.Module):
         return out
 
     def modulate(self, z: Tensor, level: Tensor) -> tuple[Tensor, ...]:
-        """Condition (N, D) and level embeddings (N, W) -> shift, scale and gate of every block, (N, 1, W) each."""
+        """Condition (N, D) and level embeddings (N, W) -> shift, scale and gate of every block, (N, W) each."""
         parts: tuple[Tensor, ...] = self.modulation(F.silu(self.condition(z) + level))
         return parts
 
     def forward(self, noisy: Tensor, parts: Parts) -> Tensor:
-        """noisy (N, 1, C), `modulate` of its level and condition -> the noise in it (N, 1, C)."""
+        """noisy (N, C), `modulate` of its level and condition -> the noise in it (N, C)."""
         return _denoise(noisy, parts, self._weights())
 
     def _weights(self) -> list[tuple[Tensor, Tensor]]:
@@ -85,7 +85,7 @@ class Denoiser(nn.Module):
         noise = torch.randn(motion.shape, generator=generator).to(motion.device)
         share = self.share[t][:, None]
         noisy = share.sqrt() * motion + (1 - share).sqrt() * noise
-        found = self(noisy[:, None], self.modulate(z, self.level(t)))[:, 0]
+        found = self(noisy, self.modulate(z, self.level(t)))
         wrong: Tensor = (noise - found).square().mean(-1)
         return wrong
 
@@ -102,32 +102,28 @@ class Denoiser(nn.Module):
             raise ValueError(f"noise for {k} steps, the sampler takes {len(self.levels)}")
         if levels is None:
             levels = self.level(torch.tensor(self.levels, device=z.device))
-        # The modulation of every step in one product: (K, N) conditions.
-        told = F.silu(self.condition(z) + levels[:, None])
-        parts = [part.view(k, n, 1, -1).unbind(0) for part in self.modulation(told.flatten(0, 1))]
-        x, weights = noise[:, :1], self._weights()
+        # The modulation of every step in one product: (K, N, W) conditions, of a single sample (K, W).
+        told = self.condition(z) + levels[:, None] if n > 1 else self.condition(z) + levels
+        parts = [each.chunk(self.modulation.parts, -1) for each in self.modulation.linear(F.silu(told)).unbind(0)]
+        first, *added = noise.unbind(1)
+        low, high, weights, x = self.low, self.high, self._weights(), first
         for index, step in enumerate(self.table):
-            found = _denoise(x, [part[k - 1 - index] for part in parts], weights)
-            clean = torch.add(x * step.denoise[0], found, alpha=step.denoise[1]).clamp(self.low, self.high)
-            if self.settings.sampler == "ddim":  # what is not motion is the noise that stays
-                x = torch.add(clean * step.motion, torch.add(x, clean, alpha=-step.share), alpha=step.stay)
-            else:
-                x = torch.add(clean * step.motion, x, alpha=step.stay)
-                if step.spread:
-                    x = torch.add(x, noise[:, index + 1 : index + 2], alpha=step.spread)
-        return x[:, 0]
+            found = _denoise(x, parts[k - 1 - index], weights)
+            clean = found.mul_(step.denoise[1]).add_(x, alpha=step.denoise[0]).clamp_(low, high)
+            x = clean.mul_(step.motion).add_(x, alpha=step.stay)
+            if step.spread:
+                x.add_(added[index], alpha=step.spread)
+        return x
 
 
 def _denoise(noisy: Tensor, parts: Parts, weights: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """noisy (N, 1, C), modulation (N, 1, W) each, `Denoiser._weights` -> (N, 1, C)."""
+    """noisy (N, C), modulation (N, W) or (W,) each, `Denoiser._weights` -> (N, C)."""
     x = F.linear(noisy, *weights[0])
-    size = x.shape[-1:]
     for block in range(len(weights) // 2 - 1):
         shift, scale, gate = parts[3 * block : 3 * block + 3]
-        y = torch.addcmul(shift, torch.layer_norm(x, size), scale)
-        y = F.linear(F.silu(F.linear(y, *weights[2 * block + 1])), *weights[2 * block + 2])
+        y = F.linear(F.silu(F.linear(modulated(x, shift, scale), *weights[2 * block + 1])), *weights[2 * block + 2])
         x = torch.addcmul(x, gate, y)
-    return F.linear(torch.addcmul(parts[-2], torch.layer_norm(x, size), parts[-1]), *weights[-1])
+    return F.linear(modulated(x, parts[-2], parts[-1]), *weights[-1])
 
 
 @dataclass(frozen=True)
@@ -136,13 +132,11 @@ class Step:
 
     Attributes:
         denoise: M_0 = denoise[0] M_t + denoise[1] eps.
-        share: sqrt(alpha-bar_t).
-        motion, stay: M_s = motion M_0 + stay M_t (ddim: + stay (M_t - share M_0)).
+        motion, stay: M_s = motion M_0 + stay M_t, which is ddim as well.
         spread: sigma_t, times the noise that is added.
     """
 
     denoise: tuple[float, float]
-    share: float
     motion: float
     stay: float
     spread: float
@@ -154,6 +148,7 @@ def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
     Equation (4) written through the clean motion M_0 = (M_t - sqrt(1 - ab_t) eps) / sqrt(ab_t): its mean is
     sqrt(ab_s) (1 - alpha) / (1 - ab_t) M_0 + sqrt(alpha) (1 - ab_s) / (1 - ab_t) M_t, alpha = ab_t / ab_s, and where
     M_0 is not clamped the two are the same. sigma^2 = (1 - alpha) (1 - ab_s) / (1 - ab_t).
+    DDIM keeps what is not motion: M_s = sqrt(ab_s) M_0 + stay (M_t - sqrt(ab_t) M_0), stay^2 = (1 - ab_s) / (1 - ab_t).
     """
     shares = signal_share(settings.train_steps)[list(levels)].tolist()
     out = []
@@ -162,9 +157,10 @@ def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
         alpha = now / after
         denoise = (now**-0.5, -(((1 - now) / now) ** 0.5))
         if settings.sampler == "ddim":
-            out.append(Step(denoise, now**0.5, after**0.5, ((1 - after) / (1 - now)) ** 0.5, 0.0))
+            stay = ((1 - after) / (1 - now)) ** 0.5
+            out.append(Step(denoise, after**0.5 - stay * now**0.5, stay, 0.0))
         else:
             motion, stay = after**0.5 * (1 - alpha) / (1 - now), alpha**0.5 * (1 - after) / (1 - now)
             spread = ((1 - alpha) * (1 - after) / (1 - now)) ** 0.5 * settings.temperature
-            out.append(Step(denoise, now**0.5, motion, stay, spread))
+            out.append(Step(denoise, motion, stay, spread))
     return out

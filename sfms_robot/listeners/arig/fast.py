@@ -39,6 +39,8 @@ class Int8Linear(nn.Module):
         out: Tensor = torch.ops.quantized.linear_dynamic(x, self.packed, self.half_range)
         return out
 
+    __call__ = forward  # as parts.Part
+
 
 def supported() -> bool:
     """Whether this processor multiplies such integers fast."""

@@ -14,18 +14,27 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.listeners.arig.parts import FeedForward, Modulation, join_heads, modulated, split_heads
+from sfms_robot.listeners.arig.parts import (
+    FeedForward,
+    LayerNorm,
+    Linear,
+    Modulation,
+    Part,
+    join_heads,
+    modulated,
+    split_heads,
+)
 
 ROPE_BASE = 10_000.0
 
 
-class Merge(nn.Module):
+class Merge(Part):
     """Sound and motion of one frame of one track -> its behaviour; sound alone without the visual modality."""
 
     def __init__(self, width: int, visual: bool) -> None:
         super().__init__()
         self.visual = visual
-        self.mlp = nn.Sequential(nn.Linear((1 + visual) * width, width), nn.GELU(), nn.Linear(width, width))
+        self.mlp = nn.Sequential(Linear((1 + visual) * width, width), nn.GELU(), Linear(width, width))
 
     def forward(self, sound: Tensor, motion: Tensor) -> Tensor:
         """(..., D) and (..., D) -> (..., D)."""
@@ -39,13 +48,13 @@ class Track(nn.Module):
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
         self.modulation = Modulation(width, width, "scgscg")
-        self.qkv = nn.Linear(width, 3 * width)
-        self.out = nn.Linear(width, width)
+        self.qkv = Linear(width, 3 * width)
+        self.out = Linear(width, width)
         self.ffn = FeedForward(width, hidden)
 
     def ask(self, x: Tensor, condition: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         """x (N, c, D), condition (N, D) -> queries, keys and values (N, c, 3D), and the modulation."""
-        parts = self.modulation(condition)
+        parts = self.modulation.of_tokens(condition)
         return self.qkv(modulated(x, parts[0], parts[1])), parts
 
     def answer(self, x: Tensor, seen: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
@@ -54,7 +63,7 @@ class Track(nn.Module):
         return torch.addcmul(x, parts[5], self.ffn(modulated(x, parts[3], parts[4])))
 
 
-class Bidirectional(nn.Module):
+class Bidirectional(Part):
     """Each track reads itself, and both see each other through one attention, as in MMDiT."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
@@ -72,45 +81,46 @@ class Bidirectional(nn.Module):
         return self.agent.answer(agent, of_agent, agent_parts), self.user.answer(user, of_user, user_parts)
 
 
-class Integrated(nn.Module):
+class Integrated(Part):
     """Both tracks as one sequence; attention and feed-forward side by side (figure 8, Dehghani et al. 2023)."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.split = [3 * width, hidden]
+        self.asked, self.hidden = 3 * width, hidden
         self.modulation = Modulation(width, width, "scg")
-        self.wide = nn.Linear(width, 3 * width + hidden)
-        self.narrow = nn.Linear(width + hidden, width)
+        self.wide = Linear(width, 3 * width + hidden)
+        self.narrow = Linear(width + hidden, width)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         """x (N, 2c, D), condition (N, D), SiLU applied -> (N, 2c, D)."""
-        shift, scale, gate = self.modulation(condition)
-        qkv, up = self.wide(modulated(x, shift, scale)).split(self.split, dim=-1)
+        shift, scale, gate = self.modulation.of_tokens(condition)
+        wide = self.wide(modulated(x, shift, scale))
+        qkv, up = wide.narrow(-1, 0, self.asked), wide.narrow(-1, self.asked, self.hidden)
         both = torch.cat([_attend(qkv, self.heads), F.gelu(up)], dim=-1)
         return torch.addcmul(x, gate, self.narrow(both))
 
 
 def _attend(qkv: Tensor, heads: int) -> Tensor:
     """Full self-attention of (N, S, 3D) -> (N, S, D)."""
-    q, k, v = (split_heads(part, heads) for part in qkv.chunk(3, dim=-1))
+    q, k, v = split_heads(qkv, 3 * heads).chunk(3, dim=1)
     return join_heads(F.scaled_dot_product_attention(q, k, v))
 
 
-class ShortRange(nn.Module):
+class ShortRange(Part):
     """The last c behaviours of both tracks -> one summary, of the agent's part (A.1)."""
 
     def __init__(self, width: int, hidden: int, heads: int, chunk: int, depths: tuple[int, int], linear: bool) -> None:
         """`depths` of bidirectional and integrated learning; `linear`: plain layers in their place (table 4)."""
         super().__init__()
         self.places = nn.Parameter(torch.randn(2, chunk, width) * 0.02)
-        self.plain = nn.ModuleList(nn.Linear(width, width) for _ in range(2)) if linear else None
-        self.plain_both = nn.Linear(4 * width, width) if linear else None
+        self.plain = nn.ModuleList(Linear(width, width) for _ in range(2)) if linear else None
+        self.plain_both = Linear(4 * width, width) if linear else None
         counts = (0, 0) if linear else depths
         self.bidirectional = nn.ModuleList(Bidirectional(width, hidden, heads) for _ in range(counts[0]))
         self.integrated = nn.ModuleList(Integrated(width, hidden, heads) for _ in range(counts[1]))
-        self.norm = nn.LayerNorm(width)
-        self.compress = nn.Linear(chunk * width, width)
+        self.norm = LayerNorm(width)
+        self.compress = Linear(chunk * width, width)
 
     def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> Tensor:
         """Behaviours (N, c, D), oldest first, and the newest sounds (N, D) -> summary (N, D)."""
@@ -132,22 +142,23 @@ class ShortRange(nn.Module):
         return out
 
 
-class ContextLayer(nn.Module):
+class ContextLayer(Part):
     """One layer of the causal decoder: a summary looks at itself and at whole chunks before it."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.norm = nn.LayerNorm(width)
-        self.qkv = nn.Linear(width, 3 * width)
-        self.out = nn.Linear(width, width)
-        self.ffn_norm = nn.LayerNorm(width)
+        self.norm = LayerNorm(width)
+        self.qkv = Linear(width, 3 * width)
+        self.out = Linear(width, width)
+        self.ffn_norm = LayerNorm(width)
         self.ffn = FeedForward(width, hidden)
 
     def project(self, x: Tensor, turn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """x (B, T, D), turn (T, 2, D/h) -> queries, keys, values (B, h, T, D/h), turned to their places."""
-        q, k, v = (split_heads(part, self.heads) for part in self.qkv(self.norm(x)).chunk(3, dim=-1))
-        return _turned(q, turn), _turned(k, turn), v
+        """x (B, T, D), turn (2, T, D/h) -> queries, keys, values (B, h, T, D/h), turned to their places."""
+        qkv = split_heads(self.qkv(self.norm(x)), 3 * self.heads)
+        q, k = _turned(qkv.narrow(1, 0, 2 * self.heads), turn).chunk(2, dim=1)
+        return q, k, qkv.narrow(1, 2 * self.heads, self.heads)
 
     def forward(self, x: Tensor, own: tuple[Tensor, Tensor, Tensor], past: Tensor, seen: Tensor | None) -> Tensor:
         """x (B, T, D), `own` of `project`, past (2, B, h, S, D/h): keys and values of whole chunks -> (B, T, D).
@@ -170,24 +181,29 @@ class ContextLayer(nn.Module):
 class LongRange(nn.Module):
     """Causal decoder over the context cache -> cis-token."""
 
+    rates: Tensor
+    signs: Tensor
+
     def __init__(self, width: int, hidden: int, heads: int, layers: int, chunk: int, capacity: int) -> None:
         super().__init__()
-        self.chunk, self.capacity, self.head_width = chunk, capacity, width // heads
+        self.chunk, self.capacity = chunk, capacity
+        half = width // heads // 2
+        rates = ROPE_BASE ** (-torch.arange(half, dtype=torch.float64) / half)
+        self.register_buffer("rates", rates.repeat(2), persistent=False)
+        self.register_buffer("signs", torch.ones(2 * half).index_fill(0, torch.arange(half), -1.0), persistent=False)
         self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(layers))
-        self.norm = nn.LayerNorm(width)
+        self.norm = LayerNorm(width)
 
     def _layers(self) -> list[ContextLayer]:
         return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
 
     def turn(self, chunks: Tensor) -> Tensor:
-        """Rotary places (Su et al. 2021): chunk numbers (T,) -> cosines and sines (T, 2, D/h).
+        """Rotary places (Su et al. 2021): chunk numbers (T,) -> cosines and sines (2, T, D/h).
 
         Computed in double precision: after days of running the angles still differ by what the chunks do.
         """
-        half = self.head_width // 2
-        rates = ROPE_BASE ** (-torch.arange(half, dtype=torch.float64, device=chunks.device) / half)
-        angles = (chunks.double()[:, None] * rates).repeat(1, 2)
-        return torch.stack([angles.cos(), angles.sin()], dim=1).float()
+        angles = chunks[:, None] * self.rates
+        return torch.stack([angles.cos(), angles.sin() * self.signs]).float()
 
     def forward(self, summaries: Tensor) -> Tensor:
         """Summaries (B, T, D) of every frame from the start of a stream -> cis-tokens (B, T, D).
@@ -213,7 +229,7 @@ class LongRange(nn.Module):
         Args:
             summary: (1, D) of the chunk in progress.
             past: (L, 2, 1, h, S, D/h) keys and values of the S whole chunks in view, oldest first.
-            turn: (1, 2, D/h) of this chunk.
+            turn: (2, 1, D/h) of this chunk.
 
         Returns:
             cis-token (1, D), and keys and values (L, 2, 1, h, 1, D/h) of this summary, should it be the last of its
@@ -228,6 +244,7 @@ class LongRange(nn.Module):
 
 
 def _turned(x: Tensor, turn: Tensor) -> Tensor:
-    """x (B, h, T, D/h) turned by (T, 2, D/h)."""
+    """x (B, h, T, D/h) turned by (2, T, D/h): its halves are the two coordinates of each plane."""
     first, second = x.chunk(2, dim=-1)
-    return torch.addcmul(x * turn[:, 0], torch.cat([-second, first], dim=-1), turn[:, 1])
+    cosine, sine = turn.unbind(0)
+    return torch.addcmul(x * cosine, torch.cat([second, first], dim=-1), sine)

@@ -30,7 +30,7 @@ from sfms_robot.listeners.arig.codes import CodeHead
 from sfms_robot.listeners.arig.csu import FIRST, StateUnderstanding
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
-from sfms_robot.listeners.arig.parts import windows
+from sfms_robot.listeners.arig.parts import Linear, windows
 from sfms_robot.listeners.arig.pmp import Progressive
 from sfms_robot.listeners.arig.sound import WIDTHS
 
@@ -118,8 +118,8 @@ class ArigModel(nn.Module):
         self.register_buffer("step_std", torch.ones(self.channels))
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
         self.register_buffer("sound_std", torch.ones(self.sound_width))
-        self.sound_in = nn.Sequential(nn.Linear(self.sound_width, d), nn.GELU(), nn.Linear(d, d))
-        self.motion_in = nn.Linear(self.channels, d)
+        self.sound_in = nn.Sequential(Linear(self.sound_width, d), nn.GELU(), Linear(d, d))
+        self.motion_in = Linear(self.channels, d)
         self.no_user_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_agent_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_face = nn.Parameter(torch.randn(d) * 0.02) if settings.visual else None

@@ -2,9 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+
+class Part(nn.Module):
+    """Called without a module's hooks, which nothing here uses: for one frame they cost as much as a product."""
+
+    def __call__(self, *args: Any) -> Any:
+        return self.forward(*args)
+
+
+class Linear(nn.Linear):
+    """Without hooks, as `Part`."""
+
+    __call__ = nn.Linear.forward
+
+
+class LayerNorm(nn.LayerNorm):
+    """Without hooks, as `Part`."""
+
+    __call__ = nn.LayerNorm.forward
 
 
 def split_heads(x: Tensor, heads: int) -> Tensor:
@@ -19,20 +40,20 @@ def join_heads(x: Tensor) -> Tensor:
     return x.transpose(1, 2).reshape(n, s, h * d)
 
 
-class FeedForward(nn.Module):
+class FeedForward(Part):
     """Widen to `hidden`, GELU, narrow."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
-        self.up = nn.Linear(width, hidden)
-        self.down = nn.Linear(hidden, width)
+        self.up = Linear(width, hidden)
+        self.down = Linear(hidden, width)
 
     def forward(self, x: Tensor) -> Tensor:
         out: Tensor = self.down(F.gelu(self.up(x)))
         return out
 
 
-class Modulation(nn.Module):
+class Modulation(Part):
     """adaLN (Peebles and Xie 2023): shifts, scales and gates of a block, from a condition.
 
     A fresh one leaves its block a plain one: shifts about 0, scales and gates about 1. DiT begins with gates of 0; at
@@ -43,18 +64,25 @@ class Modulation(nn.Module):
         """Vectors of `size` from a condition of `width`, one per letter of `kinds`: s(hift), c (scale) or g(ate)."""
         super().__init__()
         self.parts = len(kinds)
-        self.linear = nn.Linear(width, self.parts * size)
+        self.linear = Linear(width, self.parts * size)
         nn.init.normal_(self.linear.weight, std=0.5 * width**-0.5)
         with torch.no_grad():
             self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(size))
 
     def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
-        """Condition (N, D), SiLU already applied -> one (N, 1, size) per letter."""
-        return self.linear(condition)[:, None].chunk(self.parts, dim=-1)  # type: ignore[no-any-return]
+        """Condition (..., D), SiLU already applied -> one (..., size) per letter."""
+        return self.linear(condition).chunk(self.parts, dim=-1)
+
+    def of_tokens(self, condition: Tensor) -> tuple[Tensor, ...]:
+        """Condition (N, D) -> (N, 1, size) per letter, for all tokens of a sample; of a single sample (size,)."""
+        parts = self.linear(condition)
+        return (parts[0] if len(parts) == 1 else parts[:, None]).chunk(self.parts, dim=-1)
 
 
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
-    """LayerNorm of x (N, S, D) without weights of its own, then scale and shift (N, 1, D)."""
+    """LayerNorm of x (..., D) without weights of its own, then scale and shift, which broadcast to x."""
+    if shift.dim() == 1:  # one for all: LayerNorm applies it itself
+        return torch.layer_norm(x, x.shape[-1:], scale, shift)
     return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
 
 
@@ -64,7 +92,7 @@ def windows(x: Tensor, size: int) -> Tensor:
     return padded.unfold(1, size, 1).transpose(-1, -2)
 
 
-class Look(nn.Module):
+class Look(Part):
     """A query looks at a few tokens, then a feed-forward; pre-norm, residual.
 
     Keys and values of a token do not depend on its slot: what a slot means is added to the finished key. So a stream
@@ -74,12 +102,12 @@ class Look(nn.Module):
     def __init__(self, width: int, hidden: int, heads: int, slots: int) -> None:
         super().__init__()
         self.heads = heads
-        self.norm = nn.LayerNorm(width)
-        self.query = nn.Linear(width, width)
-        self.key_value = nn.Linear(width, 2 * width)
+        self.norm = LayerNorm(width)
+        self.query = Linear(width, width)
+        self.key_value = Linear(width, 2 * width)
         self.slots = nn.Parameter(torch.randn(slots, 2 * width) * 0.02)
-        self.out = nn.Linear(width, width)
-        self.ffn_norm = nn.LayerNorm(width)
+        self.out = Linear(width, width)
+        self.ffn_norm = LayerNorm(width)
         self.ffn = FeedForward(width, hidden)
 
     def keys(self, tokens: Tensor) -> Tensor:
@@ -90,8 +118,8 @@ class Look(nn.Module):
     def forward(self, x: Tensor, keys: Tensor) -> Tensor:
         """x (N, D) looking at keys (N, slots, 2D) -> (N, D)."""
         q = split_heads(self.query(self.norm(x))[:, None], self.heads)
-        k, v = (keys + self.slots).chunk(2, dim=-1)
-        seen = F.scaled_dot_product_attention(q, split_heads(k, self.heads), split_heads(v, self.heads))
+        k, v = split_heads(keys + self.slots, 2 * self.heads).chunk(2, dim=1)
+        seen = F.scaled_dot_product_attention(q, k, v)
         x = x + self.out(join_heads(seen)[:, 0])
         out: Tensor = x + self.ffn(self.ffn_norm(x))
         return out

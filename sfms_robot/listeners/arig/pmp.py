@@ -6,12 +6,12 @@ The outcome z conditions the sampler of the final motion (`diffusion`, or `codes
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from sfms_robot.listeners.arig.parts import Look
+from sfms_robot.listeners.arig.parts import LayerNorm, Look, Part
 
 
-class Progressive(nn.Module):
+class Progressive(Part):
     """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions."""
 
     def __init__(self, width: int, hidden: int, heads: int, sounds: int, motions: int, states: bool) -> None:
@@ -19,7 +19,7 @@ class Progressive(nn.Module):
         self.coarse = Look(width, hidden, heads, sounds)
         self.fine = Look(width, hidden, heads, 2 + states)
         self.temporal = Look(width, hidden, heads, motions)
-        self.norm = nn.LayerNorm(width)
+        self.norm = LayerNorm(width)
 
     def forward(
         self,

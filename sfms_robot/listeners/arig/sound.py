@@ -47,7 +47,7 @@ def hear(samples: Floats | None, ears: Ears) -> tuple[Floats, bool, Ears]:
         samples = np.zeros(FRAME_SAMPLES, dtype=np.float32)
     if len(samples) != FRAME_SAMPLES:
         raise ValueError(f"a frame at 16000 Hz has {FRAME_SAMPLES} samples or none, got {len(samples)}")
-    clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0)
+    clean = _finite(samples)
     rows, past = mel.log_mel(clean, ears.past)
     spoken, state = phase.step(clean, ears.phase)
     return np.concatenate([rows.reshape(-1), spoken]), present, Ears(past, state)
@@ -56,7 +56,7 @@ def hear(samples: Floats | None, ears: Ears) -> tuple[Floats, bool, Ears]:
 def track(samples: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """A whole recording (n,) -> features (N, 533) and speech (N,), N = n // 640: frame by frame what `hear` gives."""
     frames = len(samples) // FRAME_SAMPLES
-    clean = np.nan_to_num(samples[: frames * FRAME_SAMPLES], nan=0.0, posinf=0.0, neginf=0.0)
+    clean = _finite(samples[: frames * FRAME_SAMPLES])
     rows = mel.log_mel(clean, mel.start())[0].reshape(frames, MEL_WIDTH)
     voiced = phase.hear(voice_activity.levels_db(clean))
     return np.concatenate([rows, phase.features(phase.times(voiced))], axis=1), np.array(voiced, dtype=np.bool_)
@@ -67,6 +67,10 @@ def of_mel(rows: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     voiced = phase.hear(voice_activity.mel_levels_db(rows))
     features = np.concatenate([rows.reshape(len(rows), -1), phase.features(phase.times(voiced))], axis=1)
     return features, np.array(voiced, dtype=np.bool_)
+
+
+def _finite(samples: Floats) -> Floats:
+    return np.where(np.isfinite(samples), samples, np.float32(0))
 
 
 def fit_frame(samples: Floats | None) -> Floats | None:

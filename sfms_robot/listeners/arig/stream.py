@@ -26,6 +26,8 @@ from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sound import Ears
 from sfms_robot.listeners.space import MotionSpace
 
+BEYOND = 1e3  # rad, m or of a blendshape: no face
+
 
 @dataclass(frozen=True)
 class Memory:
@@ -166,12 +168,12 @@ class ArigListener:
         return now, user_sound
 
     def _face(self, speaker: SpeakerFrame) -> Tensor:
-        """(1, D) embedded; a face that is not finite is one not seen."""
-        face = torch.zeros(1, self.model.channels)
-        seen = speaker.face is not None and bool(np.isfinite(speaker.face.motion).all())
-        if speaker.face is not None and seen:
-            face = self.model.standardise(torch.from_numpy(self.space.encode(speaker.face.motion[None])))
-        return self.model.embed_face(face, torch.tensor([seen]))
+        """(1, D) embedded; what is not finite or beyond all faces is not seen: memory would never be rid of it."""
+        motion = None if speaker.face is None else speaker.face.motion
+        if motion is None or not np.abs(motion).max() < BEYOND:  # false for NaN too
+            return self.model.embed_face(torch.zeros(1, self.model.channels), torch.tensor([False]))
+        face = self.model.standardise(torch.from_numpy(self.space.encode(motion[None])))
+        return self.model.embed_face(face, torch.tensor([True]))
 
     def _in_view(self, memory: Memory) -> Tensor:
         """Keys and values of the whole chunks there are; `memory.frames` counts the newest frame."""

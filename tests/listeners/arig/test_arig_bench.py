@@ -5,7 +5,9 @@ from importlib import import_module
 import pytest
 from tiny_arig import arig_listener, talk
 
+from sfms_robot.app.bench.in_run import in_run
 from sfms_robot.app.bench.samplers import WAYS, samplers
+from sfms_robot.listeners import checkpoint
 
 bench = import_module("sfms_robot.app.bench.listener")  # the package's own `listener` is the function
 MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8}
@@ -34,3 +36,14 @@ def test_a_memory_minutes_old_goes_on(minutes: int):
     memory = bench._after_minutes(listener, minutes)
     assert memory.frames == minutes * 1500
     assert len(bench._steps(listener, memory, talk(5), 12)) == 12
+
+
+@pytest.mark.slow
+def test_a_listener_is_measured_beside_the_servo_loop(tmp_path):
+    listener = arig_listener()
+    checkpoint.save_config(tmp_path, listener.settings)
+    checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, listener.model)
+    found = in_run(tmp_path, duration_s=2.0)
+    assert (found["frames"], found["duration_s"]) == (50, 2.0)
+    assert found["frames_per_s"] > 0 and found["frame_to_wire_ms"]["p99"] > 0
+    assert 0 <= found["late_ticks"] <= found["ticks"]

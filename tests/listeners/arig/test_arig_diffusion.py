@@ -29,7 +29,7 @@ def test_sampling_is_equation_4_where_nothing_is_clamped():
         index = len(model.levels) - 1 - step
         before = share[index - 1] if index else torch.tensor(1.0)
         alpha = share[index] / before
-        found = model(x[:, None], model.modulate(z, model.level(torch.full((4,), level))))[:, 0]
+        found = model(x, model.modulate(z, model.level(torch.full((4,), level))))
         mean = (x - (1 - alpha) / (1 - share[index]).sqrt() * found) / alpha.sqrt()
         sigma = ((1 - alpha) * (1 - before) / (1 - share[index])).sqrt()
         x = (mean + (sigma * noise[:, step + 1] if index else 0)).float()
@@ -44,7 +44,7 @@ def test_ddim_keeps_the_noise_it_found():
     x = noise[:, 0]
     for index in reversed(range(5)):
         level = model.level(torch.full((4,), model.levels[index]))
-        found = model(x[:, None], model.modulate(z, level))[:, 0]
+        found = model(x, model.modulate(z, level))
         clean = (x - (1 - share[index]).sqrt() * found) / share[index].sqrt()
         before = share[index - 1] if index else torch.tensor(1.0)
         x = before.sqrt() * clean + (1 - before).sqrt() * found
@@ -58,6 +58,16 @@ def test_levels_worked_out_beforehand_change_nothing(sampler: str):
     z, noise = torch.randn(2, 8), torch.randn(2, 5, 3)
     levels = model.level(torch.tensor(model.levels))
     torch.testing.assert_close(model.sample(z, noise, levels), model.sample(z, noise))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
+def test_one_sample_is_drawn_as_it_is_among_many(sampler: str):
+    """A single condition takes a shorter way: LayerNorm itself applies the modulation."""
+    model = denoiser(sampler=sampler)
+    z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
+    alone = torch.cat([model.sample(z[i : i + 1], noise[i : i + 1]) for i in range(4)])
+    torch.testing.assert_close(alone, model.sample(z, noise), rtol=1e-4, atol=1e-4)
 
 
 @torch.no_grad()

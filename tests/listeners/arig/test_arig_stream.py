@@ -170,6 +170,17 @@ def test_what_is_not_finite_is_a_face_not_seen_and_silence(tiny):
     np.testing.assert_array_equal(streamed(tiny, broken), streamed(tiny, silent))
 
 
+@pytest.mark.parametrize("size", [1e4, 1e30, -1e38])
+def test_what_is_beyond_all_faces_is_not_seen_and_loudness_without_measure_is_lived_through(tiny, size: float):
+    speaker = talk(10)
+    wild = [dataclasses.replace(f, face=dataclasses.replace(f.face, pose=f.face.pose * 0 + size)) for f in speaker]
+    blind = [dataclasses.replace(f, face=None) for f in speaker]
+    np.testing.assert_array_equal(streamed(tiny, wild), streamed(tiny, blind))
+    loud = [dataclasses.replace(f, audio=np.full_like(f.audio, size), agent_audio=-f.audio * size) for f in speaker]
+    with np.errstate(over="ignore"):
+        assert np.isfinite(streamed(tiny, loud[:3] + speaker)).all()
+
+
 def test_a_robot_that_falls_silent_listens_on(tiny):
     """Agent audio shorter than the run, its last frame cut short."""
     speaker = talk(20)

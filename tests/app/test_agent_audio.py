@@ -1,0 +1,107 @@
+"""`run --agent-audio` from end to end in virtual time: the robot's own voice, ARIG, emulated servos."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from sfms_robot import config
+from sfms_robot.app.replay import read_recording
+from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.cli.main import main
+from sfms_robot.data import data_dir
+from sfms_robot.frames import CHANNEL_INDEX
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.arig.csu import STATES
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.registry import load_listener
+from sfms_robot.sources.recording import open_source
+
+SHIPPED = data_dir("configs") / "listeners" / "arig-small"
+RAW = {"kind": "arig", "width": 16, "feedforward": 24, "heads": 2, "context_chunks": 4, "context_layers": 1}
+JAW = CHANNEL_INDEX["jawOpen"]
+trained = pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
+
+
+@pytest.fixture(scope="module")
+def seeded(tmp_path_factory):
+    """A small ARIG with seeded weights: it moves for nothing in particular."""
+    folder = tmp_path_factory.mktemp("arig")
+    settings = config.parse(config.Arig, RAW | {"diffusion": {"width": 10, "steps": 4, "train_steps": 50}}, "tiny")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = ArigModel(settings)
+    model.motion_std.fill_(0.02)
+    model.motion_mean[6:] = 0.2
+    checkpoint.save_config(folder, settings)
+    checkpoint.save_weights(folder / checkpoint.WEIGHTS, model)
+    return folder
+
+
+def voice(file, seconds: float):
+    """A shipped voice, cut off after so many seconds."""
+    samples, rate = soundfile.read(data_dir("sim") / "speakers" / "katie" / "speech.wav")
+    assert len(samples) >= seconds * rate
+    soundfile.write(file, samples[: int(seconds * rate)], rate)
+    return str(file)
+
+
+def run(listener, **options):
+    return run_head(dataclasses.replace(RunOptions(listener=str(listener), fast=True, seed=3), **options))
+
+
+def test_a_voice_shorter_than_the_run_ends_and_the_head_goes_on(seeded, tmp_path):
+    said = voice(tmp_path / "said.wav", 1.0)
+    done = run(seeded, agent_audio=said, duration_s=3.0)
+    assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 75, 0)
+    mute = run(seeded, duration_s=3.0)
+    assert done["wire"]["main"]["sha256"] != mute["wire"]["main"]["sha256"]
+    assert done == run(seeded, agent_audio=said, duration_s=3.0)
+
+
+def test_a_robot_that_only_speaks_needs_nobody_to_hear(seeded, tmp_path):
+    done = run(seeded, audio="none", face="none", agent_audio=voice(tmp_path / "said.wav", 2.0))
+    assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 50, 0)
+
+
+@trained
+def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_path):
+    run(SHIPPED, agent_audio=voice(tmp_path / "said.wav", 4.0), duration_s=9.0, record=tmp_path / "run")
+    shown = read_recording(tmp_path / "run")
+    jaw, at_s = shown.motion[:, JAW], shown.times_s
+    talking, after = jaw[(at_s > 0.5) & (at_s < 4.0)], jaw[at_s > 5.5]
+    assert np.std(talking) > 2 * np.std(after) and np.mean(talking) > 2 * np.mean(after)
+
+
+@trained
+def test_a_robot_that_stops_speaking_while_somebody_talks_listens_within_a_second(tmp_path):
+    listener = load_listener(SHIPPED)
+    memory, states = listener.start(3), []
+    for frame in open_source(duration_s=6.0, agent_audio=voice(tmp_path / "said.wav", 4.0)).read(6.0):
+        _, memory = listener.step(frame, memory)
+        states.append(STATES[memory.state])
+    assert "listening" not in states[75:99] and set(states[75:99]) <= {"speaking", "interrupted", "giving_feedback"}
+    assert states[125] == "listening"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("nowhere.wav", ["nowhere.wav", "no such file", "none", "katie"]),
+        ("text.wav", ["text.wav"]),
+        ("empty.wav", ["empty.wav"]),
+        (".", ["is a folder, not a sound file"]),
+        ("loopback", ["loopback", "not available yet"]),
+    ],
+)
+def test_a_voice_that_cannot_be_used_is_one_clear_line(given: str, said, seeded, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.wav").write_text("hello")
+    soundfile.write(tmp_path / "empty.wav", [], 16_000)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", "--fast", "--duration", "1", "--listener", str(seeded), "--agent-audio", given])
+    told = capsys.readouterr().err.strip()
+    assert ended.value.code == 2 and len(told.splitlines()) == 1, told
+    assert all(word in told for word in said), told

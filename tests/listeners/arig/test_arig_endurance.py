@@ -1,0 +1,103 @@
+"""Ten minutes of what conversations do not have: silence of both, and two clocks that drift apart."""
+
+import numpy as np
+import pytest
+import torch
+from tiny_arig import arig_listener
+
+from sfms_robot.data import data_dir
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.arig import load, sound
+from sfms_robot.listeners.arig.diffusion import Denoiser
+
+FRAMES = 600 * FRAME_HZ
+SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
+PPM = 200e-6
+SHIPPED = data_dir("configs") / "listeners" / "arig-small"
+
+
+def silent_minutes(listener, frames: int = FRAMES) -> np.ndarray:
+    """(frames, 58)."""
+    memory, out = listener.start(0), np.zeros((frames, 58), np.float32)
+    for index in range(frames):
+        plan, memory = listener.step(SpeakerFrame((index + 1) * FRAME_S, SILENCE, None, SILENCE), memory)
+        out[index] = plan.frames[0]
+    return out
+
+
+def head_speed_rad_s(motion: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.diff(motion[:, :3].astype(float), axis=0), axis=1) / FRAME_S
+
+
+@pytest.mark.slow
+def test_ten_silent_minutes_stay_within_the_range_of_motion_and_the_steps_that_were_set():
+    """Steps are drawn: each is at most 2 deviations of 0.01 rad, and where they lead is held to 0.1 rad of the mean."""
+    listener = arig_listener(draws="step")
+    model = listener.model
+    assert isinstance(model.head, Denoiser)
+    with torch.no_grad():
+        model.head.low.fill_(-2.0)
+        model.head.high.fill_(2.0)
+        model.motion_low.fill_(-1.0)
+        model.motion_high.fill_(1.0)
+        model.motion_std.fill_(0.1)
+        model.motion_mean.fill_(0.5)
+        model.step_std.fill_(0.1)
+    out = silent_minutes(listener)
+    assert np.isfinite(out).all() and 0.399 < out.min() and out.max() < 0.601
+    assert head_speed_rad_s(out[1:]).max() <= 2 * 0.01 * np.sqrt(3) / FRAME_S + 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
+def test_the_shipped_listener_lives_calmly_through_ten_silent_minutes():
+    out = silent_minutes(load(SHIPPED))
+    assert np.isfinite(out).all()
+    speed = head_speed_rad_s(out)
+    assert np.percentile(speed, 99) < 1.0 and speed.max() < 3.0  # slower than a neck's 2 to 3 rad/s may be
+    late = out[-60 * FRAME_HZ :, :3]
+    assert 1e-4 < late.std(0).max() < 0.3  # alive in the last minute, and near where a head is held
+    assert np.abs(late.mean(0)).max() < 0.5
+
+
+def drifting(samples: np.ndarray, ppm: float) -> list[np.ndarray]:
+    """The agent's track as it arrives with the frames of a microphone whose clock runs slower by `ppm`."""
+    ends = np.floor(np.arange(len(samples) // FRAME_SAMPLES + 1) * FRAME_SAMPLES * (1 + ppm)).astype(int)
+    return [samples[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True) if end <= len(samples)]
+
+
+@pytest.mark.parametrize("ppm", [PPM, -PPM])
+def test_ten_minutes_of_clock_drift_do_not_add_up(ppm: float):
+    """What is heard in a frame is what was said in it: 1920 samples of drift in all, one at most in any frame."""
+    rng = np.random.default_rng(0)
+    loud = np.repeat(rng.random(300) > 0.5, 2 * AUDIO_HZ)  # bursts of 2 s
+    said = (rng.normal(0, 0.1, len(loud)) * np.where(loud, 1.0, 1e-3)).astype(np.float32)
+    frames = drifting(said, ppm)
+    assert {len(frame) for frame in frames} == {FRAME_SAMPLES, FRAME_SAMPLES + (1 if ppm > 0 else -1)}
+    ears, heard, at = sound.start(), [], 0
+    levels = []
+    for frame in frames:
+        _, present, ears = sound.hear(sound.fit_frame(frame), ears)
+        assert present
+        heard.append(ears.voiced)
+        levels.append(bool(loud[at : at + len(frame)].mean() > 0.5))
+        at += len(frame)
+    truth, found = np.array(levels), np.array(heard)
+    edges = np.flatnonzero(np.diff(truth.astype(int)))
+    near = np.zeros(len(truth), bool)
+    for edge in edges:
+        near[edge - 1 : edge + 4] = True  # two loud frames in a row are speech
+    np.testing.assert_array_equal(found[100:][~near[100:]], truth[100:][~near[100:]])
+
+
+@pytest.mark.slow
+def test_a_listener_runs_through_ten_minutes_of_clock_drift():
+    rng = np.random.default_rng(1)
+    said = rng.normal(0, 0.05, FRAMES * FRAME_SAMPLES + AUDIO_HZ).astype(np.float32)
+    listener = arig_listener()
+    memory = listener.start(0)
+    for index, frame in enumerate(drifting(said, PPM)[:FRAMES]):
+        plan, memory = listener.step(SpeakerFrame((index + 1) * FRAME_S, SILENCE, None, frame), memory)
+        assert np.isfinite(plan.frames).all()
+    assert memory.frames == FRAMES
