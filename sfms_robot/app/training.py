@@ -19,7 +19,9 @@ from sfms_robot.learning import listener, tokenizer
 from sfms_robot.learning.arig.trainer import train_arig
 from sfms_robot.learning.datasets.collection import Order
 from sfms_robot.learning.job import Run
+from sfms_robot.learning.resume import checkpoint_file
 from sfms_robot.learning.watch import Watch, progress_bar, tensorboard, together
+from sfms_robot.listeners import checkpoint
 
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -28,7 +30,8 @@ DEVICES = ("auto", "cpu", "cuda")
 class TrainOptions:
     """What the command line says. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
 
-    `order` is that of the channels in the data, if not its layout's own.
+    `order` is that of the channels in the data, if not its layout's own. `overwrite`: what an earlier training left in
+    `out` may be lost.
     """
 
     file: Path
@@ -40,6 +43,7 @@ class TrainOptions:
     placement: str | None = None
     tensorboard: bool | None = None
     order: Order | None = None
+    overwrite: bool = False
 
 
 def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
@@ -47,6 +51,7 @@ def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
     settings = train_settings(options, "tokenizer")
     if isinstance(settings, config.ArigTraining):
         raise ConfigError(f"{options.file}: listener.kind = 'arig' has no tokenizer; `train listener` is all of it")
+    _spare(options, tokenizer.WEIGHTS, "tokenizer")
     with run_of(options) as run:
         began_s = time.monotonic()
         return _timed(tokenizer.train_tokenizer(settings, options.data, options.out, run, options.order), began_s)
@@ -57,11 +62,21 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
     settings = train_settings(options, "predictor")
     if isinstance(settings, config.ArigTraining) and options.order is not None:
         raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
+    _spare(options, checkpoint.WEIGHTS, "arig" if isinstance(settings, config.ArigTraining) else "listener")
     with run_of(options) as run:
         began_s = time.monotonic()
         if isinstance(settings, config.ArigTraining):
             return _timed(train_arig(settings, options.data, options.out, run), began_s)
         return _timed(listener.train_listener(settings, options.data, options.out, run, options.order), began_s)
+
+
+def _spare(options: TrainOptions, weights: str, job: str) -> None:
+    """Raise ConfigError where this training would be the end of an earlier one."""
+    if options.resume or options.overwrite:
+        return
+    for file in (options.out / weights, checkpoint_file(options.out, job)):
+        if file.exists():
+            raise ConfigError(f"{file} is of an earlier training: --resume goes on with it, --overwrite begins anew")
 
 
 def device_of(name: str) -> torch.device:

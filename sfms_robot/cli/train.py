@@ -35,6 +35,7 @@ CONFIG = typer.Option(..., help="A configs/training/*.yaml, or your own.")
 DATA = typer.Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
 OUT = typer.Option(..., help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
 RESUME = typer.Option(False, "--resume", help="Go on from the checkpoint in --out, with the same settings and data.")
+OVERWRITE = typer.Option(False, "--overwrite", help="Train anew although --out holds an earlier training.")
 DEVICE = typer.Option(Device.auto, help="auto: the GPU if there is one.")
 STEPS = typer.Option(None, min=1, help="Another number of steps than the file's.")
 TENSORBOARD = typer.Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
@@ -48,6 +49,7 @@ def tokenizer(
     data: Path = DATA,
     out: Path = OUT,
     resume: bool = RESUME,
+    overwrite: bool = OVERWRITE,
     device: Device = DEVICE,
     steps: int | None = STEPS,
     placement: Placement | None = typer.Option(None, help="Another keyframe placement than the file's, to compare."),
@@ -60,7 +62,7 @@ def tokenizer(
 
     placed = placement.value if placement else None
     options = TrainOptions(
-        config, data, out, resume, device.value, steps, placed, tensorboard, order.value if order else None
+        config, data, out, resume, device.value, steps, placed, tensorboard, order.value if order else None, overwrite
     )
     _print(interruptible(lambda: train_tokenizer(options)), json)
 
@@ -71,6 +73,7 @@ def listener(
     data: Path = DATA,
     out: Path = OUT,
     resume: bool = RESUME,
+    overwrite: bool = OVERWRITE,
     device: Device = DEVICE,
     steps: int | None = STEPS,
     tensorboard: bool | None = TENSORBOARD,
@@ -81,7 +84,7 @@ def listener(
     from sfms_robot.app.training import TrainOptions, train_listener
 
     options = TrainOptions(
-        config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None
+        config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None, overwrite
     )
     _print(interruptible(lambda: train_listener(options)), json)
 

@@ -19,13 +19,22 @@ Placement = Literal["exact", "static", "static_paper", "learned_paper", "learned
 
 
 class ChannelGroup(Model):
-    """Channels that share one keyframe track: at most one code per frame, from `levels[0] * levels[1] * ...`."""
+    """Channels that share one keyframe track: at most one code per frame, from `levels[0] * levels[1] * ...`.
+
+    Attributes:
+        keyframes: of a window; transition_bias: on the logit of class 0, more for fewer keyframes.
+        nucleus: in place of that of `sampling`.
+        nucleus_in_silence: in place of nucleus once nobody has spoken for 3.2 s; needs a listener with `phase`.
+        guidance: how much more than in training the speaker decides what is drawn (`listeners.sfms.draw`); 1: no more.
+    """
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]
     levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
     keyframes: Count
     transition_bias: Finite = 0.0
     nucleus: Annotated[float, Field(gt=0, le=1)] | None = None
+    nucleus_in_silence: Annotated[float, Field(gt=0, le=1)] | None = None
+    guidance: Annotated[float, Field(ge=0, le=20)] = 1.0
 
     @property
     def codes(self) -> int:
@@ -156,6 +165,9 @@ class Sfms(Listener):
             raise ValueError(f"groups: no group holds {', '.join(missing)}")
         if len({len(group.levels) for group in self.groups.values()}) != 1:
             raise ValueError("groups: every group needs the same number of levels")
+        for name, group in self.groups.items():
+            if group.nucleus_in_silence is not None and not self.phase:
+                raise ValueError(f"groups.{name}.nucleus_in_silence: without phase silence is not known")
         if self.wav2vec2 is not None and self.audio != "wav2vec2":
             raise ValueError(f"wav2vec2: audio is {self.audio}, which needs no model")
         if self.hop_frames > self.future_frames:

@@ -3,7 +3,8 @@
 Teacher forcing never shows the model its own mistakes, so left to itself it places keyframes somewhat too often or
 too rarely, and looks restless or frozen. A bias on class 0 per group moves that rate. Nods are rarer than keyframes and
 end up too many or too few at the same rate of keyframes: how much of the tail the group that pitches the head may draw
-from decides that, so of several nuclei the one that nods as often as the people did is taken.
+from decides that, so of several nuclei the one that nods as often as the people did is taken. Guidance and the nucleus
+in silence are the recipe's: a few dyads hold far too few nods to tell when they come.
 """
 
 from __future__ import annotations

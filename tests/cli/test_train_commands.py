@@ -129,6 +129,20 @@ def test_nothing_to_resume(fails, arguments):
     assert code == 2 and "checkpoint-tokenizer.safetensors: no checkpoint to resume from" in told
 
 
+def test_an_earlier_training_is_not_lost_unasked(capsys, fails, arguments, tmp_path):
+    done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+    weights = tmp_path / "out" / "tokenizer.safetensors"
+    before = weights.read_bytes()
+    code, told = fails("tokenizer", *arguments(), "--steps", "3")
+    assert code == 2 and f"{weights} is of an earlier training: --resume goes on with it, --overwrite" in told
+    assert weights.read_bytes() == before
+    weights.unlink()
+    code, told = fails("tokenizer", *arguments(), "--steps", "3")
+    assert code == 2 and "checkpoint-tokenizer.safetensors is of an earlier training" in told
+    anew, _ = done(capsys, "tokenizer", *arguments(), "--no-tensorboard", "--steps", "3", "--overwrite")
+    assert anew["steps"] == 3 and weights.exists()
+
+
 def test_a_checkpoint_of_another_configuration(capsys, fails, arguments):
     done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
     raw = tiny()

@@ -31,6 +31,13 @@ def tiny_listener(**changes) -> SfmsListener:
         return SfmsListener(settings, SfmsModel(settings))
 
 
+def guided_listener(guidance: float, **changes) -> SfmsListener:
+    """The same weights; the speaker decides on the neck's tokens `guidance` times as much."""
+    groups = tiny_settings().model_dump()["groups"]
+    groups["neck"]["guidance"] = guidance
+    return tiny_listener(groups=groups, **changes)
+
+
 def speech(frames: int, seed: int = 0, face: bool = True, audio: bool = True) -> list[SpeakerFrame]:
     rng = np.random.default_rng(seed)
     out = []

@@ -1,4 +1,16 @@
-"""Tokens out of probabilities: frame by frame, every group at once, many streams at a time."""
+"""Tokens out of probabilities: frame by frame, every group at once, many streams at a time.
+
+A group may be guided (Ho and Salimans 2022, classifier-free guidance, there for diffusion): training leaves voice and
+face out now and then, so the predictor also knows what its classes are with nobody there, and
+
+    guided = unheard + guidance * (heard - unheard),   logits, per group and class.
+
+Above 1 what the speaker does weighs more than it did in training: movement that he makes likelier becomes more frequent
+still, and restlessness that nobody called for rarer. The paper has none, which is guidance 1 and takes no time.
+
+Listeners are trained while somebody speaks. When nobody has for a while (from 1.6 s of silence on, wholly from 3.2 s)
+little was learned: guidance fades to 1 there, and a group may draw from a smaller nucleus, which keeps it still.
+"""
 
 from __future__ import annotations
 
@@ -11,48 +23,88 @@ from sfms_robot import config
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, Trail, trails
 from sfms_robot.listeners.sfms.reach import Reach
+from sfms_robot.signals.phase import PHRASE_KNOTS_S, SILENCE_KNOTS_S, SPEECH_KNOTS_S
 
+# 1 at the hats of `phase.features` that stand for silence up to 1.6 s: their sum falls from 1 there to 0 at 3.2 s.
+SILENCE_LATELY = torch.tensor(
+    [0.0] * len(SPEECH_KNOTS_S) + [float(knot <= 1.6) for knot in SILENCE_KNOTS_S] + [0.0] * len(PHRASE_KNOTS_S)
+)
 LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing, and sorting it takes time
 
 
-def draw(
-    model: SfmsModel,
-    settings: config.Sfms,
-    reach: Reach,
-    seen: Context,
-    generators: Sequence[torch.Generator],
-) -> Tensor:
-    """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b by the numbers of generators[b]."""
-    predictor, tokens = model.predictor, seen.tokens.clone()
-    first = int((tokens[0] > UNDECIDED).all(-1).sum())  # the same for all streams
-    future = tokens.shape[1] - settings.future_frames
-    groups = list(settings.groups.values())
-    bias = torch.tensor([group.transition_bias for group in groups])
-    nucleus = torch.tensor([group.nucleus or settings.sampling.nucleus for group in groups])
-    past = trails(tokens)
-    slots = predictor(seen, past)  # (B, H, W)
-    trail = Trail(*(part[:, first - 1] for part in past))
-    left = tokens.shape[1] - first
-    chances = torch.stack([torch.rand(left, len(groups), generator=one) for one in generators], dim=1)
-    for frame, chance in enumerate(chances, first):
-        logits = predictor.classes(slots[:, frame - future], trail, frame - 1)  # (B, G, V)
-        logits = logits.masked_fill(reach.too_soon(trail.tokens[..., 0], frame - trail.at[..., 0]), -torch.inf)
-        drawn = sample(logits / settings.sampling.temperature, bias, nucleus, chance)
-        tokens[:, frame] = drawn
-        trail = trail.then(drawn, frame)
-    return tokens
+class Sampler:
+    """How the tokens of one listener are drawn: its predictor, and what its settings say of every group."""
+
+    @torch.no_grad()
+    def __init__(self, settings: config.Sfms, model: SfmsModel) -> None:
+        groups, common = list(settings.groups.values()), settings.sampling
+        self._predictor = model.predictor
+        self._reach = Reach(model)
+        self._future = settings.future_frames
+        self._bias = torch.tensor([group.transition_bias for group in groups])
+        self._nucleus = torch.tensor([group.nucleus or common.nucleus for group in groups])
+        self._temperature = common.temperature
+        alone = [group.nucleus_in_silence or group.nucleus or common.nucleus for group in groups]
+        self._nucleus_in_silence = torch.tensor(alone)
+        self._guidance = torch.tensor([group.guidance for group in groups])[:, None]
+        guided = any(group.guidance != 1.0 for group in groups)
+        self._nobody = model.predictor.nobody(settings.past_frames) if guided else None
+
+    def draw(self, seen: Context, generators: Sequence[torch.Generator]) -> Tensor:
+        """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b by the numbers of generators[b]."""
+        tokens = seen.tokens.clone()
+        first = int((tokens[0] > UNDECIDED).all(-1).sum())  # the same for all streams
+        future = tokens.shape[1] - self._future
+        past = trails(tokens)
+        slots = self._predictor(seen, past, self._nobody)  # (B, H, W)
+        if self._nobody is not None:
+            slots = slots.unflatten(0, (2, -1))  # with the speaker, and with nobody
+        trail = Trail(*(part[:, first - 1] for part in past))
+        left, groups = tokens.shape[1] - first, tokens.shape[2]
+        chances = torch.stack([torch.rand(left, groups, generator=one) for one in generators], dim=1)
+        lately = self._lately(seen)
+        guidance = 1 + (self._guidance - 1) * lately[:, None, None]  # (1 or B, G, 1)
+        nucleus = self._nucleus_in_silence + (self._nucleus - self._nucleus_in_silence) * lately[:, None]
+        for frame, chance in enumerate(chances, first):
+            logits = self._logits(slots[..., frame - future, :], trail, frame - 1, guidance)  # (B, G, V)
+            logits = logits.masked_fill(
+                self._reach.too_soon(trail.tokens[..., 0], frame - trail.at[..., 0]), -torch.inf
+            )
+            drawn = sample(logits / self._temperature, self._bias, nucleus, chance)
+            tokens[:, frame] = drawn
+            trail = trail.then(drawn, frame)
+        return tokens
+
+    def _lately(self, seen: Context) -> Tensor:
+        """(1 or B,) 1 where somebody speaks or did 1.6 s ago, 0 from 3.2 s of silence on; 1 if that is unknown."""
+        silence = seen.phase[:, -1] @ SILENCE_LATELY if seen.phase.shape[-1] else torch.ones(len(seen.heard))
+        return torch.where(seen.heard[:, -1], silence, 1.0)
+
+    def _logits(self, slots: Tensor, trail: Trail, frame: int, guidance: Tensor) -> Tensor:
+        """(B, G, V) of slots (B, W), or (2, B, W) where a group is guided."""
+        logits = self._predictor.classes(slots, trail, frame)
+        if self._nobody is None:
+            return logits
+        heard, unheard = logits
+        return guided(heard, unheard, guidance)
+
+
+def guided(heard: Tensor, unheard: Tensor, guidance: Tensor) -> Tensor:
+    """Logits (..., G, V) with the speaker and with nobody, guidance (..., G, 1) -> logits; `heard` where that is 1."""
+    untouched = (guidance == 1) | heard.isinf()  # classes that a group lacks
+    return torch.where(untouched, heard, unheard + guidance * (heard - unheard))
 
 
 def sample(logits: Tensor, bias: Tensor, nucleus: Tensor, chance: Tensor) -> Tensor:
-    """One class (..., G) of each logits (..., G, V): bias (G,) on class 0, then the likeliest that hold `nucleus` (G,).
+    """One class (..., G) of each logits (..., G, V): bias (G,) on class 0, then the likeliest that hold `nucleus`.
 
-    `chance` (..., G) in 0..1 says where in that mass: a class is drawn as often as it is likely.
+    `chance`, both (..., G) in 0..1, says where in that mass: a class is drawn as often as it is likely.
     """
     biased = logits.clone()
     biased[..., 0] += bias
     order = torch.softmax(biased, dim=-1).topk(min(LIKELIEST, logits.shape[-1]))
     mass = order.values.cumsum(-1)
-    kept = ((mass - order.values) < nucleus[:, None]).sum(-1, keepdim=True)
+    kept = ((mass - order.values) < nucleus[..., None]).sum(-1, keepdim=True)
     whole = mass.gather(-1, kept - 1)
     place = torch.minimum((mass <= chance[..., None] * whole).sum(-1, keepdim=True), kept - 1)
     return order.indices.gather(-1, place)[..., 0]

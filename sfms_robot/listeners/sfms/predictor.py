@@ -114,29 +114,46 @@ class Predictor(nn.Module):
         self.own = nn.ModuleList(Block(width, heads) for _ in range(layers))
         self.slots = nn.Parameter(torch.randn(future, width) * 0.02)
         self.role = nn.Parameter(torch.randn(3, width) * 0.02)
-        self.phase_in = nn.Linear(speaker.phase_in.in_features, width) if speaker.phase_in is not None else None
+        self.phase_size = 0 if speaker.phase_in is None else speaker.phase_in.in_features
+        self.phase_in = nn.Linear(self.phase_size, width) if self.phase_size else None
         self.decoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
         self.trail_in = nn.Linear(described, width) if sequential else None
         self.chain = FeedForward(width) if sequential else None
         self.norm = nn.LayerNorm(width)
         self.classify = nn.Linear(width, int(classes.sum()))
 
-    def forward(self, context: Context, trail: Trail | None = None) -> Tensor:
+    def forward(self, context: Context, trail: Trail | None = None, nobody: Tensor | None = None) -> Tensor:
         """What is known about every future frame without knowing those before it: (B', H, W).
 
         `trail`: what `trails` finds in the context's tokens, for those who need it themselves.
+        `nobody` (1, 2P, W), what `nobody` gives: (2B', H, W), and the second half knows the listener's own tokens only.
         """
-        speaker = self.speaker(context.face, context.face_known, context.voice, context.heard, context.phase)
-        own = self._own(context.tokens, trails(context.tokens) if trail is None else trail)
-        speaker = speaker + self.role[:2].repeat_interleave(context.heard.shape[1], dim=0)
-        memory = torch.cat([speaker.expand(len(own), -1, -1), own + self.role[2]], dim=1)  # (B', 2P + P + H, W)
+        c = context
+        speaker = self.speaker(c.face, c.face_known, c.voice, c.heard, c.phase)
+        own = self._own(c.tokens, trails(c.tokens) if trail is None else trail)
+        newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(len(own), -1)
+        speaker = speaker.expand(len(own), -1, -1)
+        if nobody is not None:
+            speaker, own = torch.cat([speaker, nobody.expand_as(speaker)]), own.repeat(2, 1, 1)
+            newest = torch.cat([newest, torch.zeros_like(newest)])
+        speaker = speaker + self.role[:2].repeat_interleave(c.heard.shape[1], dim=0)
+        memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B', 2P + P + H, W)
         x = self.slots + own[:, -self.future :]
         if self.phase_in is not None:
-            newest = torch.where(context.heard[:, -1:], context.phase[:, -1], 0.0)
             x = x + self.phase_in(newest)[:, None]
         for block in self.decoder:
             x = block(x, memory=memory)
         return x
+
+    def nobody(self, frames: int) -> Tensor:
+        """(1, 2 * frames, W): the speaker where there is none, neither heard nor seen; the same at all times."""
+        away = torch.zeros(1, frames, dtype=torch.bool, device=self.slots.device)
+        face, voice, phase = (
+            self.slots.new_zeros(1, frames, size)
+            for size in (self.speaker.face_in.in_features, self.slots.shape[1], self.phase_size)
+        )
+        out: Tensor = self.speaker(face, away, voice, away, phase)
+        return out
 
     def _own(self, tokens: Tensor, trail: Trail) -> Tensor:
         """Tokens (B, P + H, G) and their trail -> (B, P + H, W)."""

@@ -18,11 +18,10 @@ from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, Plan, SpeakerFrame
-from sfms_robot.listeners.sfms.draw import draw
+from sfms_robot.listeners.sfms.draw import Sampler
 from sfms_robot.listeners.sfms.hearing import Ears, Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
-from sfms_robot.listeners.sfms.reach import Reach
 from sfms_robot.listeners.space import MotionSpace
 
 # Channels of any motion space that turn or move the head.
@@ -92,7 +91,7 @@ class SfmsListener:
         self.model = model.eval()
         self.space = space or MotionSpace.of(settings)
         self.hearing = hearing or Hearing.of(settings)
-        self.reach = Reach(self.model)
+        self.sampler = Sampler(settings, self.model)
         head = [float(channel in HEAD) for channel in settings.channels]
         self._smoothing = settings.sampling.smoothing * torch.tensor(head)
         self._neutral = neutral_tokens(self.model, self.space, settings.past_frames)
@@ -168,7 +167,7 @@ class SfmsListener:
 
     def plan(self, seen: Context, path: Tensor, generators: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
         """New plans of B streams: tokens (B, P + H, G), path (B, 2 + H, C). `path` is the old one, as played so far."""
-        tokens = draw(self.model, self.settings, self.reach, seen, generators)
+        tokens = self.sampler.draw(seen, generators)
         decoded = self.model.tokenizer.decode(tokens, last=self.horizon + 2)
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 

@@ -4,11 +4,11 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from tiny_sfms import plans_of, speech, tiny_listener
+from tiny_sfms import guided_listener, plans_of, speech, tiny_listener
 
 from sfms_robot.config.listener import default_hop
 from sfms_robot.frames import FRAME_S, SpeakerFrame
-from sfms_robot.listeners.sfms.draw import draw, sample
+from sfms_robot.listeners.sfms.draw import sample
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.stream import join, neutral_tokens
 from sfms_robot.signals import phase
@@ -48,7 +48,7 @@ def offline(listener, speaker, seed):
         own = tokens[None, past.start : past.stop + h].clone()
         own[:, p + decided - (now + 1) :] = UNDECIDED
         seen = Context(*(x[None, past] for x in (face, known, voice, known, place)), own)
-        drawn = draw(model, settings, listener.reach, seen, [generator])
+        drawn = listener.sampler.draw(seen, [generator])
         tokens[past.stop : past.stop + h] = drawn[0, p:]
         decided = now + 1 + h
         window = model.tokenizer.decode(drawn)[0]
@@ -61,7 +61,15 @@ def offline(listener, speaker, seed):
 @pytest.mark.parametrize("hop", [1, 4, 8])
 @pytest.mark.parametrize("changes", [{}, {"sequential": False, "phase": False}, {"audio": "mfcc78"}])
 def test_stream_equals_offline(hop: int, changes: dict):
-    listener = tiny_listener(hop=hop, **changes)
+    is_offline(tiny_listener(hop=hop, **changes))
+
+
+@pytest.mark.parametrize("guidance", [0.5, 3.0])
+def test_a_guided_stream_equals_offline(guidance: float):
+    is_offline(guided_listener(guidance))
+
+
+def is_offline(listener):
     speaker = speech(61)
     expected = offline(listener, speaker, seed=3)
     streamed = plans_of(listener, speaker, seed=3)
