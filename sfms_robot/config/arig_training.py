@@ -44,6 +44,7 @@ class ArigPhase(Phase):
         state_weight: of the states' cross-entropy (3.3); coarse_weight: of the coarse motion's squared error (3.4);
             equation (3) weighs 1. The paper gives no weights.
         history_noise: most that the past motion is off by, in standard deviations: in a stream it is the model's own.
+        speaking_noise: likewise of jaw and mouth while the agent speaks: what it says decides them, not what they did.
         state_noise: share of previous states that are drawn by lot: true ones would be copied, and a stream has none.
         drop_audio, drop_face: share of windows in which the user is not heard, not seen; drop_agent: of those in which
             the agent says nothing, that have no agent's track.
@@ -56,6 +57,7 @@ class ArigPhase(Phase):
     state_weight: NonNegative = 0.1
     coarse_weight: NonNegative = 0.5
     history_noise: NonNegative = 0.3
+    speaking_noise: NonNegative = 1.0
     state_noise: Share = 0.8
     drop_audio: Share = 0.1
     drop_face: Share = 0.3

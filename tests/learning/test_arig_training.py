@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tiny_arig_training import HZ, dyad, settings, write
 from sfms_robot import config
 from sfms_robot.config import parse_training
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.learning.arig.corpus import SCENES, fit_scales, gather, open_scenes
 from sfms_robot.learning.arig.losses import Pupil, augment, loss_parts, previous_states
 from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
@@ -43,7 +44,8 @@ def a_pupil(**changes) -> Pupil:
 
 def quiet(**changes) -> config.ArigPhase:
     """A phase that leaves windows as they are, but for `changes`."""
-    off = {"history_noise": 0, "state_noise": 0, "drop_audio": 0, "drop_face": 0, "drop_agent": 0, "gain_db": 0}
+    noises = ("history_noise", "speaking_noise", "state_noise")
+    off = {name: 0 for name in (*noises, "drop_audio", "drop_face", "drop_agent", "gain_db")}
     return settings(**(off | changes)).training
 
 
@@ -154,11 +156,28 @@ def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_
     fit_scales(model, corpus, settings().listener.channels)
     model.step_std.zero_()  # leaves the slow part alone
     told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    told = replace(told, voiced=torch.zeros_like(told.voiced))
     found, truth = augment(told, model, quiet(history_noise=0.4), torch.Generator().manual_seed(0))
     off = (found.agent_motion - told.agent_motion) / model.motion_std
     assert float((off.flatten(1).abs().amax(1) < 1e-4).float().mean()) == pytest.approx(0.67, abs=0.1)  # 0.3 never jump
     after = (truth - told.agent_motion) / model.motion_std
     assert torch.allclose(after[:, 1:], 0.9 * off[:, :-1], atol=1e-4)
+
+
+def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_once(corpus):
+    model = a_pupil().model
+    fit_scales(model, corpus, settings().listener.channels)
+    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    speaks = torch.zeros_like(told.voiced)
+    speaks[:, WINDOW // 2 :, 0] = True
+    told = replace(told, voiced=speaks)
+    phase = quiet(history_noise=0.4, speaking_noise=1.0)
+    found, truth = augment(told, model, phase, torch.Generator().manual_seed(0))
+    off = ((found.agent_motion - told.agent_motion) / model.motion_std)[:, WINDOW // 2 :]
+    lips = torch.tensor([name.startswith(("jaw", "mouth", "tongue")) for name in CHANNELS])
+    assert float(off[..., lips].std()) > 3 * float(off[..., ~lips].std()) > 0
+    assert torch.equal(truth[:, WINDOW // 2 :, lips], told.agent_motion[:, WINDOW // 2 :, lips])
+    assert not torch.equal(truth[:, WINDOW // 2 :, ~lips], told.agent_motion[:, WINDOW // 2 :, ~lips])
 
 
 @pytest.mark.parametrize("draws", ["motion", "step"])

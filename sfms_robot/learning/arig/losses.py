@@ -25,6 +25,7 @@ LN_PER_DB = math.log(10) / 10  # of power
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
 JUMPS = 0.04  # of frames at which the slow part jumps
 COLD = 0.5  # share of windows whose past is exact
+SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
 
 
 class Pupil(nn.Module):
@@ -80,6 +81,8 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     Also the motion (B, N, C) that comes after such a past.
     The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
     everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter.
+    Lips are another matter while the agent speaks: its sounds say where they have to be, so their past is off by more,
+    in every window, and all of it is taken back at once.
     """
     b, n = dyad.user_heard.shape
     device = dyad.agent_motion.device
@@ -95,6 +98,10 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
         gain = torch.zeros_like(gain)
     rows = (torch.arange(model.sound_width, device=device) < MEL_WIDTH).float()  # logarithms of power
     slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, model, phase, generator))
+    lips = torch.tensor([name.startswith(SPOKEN) for name in model.settings.channels], device=device)
+    spoken = dyad.voiced[..., :1] & lips
+    missed = torch.rand(b, 1, 1, generator=generator) * phase.speaking_noise
+    missed = (missed * torch.randn(b, n, model.channels, generator=generator)).to(device) * model.motion_std
     told = replace(
         dyad,
         user_sound=dyad.user_sound + gain[0] * rows,
@@ -102,11 +109,11 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
         user_heard=dyad.user_heard & ~deaf,
         agent_heard=dyad.agent_heard & ~mute,
         user_seen=dyad.user_seen & ~blind,
-        agent_motion=dyad.agent_motion + slow + fast * model.step_std,
+        agent_motion=dyad.agent_motion + slow + fast * model.step_std + torch.where(spoken, missed, 0.0),
         voiced=voiced,
     )
     carried = (1 - RETURN) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
-    return told, dyad.agent_motion + carried
+    return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
 
 
 def _wander(
