@@ -9,12 +9,16 @@ from sfms_robot.runtime.safety import interrupt_flag, realtime_priority, smooth
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_sets_the_flag_and_raises_nothing(number: signal.Signals) -> None:
-    before = signal.getsignal(number)
-    with interrupt_flag() as interrupted:
-        assert not interrupted()
-        signal.raise_signal(number)
-        assert interrupted()
-    assert signal.getsignal(number) is before
+    ours = signal.default_int_handler
+    before = signal.signal(number, ours)  # whatever the tests were started under
+    try:
+        with interrupt_flag() as interrupted:
+            assert not interrupted()
+            signal.raise_signal(number)
+            assert interrupted()
+        assert signal.getsignal(number) is ours
+    finally:
+        signal.signal(number, before)
 
 
 def test_a_signal_that_is_ignored_stays_so() -> None:

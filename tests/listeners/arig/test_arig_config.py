@@ -38,9 +38,10 @@ def test_arig_is_a_kind():
 @pytest.mark.parametrize("name", ["arig-small", "arig-paper"])
 def test_shipped_sizes_hold_the_papers_numbers(name: str):
     settings = config.load(config.Arig, LISTENERS / name / "config.yaml")
-    assert (settings.chunk_frames, settings.context_chunks, settings.diffusion.steps) == (6, 512, 15)
+    assert (settings.chunk_frames, settings.diffusion.steps) == (6, 15)
     assert (settings.bidirectional_layers, settings.diffusion.blocks) == (2, 3)
     if name == "arig-paper":
+        assert settings.context_chunks == 512
         assert (settings.width, settings.feedforward, settings.diffusion.width) == (512, 2048, 262)
 
 
