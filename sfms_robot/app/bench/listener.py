@@ -101,6 +101,7 @@ def _plans(listener: Listener) -> Row:
         "threads": fastest,
         "step_ms": _spread(steps_ms[fastest]),
         "one_thread_plan_ms": float(np.median(plans_ms[1])),
+        "all_threads_plan_ms": float(np.median(plans_ms[max(plans_ms)])),
         "one_thread_fps": _fps(steps_ms[1]),
     }
 
