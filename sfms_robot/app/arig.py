@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -180,5 +181,5 @@ def _played(
 ) -> dict[str, list[Played]]:
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task(name, total=sum(len(each) for each in held_out.values()))
-        advance: Callable[[], None] = lambda: progress.advance(task)  # noqa: E731
+        advance = partial(progress.advance, task)
         return {scene: play_all(listener, dyads, seed, advance) for scene, dyads in held_out.items()}

@@ -84,8 +84,8 @@ def gather(dyads: Sequence[Dyad], window: int, space: MotionSpace, hearing: Hear
         if len(dyad.listener) < window:
             short += 1
         else:
-            listeners.append(_in_space(dyad, dyad.listener, space))
-            faces.append(_in_space(dyad, dyad.speaker, space))
+            listeners.append(in_space(dyad, dyad.listener, space))
+            faces.append(in_space(dyad, dyad.speaker, space))
             rows, place = _heard(dyad, hearing)
             sound.append(rows)
             phase.append(place)
@@ -113,7 +113,7 @@ def gather(dyads: Sequence[Dyad], window: int, space: MotionSpace, hearing: Hear
     )
 
 
-def _in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
+def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
     """(N, C); rows that are not finite stay so."""
     if dyad.space == space.name:
         return torch.from_numpy(motion)

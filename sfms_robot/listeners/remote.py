@@ -101,12 +101,17 @@ class RemoteFeed:
         return value  # type: ignore[no-any-return]
 
 
+def threads() -> int:
+    """Of torch in the child: one core is the servo loop's."""
+    return max(1, (os.cpu_count() or 2) - 1)
+
+
 def _serve(build: Callable[[], Listener], seed: int, frames: Any, plans: Connection) -> None:
     """The child: load, then listen."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle: the head must reach rest first
     import torch
 
-    torch.set_num_threads(max(1, (os.cpu_count() or 2) - 1))
+    torch.set_num_threads(threads())
     try:
         listener = build()
     except RobotError as error:

@@ -6,12 +6,12 @@ and that no frame waits for the one before: a step has a frame's 40 ms.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.app.bench.measure import HEAD
 from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.listeners.remote import threads
 from sfms_robot.sources.recording import DEFAULT_SPEAKER
 
 RUN_S: Final = 8.0
@@ -39,5 +39,5 @@ def in_run(folder: Path, duration_s: float = RUN_S) -> dict[str, Any]:
         "late_ticks": report["tick"]["late"],
         "achieved_hz": report["tick"]["achieved_hz"],
         "frame_to_wire_ms": report["latency_ms"]["frame_to_wire"],
-        "threads": max(1, (os.cpu_count() or 2) - 1),  # of the listener's process, as in `listeners.remote`
+        "threads": threads(),
     }

@@ -89,10 +89,7 @@ def _sfms_paper() -> Row:
 
 def _plans(listener: Listener) -> Row:
     """Durations of plans beside the time there is for one, on one thread and on two; the faster counts."""
-    steps_ms = {
-        n: _times_of(listener, listener.start(0), _speaker(), threads=n, steps=STEPS)
-        for n in {1, min(2, os.cpu_count() or 1)}
-    }
+    steps_ms = _on_one_and_two(listener, listener.start(0), _speaker())
     plans_ms = {n: sorted(each)[-(len(each) // listener.hop) :] for n, each in steps_ms.items()}  # the others listen
     fastest = min(plans_ms, key=lambda n: float(np.median(plans_ms[n])))
     period_ms = listener.hop * FRAME_S * 1e3
@@ -127,7 +124,7 @@ def _arig(folder: Path, settings: config.Arig) -> Row:
     speaker = _speaker()
     full = _after_minutes(quick, 60)
     eager_ms = _times_of(exact, full, speaker, threads=1, steps=STEPS // 2)
-    both_ms = {n: _times_of(quick, full, speaker, threads=n, steps=STEPS) for n in {1, min(2, os.cpu_count() or 1)}}
+    both_ms = _on_one_and_two(quick, full, speaker)
     fastest = min(both_ms, key=lambda n: float(np.median(both_ms[n])))
     early_ms = _times_of(quick, _after_minutes(quick, 1), speaker, threads=fastest, steps=STEPS // 2)
     with tempfile.TemporaryDirectory() as scratch:
@@ -151,6 +148,12 @@ def _arig(folder: Path, settings: config.Arig) -> Row:
         "samplers": samplers(exact, speaker) if trained else None,
         "weights": "trained" if trained else "seeded, not trained",
     }
+
+
+def _on_one_and_two(listener: Listener, memory: Any, speaker: list[SpeakerFrame]) -> dict[int, list[float]]:
+    """`_times_of` by number of threads; one alone on a single core."""
+    counts = {1, min(2, os.cpu_count() or 1)}
+    return {n: _times_of(listener, memory, speaker, threads=n, steps=STEPS) for n in counts}
 
 
 def _times_of(listener: Listener, memory: Any, speaker: list[SpeakerFrame], threads: int, steps: int) -> list[float]:

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Floats
+from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning.arig.labels import UNKNOWN
-from sfms_robot.learning.corpus import spread_bounds, windows
+from sfms_robot.learning.corpus import in_space, spread_bounds, windows
 from sfms_robot.learning.datasets import clips
 from sfms_robot.learning.datasets.collection import usable
 from sfms_robot.learning.datasets.formats import open_dataset
@@ -127,7 +127,7 @@ def gather(scenes: Mapping[str, Sequence[clips.Dyad]], window: int, space: Motio
 
 def _tensors(dyad: clips.Dyad, space: MotionSpace, width: int) -> dict[str, Tensor]:
     frames = len(dyad.listener)
-    face = _in_space(dyad, dyad.speaker, space)
+    face = in_space(dyad, dyad.speaker, space)
     seen = face.isfinite().all(-1)
     user, user_voiced, heard = _heard(dyad, "user", width)
     agent, agent_voiced, says = _heard(dyad, "agent", width)
@@ -139,7 +139,7 @@ def _tensors(dyad: clips.Dyad, space: MotionSpace, width: int) -> dict[str, Tens
         "agent_heard": torch.full((frames,), says),
         "user_motion": torch.where(seen[:, None], face, 0.0),
         "user_seen": seen,
-        "agent_motion": _in_space(dyad, dyad.listener, space),
+        "agent_motion": in_space(dyad, dyad.listener, space),
         "voiced": torch.stack([agent_voiced, user_voiced], dim=-1),
         "states": torch.from_numpy(states.astype(np.int64)),
     }
@@ -161,7 +161,7 @@ def _heard(dyad: clips.Dyad, track: str, width: int) -> tuple[Tensor, Tensor, bo
         voiced = np.zeros(frames, bool) if audio is None else np.array(phase.hear(levels_db(audio)))
     elif width != sound.WIDTHS["mel"] and audio is not None:
         raise ConfigError(f"{dyad.name}: sound = wav2vec2 needs the feature wav2vec2, agent_wav2vec2 with the data")
-    elif audio is not None and dyad.fps == 25:
+    elif audio is not None and dyad.fps == FRAME_HZ:
         rows, voiced = sound.track(audio)
     elif track == "user" and dyad.mel is not None:
         rows, voiced = sound.of_mel(dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
@@ -173,18 +173,6 @@ def _heard(dyad: clips.Dyad, track: str, width: int) -> tuple[Tensor, Tensor, bo
 def _beside_phase(rows: Floats, audio: Floats | None) -> Floats:
     place = np.zeros((len(rows), phase.FEATURES), np.float32) if audio is None else phase.of_audio(audio)
     return np.concatenate([rows, place], axis=1).astype(np.float32)
-
-
-def _in_space(dyad: clips.Dyad, motion: Floats, space: MotionSpace) -> Tensor:
-    """(N, C); rows that are not finite stay so."""
-    if dyad.space == space.name:
-        return torch.from_numpy(motion)
-    if dyad.space != "arkit58":
-        raise ConfigError(f"dyad {dyad.name} is in {dyad.space}, the listener in {space.name}: set motion_space to it")
-    known = np.isfinite(motion).all(axis=1)
-    out = np.full((len(motion), space.dim), np.nan, dtype=np.float32)
-    out[known] = space.encode(motion[known])
-    return torch.from_numpy(out)
 
 
 def fit_scales(model: ArigModel, corpus: Corpus, channels: Sequence[str]) -> None:

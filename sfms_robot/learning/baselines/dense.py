@@ -47,7 +47,8 @@ class Bottleneck(nn.Module):
 
     def latent(self, x: Tensor) -> Tensor:
         """(B, T, width) -> (B, T, n, D)."""
-        return self.down(x).unflatten(-1, (self.count, -1))  # type: ignore[no-any-return]
+        out: Tensor = self.down(x).unflatten(-1, (self.count, -1))
+        return out
 
     def restore(self, codes: Tensor) -> Tensor:
         """(B, T, n, D) -> (B, T, width)."""
