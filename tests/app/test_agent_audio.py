@@ -83,7 +83,7 @@ def test_a_robot_that_stops_speaking_while_somebody_talks_listens_within_a_secon
         _, memory = listener.step(frame, memory)
         states.append(STATES[memory.state])
     assert "listening" not in states[75:99] and set(states[75:99]) <= {"speaking", "interrupted", "giving_feedback"}
-    assert states[125] in {"listening", "giving_feedback"}
+    assert set(states[125:]) <= {"listening", "giving_feedback"}
 
 
 @pytest.mark.parametrize(
