@@ -19,6 +19,7 @@ class Diffusion(Model):
         steps: of them used to sample one frame, spread evenly.
         sampler: `ddpm` is the paper's (4); `ddim` adds no noise between steps, which suits few of them.
         temperature: factor on the noise that is added between steps.
+        temperatures: the same for channels whose names begin so, in its place: `{eye: 1.1}`. The first that fits counts.
     """
 
     width: Annotated[int, Field(ge=2, multiple_of=2)] = 262
@@ -27,6 +28,11 @@ class Diffusion(Model):
     steps: Count = 15
     sampler: Literal["ddpm", "ddim"] = "ddpm"
     temperature: NonNegative = 1.0
+    temperatures: dict[str, NonNegative] = {}
+
+    def temperature_of(self, channel: str) -> float:
+        fits = (value for prefix, value in self.temperatures.items() if channel.startswith(prefix))
+        return next(fits, self.temperature)
 
     @model_validator(mode="after")
     def _fits(self) -> Diffusion:
@@ -77,4 +83,11 @@ class Arig(Listener):
     def _heads_fit(self) -> Arig:
         if self.width % (2 * self.heads):
             raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        return self
+
+    @model_validator(mode="after")
+    def _temperatures_fit(self) -> Arig:
+        for prefix in self.diffusion.temperatures:
+            if not any(channel.startswith(prefix) for channel in self.channels):
+                raise ValueError(f"diffusion.temperatures.{prefix}: no channel of {self.motion_space} begins so")
         return self

@@ -48,7 +48,8 @@ class ArigPhase(Phase):
         state_noise: share of previous states that are drawn by lot: true ones would be copied, and a stream has none.
         drop_audio, drop_face: share of windows in which the user is not heard, not seen; drop_agent: of those in which
             the agent says nothing, that have no agent's track.
-        gain_db: most that either track is louder or softer.
+        gain_db: most that either track is louder or softer; colour_db: most that its bands are, smoothly from low to
+            high, as another microphone has it; grain_db: deviation of every band of every row.
         stages: the curriculum, in order; shares add up to 1.
     """
 
@@ -63,6 +64,8 @@ class ArigPhase(Phase):
     drop_face: Share = 0.3
     drop_agent: Share = 0.5
     gain_db: NonNegative = 6.0
+    colour_db: NonNegative = 6.0
+    grain_db: NonNegative = 2.0
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)] = (
         Stage(share=0.15, speaking=1.0),
         Stage(share=0.35, speaking=0.2, listening=0.8),

@@ -20,7 +20,7 @@ class Phase(Model):
         learning_rate: where the warm-up ends and the cosine begins.
         warm_up_steps: at most a tenth of `steps`.
         clip_norm: largest gradient norm of each optimizer's parameters.
-        precision: bf16 is autocast on a GPU; a CPU computes in fp32 whatever is asked.
+        precision: bf16 is autocast; a CPU without instructions for it computes in fp32 whatever is asked.
         evaluate_every: steps from one look at the held-out loss to the next; 0: never, the last weights are kept.
         patience: looks without a better held-out loss before training stops; None: it goes on to the last step.
         checkpoint_every, checkpoint_minutes: whichever comes first.

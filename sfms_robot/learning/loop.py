@@ -119,8 +119,8 @@ def _step(job: Job, step: int, generator: torch.Generator, file: Path) -> tuple[
     """One update of the weights; returns loss and largest gradient norm. Nothing is updated when one is not finite."""
     for one in job.optimizers:
         one.zero_grad(set_to_none=True)
-    on_gpu = job.device.type == "cuda"
-    with torch.autocast(job.device.type, torch.bfloat16, enabled=on_gpu and job.phase.precision == "bf16"):
+    half = job.phase.precision == "bf16" and multiplies_bf16(job.device)
+    with torch.autocast(job.device.type, torch.bfloat16, enabled=half):
         loss = job.loss_of(step, generator)
     loss.backward()  # type: ignore[no-untyped-call]
     norm = max(_clip(one, job.phase.clip_norm) for one in job.optimizers)
@@ -132,6 +132,11 @@ def _step(job: Job, step: int, generator: torch.Generator, file: Path) -> tuple[
     for one in job.optimizers:
         one.step()
     return value, norm
+
+
+def multiplies_bf16(device: torch.device) -> bool:
+    """Whether bf16 is faster there than fp32; a processor without such instructions only pretends."""
+    return device.type == "cuda" or (device.type == "cpu" and torch.cpu._is_avx512_bf16_supported())
 
 
 def _clip(one: torch.optim.Optimizer, norm: float) -> float:

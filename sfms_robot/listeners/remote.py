@@ -26,6 +26,7 @@ from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
 
 MOST_WAITING = FRAME_HZ // 2  # frames
+NICE = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
 START_LIMIT_S = 60.0  # importing torch on a small board with a cold disk
 CLOSE_LIMIT_S = 2.0
 
@@ -109,6 +110,7 @@ def threads() -> int:
 def _serve(build: Callable[[], Listener], seed: int, frames: Any, plans: Connection) -> None:
     """The child: load, then listen."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle: the head must reach rest first
+    os.nice(NICE)
     import torch
 
     torch.set_num_threads(threads())

@@ -14,13 +14,13 @@ from sfms_robot.config import parse_training
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.learning.arig.corpus import SCENES, fit_scales, gather, open_scenes
-from sfms_robot.learning.arig.losses import Pupil, augment, loss_parts, previous_states
+from sfms_robot.learning.arig.losses import LN_PER_DB, Pupil, augment, loss_parts, previous_states
 from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.sound import WIDTHS
+from sfms_robot.listeners.arig.sound import MEL_WIDTH, WIDTHS
 from sfms_robot.listeners.space import MotionSpace
 
 ARKIT = MotionSpace("arkit58", np.zeros(58))
@@ -45,7 +45,7 @@ def a_pupil(**changes) -> Pupil:
 def quiet(**changes) -> config.ArigPhase:
     """A phase that leaves windows as they are, but for `changes`."""
     noises = ("history_noise", "speaking_noise", "state_noise")
-    off = {name: 0 for name in (*noises, "drop_audio", "drop_face", "drop_agent", "gain_db")}
+    off = {name: 0 for name in (*noises, "drop_audio", "drop_face", "drop_agent", "gain_db", "colour_db", "grain_db")}
     return settings(**(off | changes)).training
 
 
@@ -149,6 +149,36 @@ def test_without_augmentation_windows_stay_as_they_are(corpus):
     assert torch.equal(truth, told.agent_motion)
     for name in ("user_sound", "agent_sound", "user_heard", "agent_motion", "voiced"):
         assert torch.equal(getattr(found, name), getattr(told, name))
+
+
+def sounds_off(corpus, sound: str = "mel", **changes) -> torch.Tensor:
+    """(400, N, A) what augmentation adds to the agent's sound."""
+    pupil = Pupil(ArigModel(settings({"sound": sound}).listener))
+    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    if sound != "mel":
+        zeros = torch.zeros(400, WINDOW, pupil.model.sound_width)
+        told = replace(told, user_sound=zeros, agent_sound=zeros)
+    found, _ = augment(told, pupil.model, quiet(**changes), torch.Generator().manual_seed(0))
+    return found.agent_sound - told.agent_sound
+
+
+def test_another_microphone_colours_a_window_smoothly_and_leaves_the_phrase_alone(corpus):
+    off = sounds_off(corpus, colour_db=6.0)
+    bands = off[..., :MEL_WIDTH].unflatten(-1, (4, 128))
+    assert torch.allclose(bands, bands[:, :1, :1].expand_as(bands), atol=1e-5)
+    assert 0.2 < float(bands.std()) / (6 * LN_PER_DB) < 0.6
+    assert float(bands.diff(dim=-1).abs().amax()) < 0.15 * float(bands.abs().amax())
+    assert not off[..., MEL_WIDTH:].any()
+
+
+def test_grain_is_drawn_anew_for_every_band_and_row(corpus):
+    off = sounds_off(corpus, grain_db=6.0)[..., :MEL_WIDTH]
+    assert float(off.std(dim=(1, 2)).amax()) == pytest.approx(6 * LN_PER_DB, rel=0.1)
+    assert abs(float((off[..., 1:] * off[..., :-1]).mean())) < 0.02 * float(off.square().mean())
+
+
+def test_features_that_are_no_logarithms_of_power_are_left_as_they_are(corpus):
+    assert not sounds_off(corpus, sound="wav2vec2", gain_db=6.0, colour_db=6.0, grain_db=6.0).any()
 
 
 def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_back(corpus):

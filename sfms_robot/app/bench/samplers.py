@@ -47,8 +47,9 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
 
     @torch.inference_mode()
     def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        settings = head.settings.model_copy(update={"sampler": sampler, "steps": steps, "temperature": 1.0})
-        other = Denoiser(listener.model.channels, listener.settings.width, settings)
+        plain = {"temperature": 1.0, "temperatures": {}}
+        settings = head.settings.model_copy(update={"sampler": sampler, "steps": steps} | plain)
+        other = Denoiser(listener.settings.channels, listener.settings.width, settings)
         other.load_state_dict(head.state_dict())
         generator = torch.Generator().manual_seed(seed)
         noise = torch.randn(len(told), steps, listener.model.channels, generator=generator)

@@ -20,9 +20,11 @@ from sfms_robot import config
 from sfms_robot.listeners.arig.csu import FIRST, STATES
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.sound import MEL_WIDTH
+from sfms_robot.signals import mel
 
 LN_PER_DB = math.log(10) / 10  # of power
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
+COLOURS = 4  # waves over the bands that make up another microphone's colour
 JUMPS = 0.04  # of frames at which the slow part jumps
 COLD = 0.5  # share of windows whose past is exact
 SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
@@ -93,10 +95,7 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     deaf, blind = lot(phase.drop_audio), lot(phase.drop_face)
     mute = lot(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
     voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf], dim=-1)
-    gain = (torch.rand(2, b, 1, 1, generator=generator) * 2 - 1).to(device) * phase.gain_db * LN_PER_DB
-    if model.settings.sound != "mel":
-        gain = torch.zeros_like(gain)
-    rows = (torch.arange(model.sound_width, device=device) < MEL_WIDTH).float()  # logarithms of power
+    user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
     slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, model, phase, generator))
     lips = torch.tensor([name.startswith(SPOKEN) for name in model.settings.channels], device=device)
     spoken = dyad.voiced[..., :1] & lips
@@ -104,8 +103,8 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     missed = (missed * torch.randn(b, n, model.channels, generator=generator)).to(device) * model.motion_std
     told = replace(
         dyad,
-        user_sound=dyad.user_sound + gain[0] * rows,
-        agent_sound=dyad.agent_sound + gain[1] * rows,
+        user_sound=dyad.user_sound + user_off,
+        agent_sound=dyad.agent_sound + agent_off,
         user_heard=dyad.user_heard & ~deaf,
         agent_heard=dyad.agent_heard & ~mute,
         user_seen=dyad.user_seen & ~blind,
@@ -114,6 +113,22 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     )
     carried = (1 - RETURN) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
     return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
+
+
+def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> Tensor:
+    """(B, N, A) what another microphone would add to logarithms of power; nothing to other features."""
+    off = torch.zeros(b, n, model.sound_width)
+    if model.settings.sound != "mel":
+        return off
+    size = torch.rand(b, 1, 2, generator=generator) * LN_PER_DB
+    waves = torch.randn(b, 1, COLOURS, generator=generator) / COLOURS**0.5
+    place = torch.arange(mel.MEL_BINS) / mel.MEL_BINS
+    colour = waves @ torch.cos(torch.pi * torch.arange(1, COLOURS + 1)[:, None] * place)
+    grain = torch.randn(b, n, mel.ROWS_PER_FRAME, mel.MEL_BINS, generator=generator)
+    gain = torch.rand(b, 1, 1, generator=generator) * 2 - 1
+    bands = gain * LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
+    off[..., :MEL_WIDTH] = (bands[:, :, None] + size[..., 1:2, None] * phase.grain_db * grain).flatten(2)
+    return off
 
 
 def _wander(

@@ -38,15 +38,18 @@ class Denoiser(nn.Module):
     low: Tensor
     high: Tensor
     share: Tensor
+    warmth: Tensor
     places: Tensor
 
-    def __init__(self, channels: int, condition: int, settings: config.Diffusion) -> None:
+    def __init__(self, names: Sequence[str], condition: int, settings: config.Diffusion) -> None:
         super().__init__()
-        width = settings.width
+        channels, width = len(names), settings.width
         self.settings = settings
         self.register_buffer("low", torch.full((channels,), -8.0))  # standardised motion that is possible at all
         self.register_buffer("high", torch.full((channels,), 8.0))
         self.register_buffer("share", signal_share(settings.train_steps).float(), persistent=False)
+        warmth = torch.tensor([settings.temperature_of(name) for name in names])
+        self.register_buffer("warmth", warmth, persistent=False)
         self.register_buffer("places", sinusoidal(settings.train_steps, width), persistent=False)
         self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))
         self.condition = Linear(condition, width)
@@ -105,7 +108,7 @@ class Denoiser(nn.Module):
         # The modulation of every step in one product: (K, N, W) conditions, of a single sample (K, W).
         told = self.condition(z) + levels[:, None] if n > 1 else self.condition(z) + levels
         parts = [each.chunk(self.modulation.parts, -1) for each in self.modulation.linear(F.silu(told)).unbind(0)]
-        first, *added = noise.unbind(1)
+        first, *added = noise[:, 0], *(noise[:, 1:] * self.warmth).unbind(1)
         low, high, weights, x = self.low, self.high, self._weights(), first
         for index, step in enumerate(self.table):
             found = _denoise(x, parts[k - 1 - index], weights)
@@ -133,7 +136,7 @@ class Step:
     Attributes:
         denoise: M_0 = denoise[0] M_t + denoise[1] eps.
         motion, stay: M_s = motion M_0 + stay M_t, which is ddim as well.
-        spread: sigma_t, times the noise that is added.
+        spread: sigma_t, times the noise that is added (and the temperature).
     """
 
     denoise: tuple[float, float]
@@ -161,6 +164,6 @@ def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
             out.append(Step(denoise, after**0.5 - stay * now**0.5, stay, 0.0))
         else:
             motion, stay = after**0.5 * (1 - alpha) / (1 - now), alpha**0.5 * (1 - after) / (1 - now)
-            spread = ((1 - alpha) * (1 - after) / (1 - now)) ** 0.5 * settings.temperature
+            spread = ((1 - alpha) * (1 - after) / (1 - now)) ** 0.5
             out.append(Step(denoise, motion, stay, spread))
     return out

@@ -20,6 +20,7 @@ from sfms_robot.listeners.arig.parts import (
     Linear,
     Modulation,
     Part,
+    attend,
     join_heads,
     modulated,
     split_heads,
@@ -104,7 +105,7 @@ class Integrated(Part):
 def _attend(qkv: Tensor, heads: int) -> Tensor:
     """Full self-attention of (N, S, 3D) -> (N, S, D)."""
     q, k, v = split_heads(qkv, 3 * heads).chunk(3, dim=1)
-    return join_heads(F.scaled_dot_product_attention(q, k, v))
+    return join_heads(attend(q, k, v))
 
 
 class ShortRange(Part):

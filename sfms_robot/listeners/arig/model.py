@@ -136,7 +136,7 @@ class ArigModel(nn.Module):
         self.head: Denoiser | CodeHead = (
             CodeHead(self.channels, d, settings.code_levels)
             if settings.discrete
-            else Denoiser(self.channels, d, settings.diffusion)
+            else Denoiser(settings.channels, d, settings.diffusion)
         )
 
     @property

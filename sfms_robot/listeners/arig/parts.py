@@ -40,6 +40,14 @@ def join_heads(x: Tensor) -> Tensor:
     return x.transpose(1, 2).reshape(n, s, h * d)
 
 
+def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """Full attention of (N, h, S, D/h), in 32 bits where training on a CPU runs in 16: its gradient is slow there."""
+    if q.dtype == torch.bfloat16 and not q.is_cuda:
+        with torch.autocast(q.device.type, enabled=False):
+            return F.scaled_dot_product_attention(q.float(), k.float(), v.float())
+    return F.scaled_dot_product_attention(q, k, v)
+
+
 class FeedForward(Part):
     """Widen to `hidden`, GELU, narrow."""
 
@@ -119,7 +127,7 @@ class Look(Part):
         """x (N, D) looking at keys (N, slots, 2D) -> (N, D)."""
         q = split_heads(self.query(self.norm(x))[:, None], self.heads)
         k, v = split_heads(keys + self.slots, 2 * self.heads).chunk(2, dim=1)
-        seen = F.scaled_dot_product_attention(q, k, v)
+        seen = attend(q, k, v)
         x = x + self.out(join_heads(seen)[:, 0])
         out: Tensor = x + self.ffn(self.ffn_norm(x))
         return out

@@ -12,7 +12,7 @@ def denoiser(**changes) -> Denoiser:
     raw = {"width": 12, "steps": 5, "train_steps": 40} | changes
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = Denoiser(3, 8, config.parse(config.Diffusion, raw, "tiny"))
+        model = Denoiser(("jawOpen", "eyeBlinkLeft", "eyeBlinkRight"), 8, config.parse(config.Diffusion, raw, "tiny"))
     with torch.no_grad():
         model.low.fill_(-1e6)
         model.high.fill_(1e6)
@@ -81,6 +81,14 @@ def test_without_added_noise_the_start_decides(changes):
 
 
 @torch.no_grad()
+def test_a_temperature_of_some_channels_scales_the_noise_that_is_added_to_them():
+    model = denoiser(temperatures={"eye": 2.0, "jaw": 0.5})
+    z, noise, warmth = torch.randn(2, 8), torch.randn(2, 5, 3), torch.tensor([0.5, 2.0, 2.0])
+    scaled = torch.cat([noise[:, :1], noise[:, 1:] * warmth], dim=1)
+    torch.testing.assert_close(model.sample(z, noise), denoiser().sample(z, scaled))
+
+
+@torch.no_grad()
 @given(seed=st.integers(0, 1000), sampler=st.sampled_from(["ddpm", "ddim"]), steps=st.integers(1, 8))
 @settings(max_examples=25, deadline=None)
 def test_no_sample_leaves_the_range_that_was_set(seed: int, sampler: str, steps: int):
@@ -116,7 +124,7 @@ def test_a_trained_sampler_draws_what_it_was_shown():
     """Two clusters, one per condition: place and spread come back."""
     torch.manual_seed(0)
     settings = config.Diffusion(width=32, steps=15, train_steps=200)
-    model = Denoiser(2, 1, settings)
+    model = Denoiser(("yaw", "pitch"), 1, settings)
     optimizer = torch.optim.Adam(model.parameters(), 5e-3)
     centre = torch.tensor([[1.0, -1.0], [-0.5, 0.5]])
     for _ in range(400):

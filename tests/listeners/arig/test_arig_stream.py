@@ -54,23 +54,39 @@ def test_stream_equals_offline(changes):
     assert_stream_is_offline(soft(arig_listener(**changes)), 31, 1e-5)
 
 
-@pytest.mark.parametrize("name", ["arig-small", pytest.param("arig-paper", marks=pytest.mark.slow)])
-def test_stream_equals_offline_at_the_shipped_sizes(name: str):
-    file = data_dir("configs") / "listeners" / name / "config.yaml"
-    settings = config.load(config.Arig, file).model_copy(update={"precision": "fp32"})
+def shipped(name: str, **changes) -> ArigListener:
+    """With the sizes of a shipped listener and seeded weights."""
+    settings = config.load(config.Arig, data_dir("configs") / "listeners" / name / "config.yaml")
+    settings = settings.model_copy(update=changes)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        listener = soft(ArigListener(settings, ArigModel(settings)))
-    assert_stream_is_offline(listener, 20, 1e-4)
+        return ArigListener(settings, ArigModel(settings))
+
+
+SHIPPED = ["arig-small", pytest.param("arig-paper", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_stream_equals_offline_at_the_shipped_sizes(name: str):
+    assert_stream_is_offline(soft(shipped(name, precision="fp32")), 20, 1e-4)
+
+
+def assert_causal(listener: ArigListener, changed_from: int, frames: int = 26) -> None:
+    speaker = talk(frames)
+    other = speaker[:changed_from] + talk(frames, seed=9)[changed_from:]
+    before, after = streamed(listener, speaker), streamed(listener, other)
+    np.testing.assert_array_equal(before[:changed_from], after[:changed_from])
+    assert not np.array_equal(before[changed_from:], after[changed_from:])
 
 
 @pytest.mark.parametrize("changed_from", [1, 8, 22])
 def test_later_frames_never_change_earlier_plans(tiny, changed_from: int):
-    speaker = talk(26)
-    other = speaker[:changed_from] + talk(26, seed=9)[changed_from:]
-    before, after = streamed(tiny, speaker), streamed(tiny, other)
-    np.testing.assert_array_equal(before[:changed_from], after[:changed_from])
-    assert not np.array_equal(before[changed_from:], after[changed_from:])
+    assert_causal(tiny, changed_from)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_later_frames_never_change_earlier_plans_at_the_shipped_sizes(name: str):
+    assert_causal(shipped(name), changed_from=15)
 
 
 def bytes_of(value) -> int:
