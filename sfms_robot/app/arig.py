@@ -18,10 +18,12 @@ from sfms_robot.config import find, parse_training
 from sfms_robot.errors import ConfigError
 from sfms_robot.learning.arig import scores
 from sfms_robot.learning.arig.corpus import open_scenes
+from sfms_robot.learning.arig.labels import UNKNOWN
 from sfms_robot.learning.arig.stage import Played, play_all
 from sfms_robot.learning.arig.trainer import train_arig
 from sfms_robot.learning.datasets.clips import Dyad
 from sfms_robot.learning.tables import arig as tables
+from sfms_robot.learning.tables.answers import spread
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.csu import STATES
 from sfms_robot.listeners.registry import load_listener
@@ -48,7 +50,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
     settings = getattr(listener, "settings", None)
     if not isinstance(settings, config.Arig):
         raise ConfigError(f"--listener {name}: does not speak; this looks at listeners of kind arig")
-    held_out = {scene: _some(dyads, clips) for scene, dyads in open_scenes(data, "validation").items()}
+    held_out = {scene: spread(dyads, clips) for scene, dyads in open_scenes(data, "validation").items()}
     played = _played(name, listener, held_out, seed)
     both = [(one, dyad) for scene in held_out for one, dyad in zip(played[scene], held_out[scene], strict=True)]
     every, dyads = [one for one, _ in both], [dyad for _, dyad in both]
@@ -68,30 +70,33 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
 
 
 def _states(played: Sequence[Played], dyads: Sequence[Dyad], data: Path, clips: int | None) -> dict[str, Any]:
-    """Against the most frequent state and the best rule on voice activity, both of the training set."""
-    labelled = [(one, dyad) for one, dyad in zip(played, dyads, strict=True) if dyad.states is not None]
-    if not labelled or (np.concatenate([one.states for one, _ in labelled]) < 0).all():
+    """The listener's answers, and beside them what training labels, where there are any, make of voices alone."""
+    labelled = [(one.states, dyad, dyad.states) for one, dyad in zip(played, dyads, strict=True)
+                if dyad.states is not None]  # fmt: skip
+    if not labelled or (np.concatenate([said for said, _, _ in labelled]) < 0).all():
         return {}
-    learned = [d for each in open_scenes(data, "train").values() for d in _some(each, clips) if d.states is not None]
-    voices = np.concatenate([scores.heard_voices(dyad) for dyad in learned])
-    states = np.concatenate([dyad.states for dyad in learned if dyad.states is not None])
-    rule, majority = scores.VoiceRule.of(voices, states), np.bincount(states[states >= 0]).argmax()
-    said = np.concatenate([one.states for one, _ in labelled])
-    truth = np.concatenate([dyad.states for _, dyad in labelled if dyad.states is not None])
-    truth = np.where(said < 0, -1, truth).astype(np.int8)  # the first frame of a stream is given
-    by_rule = rule(np.concatenate([scores.heard_voices(dyad) for _, dyad in labelled]))
-    table = scores.confusion(said, truth)
-    others = {
-        "majority": scores.confusion(np.full(len(truth), majority, np.int8), truth),
-        "voice_rule": scores.confusion(by_rule, truth),
-    }
-    return {
-        "state_accuracy": scores.accuracy(table),
-        "state_balanced_accuracy": scores.balanced_accuracy(table),
-        **{f"{key}_accuracy": scores.accuracy(one) for key, one in others.items()},
-        **{f"{key}_balanced_accuracy": scores.balanced_accuracy(one) for key, one in others.items()},
-        "confusion": {"states": list(STATES), "label_by_answer": table.tolist()},
-    }
+    said = np.concatenate([said for said, _, _ in labelled])
+    truth = np.concatenate([states for _, _, states in labelled])
+    truth = np.where(said < 0, UNKNOWN, truth).astype(np.int8)  # the first frame of a stream is given
+    voices = np.concatenate([scores.heard_voices(dyad) for _, dyad, _ in labelled])
+    tables_of = {"state": scores.confusion(said, truth)}
+    tables_of |= {name: scores.confusion(answers, truth) for name, answers in _by_rule(voices, data, clips).items()}
+    found: dict[str, Any] = {}
+    for name, table in tables_of.items():
+        found[f"{name}_accuracy"] = scores.accuracy(table)
+        found[f"{name}_balanced_accuracy"] = scores.balanced_accuracy(table)
+    return {**found, "confusion": {"states": list(STATES), "label_by_answer": tables_of["state"].tolist()}}
+
+
+def _by_rule(voices: scores.Bools, data: Path, clips: int | None) -> dict[str, scores.States]:
+    """The most frequent state and the best rule on voice activity, both of the training set, for voices (N, 2)."""
+    learned = [d for each in open_scenes(data, "train").values() for d in spread(each, clips) if d.states is not None]
+    states = np.concatenate([np.zeros(0, np.int8), *(dyad.states for dyad in learned if dyad.states is not None)])
+    if not (states >= 0).any():
+        return {}
+    majority = np.full(len(voices), np.bincount(states[states >= 0]).argmax(), np.int8)
+    rule = scores.VoiceRule.of(np.concatenate([scores.heard_voices(dyad) for dyad in learned]), states)
+    return {"majority": majority, "voice_rule": rule(voices)}
 
 
 def _lips(played: Mapping[str, Sequence[Played]], held_out: Mapping[str, Sequence[Dyad]]) -> dict[str, Any]:
@@ -123,7 +128,7 @@ def arig_table(
     scene = "listening" if number == 2 else "interaction"
     if scene not in scenes:
         raise ConfigError(f"{data / scene}: no validation dyads there, which --table {name} is about")
-    held_out = [dyad for dyad in _some(scenes[scene], clips) if len(dyad.listener) >= tables.CLIP_FRAMES]
+    held_out = [dyad for dyad in spread(scenes[scene], clips) if len(dyad.listener) >= tables.CLIP_FRAMES]
     if not held_out:
         raise ConfigError(f"{data}: no validation dyad is as long as a clip of {tables.CLIP_FRAMES} frames")
     folders = {one: find("listeners", one, "config.yaml") for one in names}
@@ -168,12 +173,6 @@ def _train(settings: config.Training | config.ArigTraining, options: TrainOption
         raise ValueError("ablations are of kind arig")
     with run_of(options) as run:
         train_arig(settings, options.data, options.out, run)
-
-
-def _some(dyads: Sequence[Dyad], most: int | None) -> list[Dyad]:
-    """At most that many, evenly from first to last."""
-    step = 1.0 if most is None else max(1.0, len(dyads) / most)
-    return [dyads[int(at)] for at in np.arange(0, len(dyads), step)]
 
 
 def _played(

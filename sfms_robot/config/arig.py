@@ -19,7 +19,7 @@ class Diffusion(Model):
         steps: of them used to sample one frame, spread evenly.
         sampler: `ddpm` is the paper's (4); `ddim` adds no noise between steps, which suits few of them.
         temperature: factor on the noise that is added between steps.
-        temperatures: the same for channels whose names begin so, in its place: `{eye: 1.1}`. The first that fits counts.
+        temperatures: the same, in its place, for channels whose names begin so: `{eye: 1.1}`; the first that fits.
     """
 
     width: Annotated[int, Field(ge=2, multiple_of=2)] = 262

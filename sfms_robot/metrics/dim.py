@@ -125,14 +125,20 @@ def shannon_index(
 
 
 def cluster_centres(reference: ArrayLike, k: int) -> Doubles:
-    """(k, D) k-means of the pooled frames of clips, with a fixed seed. Raises ValueError for fewer frames than k."""
+    """(k, D) k-means of the pooled frames of clips, with a fixed seed.
+
+    Raises ValueError for fewer frames than k, or frames of which too many are the same.
+    """
     clips = _clips(reference)
     frames = clips.reshape(-1, clips.shape[-1])
     if len(frames) < k:
         raise ValueError(f"{len(frames)} frames make no {k} clusters")
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), np.errstate(invalid="raise"):
         warnings.simplefilter("ignore", UserWarning)  # a cluster that nothing falls into counts 0 in the entropy
-        found, _ = kmeans2(frames, k, iter=KMEANS_ROUNDS, minit="++", seed=np.random.default_rng(0))
+        try:
+            found, _ = kmeans2(frames, k, iter=KMEANS_ROUNDS, minit="++", seed=np.random.default_rng(0))
+        except FloatingPointError:
+            raise ValueError(f"{len(frames)} frames differ too little to make {k} clusters") from None
     return np.asarray(found, np.float64)
 
 

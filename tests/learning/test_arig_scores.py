@@ -69,6 +69,12 @@ def test_a_still_jaw_follows_nothing():
     assert found.correlation == 0 and found.spread == 0
 
 
+def test_a_clip_too_short_to_be_shifted_does_not_count():
+    first, short = talk(100), talk(20)
+    assert scores.lips([jaw(first), jaw(-short)], [jaw(first), jaw(short)]) == scores.lips([jaw(first)], [jaw(first)])
+    assert scores.lips([jaw(short)], [jaw(short)]).correlation == 0
+
+
 def test_clips_are_each_taken_less_their_own_mean():
     first, second = talk(200), talk(200, seed=1)
     found = scores.lips([jaw(first), jaw(second + 5)], [jaw(first), jaw(second)])
@@ -134,24 +140,27 @@ def clips(seed: int = 0) -> np.ndarray:
 
 
 def test_the_truth_is_at_no_distance_of_itself():
-    found = tables.scores(clips(), clips(), clips(1))
+    found = tables.scores(clips(), clips(), clips(1), CENTRES)
     for part in ("exp", "pose"):
         assert found[f"FD {part}"] == pytest.approx(0, abs=1e-6) and found[f"RPCC {part}"] == 0
         assert 0 < found[f"SID {part}"] <= np.log2(tables.CLUSTERS[part])
 
 
 def test_a_still_face_has_no_variance_and_no_diversity():
-    found = tables.scores(clips(), np.zeros_like(clips()), clips(1))
+    found = tables.scores(clips(), np.zeros_like(clips()), clips(1), CENTRES)
     assert found["Var exp"] == found["Var pose"] == 0
     assert found["SID exp"] == pytest.approx(0, abs=1e-5) and np.isnan(found["RPCC exp"])
+
+
+CENTRES = tables.centres_of(clips())
 
 
 def test_clips_without_a_speakers_face_do_not_count_for_rpcc():
     other = clips(1)
     other[0] = np.nan
-    found = tables.scores(clips(), clips(2), other)
-    assert found["RPCC exp"] == tables.scores(clips()[1:], clips(2)[1:], clips(1)[1:])["RPCC exp"]
-    assert np.isnan(tables.scores(clips(), clips(2), np.full_like(other, np.nan))["RPCC exp"])
+    found = tables.scores(clips(), clips(2), other, CENTRES)
+    assert found["RPCC exp"] == tables.scores(clips()[1:], clips(2)[1:], clips(1)[1:], CENTRES)["RPCC exp"]
+    assert np.isnan(tables.scores(clips(), clips(2), np.full_like(other, np.nan), CENTRES)["RPCC exp"])
 
 
 def test_rows_share_their_columns_and_hold_the_papers():

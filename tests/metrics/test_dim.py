@@ -77,6 +77,8 @@ def test_shannon_index_counts_nearest_centres_pooled_or_clip_by_clip():
     assert each == pytest.approx(np.mean([entropy(clip) for clip in pred]))
     with pytest.raises(ValueError, match="200 frames make no 201 clusters"):
         metrics.cluster_centres(reference, 201)
+    with pytest.raises(ValueError, match="200 frames differ too little to make 3 clusters"):
+        metrics.cluster_centres(np.zeros_like(reference), 3)
 
 
 def test_centres_are_the_means_of_what_is_nearest_to_them():

@@ -18,7 +18,7 @@ from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning.arig.labels import UNKNOWN
 from sfms_robot.learning.corpus import in_space, spread_bounds, windows
 from sfms_robot.learning.datasets import clips
-from sfms_robot.learning.datasets.collection import usable
+from sfms_robot.learning.datasets.collection import Dataset, usable
 from sfms_robot.learning.datasets.formats import open_dataset
 from sfms_robot.listeners.arig import sound
 from sfms_robot.listeners.arig.diffusion import Denoiser
@@ -88,9 +88,9 @@ class Corpus:
         return {"dyads": len(self.lengths), "frames": sum(self.lengths), "digest": digest.hexdigest()}
 
 
-def open_scenes(data: Path, split: str) -> dict[str, Sequence[clips.Dyad]]:
+def open_scenes(data: Path, split: str) -> dict[str, Dataset]:
     """The set in `data` is listening; data/speaking and data/interaction, where they are, the other two."""
-    found: dict[str, Sequence[clips.Dyad]] = {"listening": open_dataset(data, split)}
+    found = {"listening": open_dataset(data, split)}
     for scene in ("speaking", "interaction"):
         if any((data / scene).glob(f"{split}/*.npz")):
             found[scene] = open_dataset(data / scene, split)

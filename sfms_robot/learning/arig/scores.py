@@ -98,7 +98,11 @@ class Lips:
 
 
 def lips(played: Sequence[Floats], recorded: Sequence[Floats], lags: int = LAGS) -> Lips:
-    """Motions (N, 58), made and recorded, each pair of one clip longer than `lags` either way."""
+    """Motions (N, 58), made and recorded; a pair that is not longer than `lags` either way does not count."""
+    long = [pair for pair in zip(played, recorded, strict=True) if len(pair[0]) > 2 * lags]
+    if not long:
+        return Lips(0.0, 0, 0.0, 0.0)
+    played, recorded = zip(*long, strict=True)
     found = {lag: _pooled(played, recorded, lag) for lag in range(-lags, lags + 1)}
     best = max(found, key=lambda lag: (found[lag], -abs(lag)))
     spreads = [np.concatenate([one[:, JAW] - one[:, JAW].mean() for one in each]).std() for each in (played, recorded)]

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from sfms_robot import metrics
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE, SHAPES, Doubles, Floats
 
 CLIP_FRAMES: Final = 250
@@ -65,24 +65,32 @@ def cut(motions: Sequence[Floats], frames: int = CLIP_FRAMES) -> Doubles:
     return np.stack(clips).astype(np.float64)
 
 
-def scores(truth: Doubles, made: Doubles, speaker: Doubles) -> dict[str, float]:
+Centres = Mapping[str, Doubles]  # of the clusters of each part
+
+
+def centres_of(truth: Doubles) -> Centres:
+    """What SID counts in: clusters of the truth (M, T, 58), the same for every row of a table. Raises ConfigError."""
+    try:
+        return {part: metrics.cluster_centres(truth[..., where], CLUSTERS[part]) for part, where in PARTS.items()}
+    except ValueError as error:
+        raise ConfigError(f"the clips' own motion: {error}") from error
+
+
+def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Centres) -> dict[str, float]:
     """FD, RPCC, SID and Var of expression and pose; clips (M, T, 58), a speaker's face NaN where it is not seen.
 
-    RPCC is over the clips in which the speaker's face is seen throughout, NaN when there is none.
+    RPCC is over the clips in which the speaker's face is seen throughout, NaN when there is none or one of the three
+    never moves.
     """
     seen = np.isfinite(speaker).all(axis=(1, 2))
     found: dict[str, float] = {}
     for part, where in PARTS.items():
         real, ours, other = truth[..., where], made[..., where], speaker[..., where]
-        pooled = real.reshape(-1, real.shape[-1])
-        centres, _ = kmeans2(pooled, CLUSTERS[part], minit="++", seed=np.random.default_rng(0))
-        still = float(np.ptp(ours)) == 0
+        moves = seen.any() and all(np.ptp(each[seen]) > 0 for each in (real, ours, other))
         found |= {
             f"FD {part}": metrics.frechet_distance(real, ours),
-            f"RPCC {part}": metrics.rpcc_flat(real[seen], ours[seen], other[seen])
-            if seen.any() and not still
-            else float("nan"),
-            f"SID {part}": metrics.shannon_index(ours, real, CLUSTERS[part], unit="bits", centres=centres),
+            f"RPCC {part}": metrics.rpcc_flat(real[seen], ours[seen], other[seen]) if moves else float("nan"),
+            f"SID {part}": metrics.shannon_index(ours, real, CLUSTERS[part], unit="bits", centres=centres[part]),
             f"Var {part}": metrics.variance(ours),
         }
     return {name: found[name] for name in _NAMES}
@@ -90,8 +98,9 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles) -> dict[str, float]:
 
 def table_2(truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles]) -> list[dict[str, Any]]:
     """Rows: truth, ours by name, the paper's."""
-    rows = [_row("Ground truth", "here", scores(truth, truth, speaker))]
-    rows += [_row(name, "here", scores(truth, made, speaker)) for name, made in answers.items()]
+    centres = centres_of(truth)
+    every = {"Ground truth": truth, **answers}
+    rows = [_row(name, "here", scores(truth, made, speaker, centres)) for name, made in every.items()]
     rows += [_row(name, "paper", dict(zip(_NAMES, row, strict=True))) for name, row in PAPER_2.items()]
     return rows
 
@@ -102,10 +111,10 @@ def ablation_table(
     """Table 1 or 4 without its image columns: rows as in `table_2`, with the paper's RPCC, SID and Var beside them."""
     paper = PAPER_1 if number == 1 else PAPER_4
     columns = ("paper RPCC", "paper SID", "paper Var")
-    rows = []
+    centres, rows = centres_of(truth), []
     for name, made in {"GT": truth, **answers}.items():
-        beside = paper.get(name, (None,) * 3)
-        rows.append({**_row(name, "here", scores(truth, made, speaker)), **dict(zip(columns, beside, strict=True))})
+        beside = dict(zip(columns, paper.get(name, (None,) * 3), strict=True))
+        rows.append(_row(name, "here", scores(truth, made, speaker, centres)) | beside)
     for name in paper.keys() - {row["name"] for row in rows}:
         empty: dict[str, float | None] = dict.fromkeys(_NAMES)
         rows.append({**_row(name, "paper", empty), **dict(zip(columns, paper[name], strict=True))})
