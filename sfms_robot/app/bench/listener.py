@@ -119,7 +119,7 @@ def _arig(folder: Path, settings: config.Arig) -> Row:
     else:  # motion inside 0..1, where nothing is clipped
         model.motion_mean.copy_(torch.tensor([0.5 * (name not in POSE_CHANNELS) for name in settings.channels]))
         model.motion_std.fill_(0.02)
-    quick = ArigListener(settings, model)
+    quick = ArigListener(settings, model).settle()
     exact = ArigListener(settings.model_copy(update={"precision": "fp32"}), model)
     speaker = _speaker()
     full = _after_minutes(quick, 60)

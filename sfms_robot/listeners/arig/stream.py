@@ -10,7 +10,9 @@ its samples are those the robot says in the 40 ms after `time_s`. Given on time,
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +23,7 @@ from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
 from sfms_robot.listeners.arig import fast, sound
 from sfms_robot.listeners.arig.csu import FIRST
-from sfms_robot.listeners.arig.diffusion import Denoiser
+from sfms_robot.listeners.arig.frame import Draw, Frame, repeated
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sound import Ears
 from sfms_robot.listeners.space import MotionSpace
@@ -70,9 +72,8 @@ class ArigListener:
         self.settings = settings
         self.model = fast.with_precision(model, settings.precision).eval()
         self.space = space or MotionSpace.of(settings)
-        head = self.model.head
-        with torch.no_grad():
-            self._levels = head.level(torch.tensor(head.levels)) if isinstance(head, Denoiser) else None
+        self._frame: Callable[..., Any] = Frame(self.model).eval()
+        self._draw: Callable[..., Any] = Draw(self.model).eval()
 
     @property
     def hop(self) -> int:
@@ -81,6 +82,17 @@ class ArigListener:
     @property
     def horizon(self) -> int:
         return 1
+
+    @torch.inference_mode()
+    def settle(self) -> ArigListener:
+        """The weights stay as they are from now on: what a frame computes becomes graphs (`fast.graph`). Itself."""
+        memory = self.start(0)
+        told, _ = self._told(SpeakerFrame(0.0, np.zeros(0, np.float32)), memory)
+        z, *_ = self._frame(*told)
+        noise = torch.zeros(1, *self.model.noise_shape)
+        self._frame = fast.graph(self._frame, told)
+        self._draw = fast.graph(self._draw, (z, noise, memory.standard, memory.motion_keys))
+        return self
 
     @torch.inference_mode()
     def start(self, seed: int) -> Memory:
@@ -96,8 +108,8 @@ class ArigListener:
             agent_sound=silence,
             agent_behaviour=torch.zeros(1, c, d),
             user_behaviour=torch.zeros(1, c, d),
-            sound_keys=_repeated(model.progress.coarse.keys(silence), settings.sound_frames),
-            motion_keys=_repeated(model.progress.temporal.keys(motion), settings.motion_frames),
+            sound_keys=repeated(model.progress.coarse.keys(silence), settings.sound_frames),
+            motion_keys=repeated(model.progress.temporal.keys(motion), settings.motion_frames),
             context=torch.zeros(settings.context_layers, 2, 1, heads, settings.context_chunks - 1, d // heads),
             motion=motion,
             standard=still,
@@ -112,90 +124,64 @@ class ArigListener:
         Raises ValueError when the frame holds another number of samples than 640 or none.
         """
         z, now = self.condition(speaker, memory)
-        sample, random = self._sample(z, now.random)
-        standard = self.model.drawn(sample, now.standard)
-        motion = self.model.embed_motion(standard)
-        keys = self.model.progress.temporal.keys(motion)
-        after = replace(now, motion=motion, standard=standard, motion_keys=_push(now.motion_keys, keys), random=random)
-        frames, jaw_rad = self.space.decode(self.model.restore(standard).numpy())
+        generator = torch.Generator()
+        generator.set_state(now.random)
+        noise = torch.randn(1, *self.model.noise_shape, generator=generator)
+        made, standard, motion, keys = self._draw(z, noise, now.standard, now.motion_keys)
+        after = replace(now, motion=motion, standard=standard, motion_keys=keys, random=generator.get_state())
+        frames, jaw_rad = self.space.decode(made.numpy())
         return Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad), after
 
     @torch.inference_mode()
     def condition(self, speaker: SpeakerFrame, memory: Memory) -> tuple[Tensor, Memory]:
         """What the sampler is told of the next frame, z (1, D), and the memory but for the motion to be drawn."""
-        model = self.model
-        now, user_sound = self._hear(speaker, memory)
-        cis, made = model.long.step(
-            model.short(now.agent_behaviour, now.user_behaviour, now.agent_sound, user_sound),
-            self._in_view(now),
-            model.long.turn(torch.tensor([memory.frames // self.settings.chunk_frames])),
-        )
-        feature, state = None, now.state
-        if model.states is not None:
-            voiced = torch.tensor([[now.agent_ears.voiced, now.user_ears.voiced]])
-            feature, logits = model.states(model.states.condition(cis, voiced), torch.tensor([now.state]))
-            state = int(logits.argmax())
-        z = model.progress(now.motion, now.sound_keys, now.motion_keys, now.agent_sound, cis, feature)
+        told, now = self._told(speaker, memory)
+        z, logits, made, agent_sound, agent_behaviour, user_behaviour, sound_keys = self._frame(*told)
         whole = now.frames % self.settings.chunk_frames == 0
-        context = torch.cat([now.context[..., 1:, :], made], dim=-2) if whole else now.context
-        return z, replace(now, context=context, state=state)
+        after = replace(
+            now,
+            agent_sound=agent_sound,
+            agent_behaviour=agent_behaviour,
+            user_behaviour=user_behaviour,
+            sound_keys=sound_keys,
+            context=torch.cat([now.context[..., 1:, :], made], dim=-2) if whole else now.context,
+            state=int(logits.argmax()) if logits.numel() else now.state,
+        )
+        return z, after
 
-    def _hear(self, speaker: SpeakerFrame, memory: Memory) -> tuple[Memory, Tensor]:
-        """Memory with the behaviours of this frame and the agent's sound of the next, and the user's sound (1, D)."""
-        model = self.model
+    def _told(self, speaker: SpeakerFrame, memory: Memory) -> tuple[tuple[Tensor, ...], Memory]:
+        """What `Frame` takes, and memory with both tracks heard."""
         user, heard, user_ears = sound.hear(speaker.audio, memory.user_ears)
         agent, says, agent_ears = sound.hear(sound.fit_frame(speaker.agent_audio), memory.agent_ears)
-        sounds = model.embed_sound(
+        face, seen = self._face(speaker)
+        told = (
             torch.from_numpy(np.stack([user, agent])),
             torch.tensor([heard, says]),
-            torch.stack([model.no_user_sound, model.no_agent_sound]),
+            torch.tensor([[agent_ears.voiced, user_ears.voiced]]),
+            face,
+            seen,
+            torch.tensor(memory.frames == 0),
+            torch.tensor([memory.state]),
+            self.model.long.turn(torch.tensor([memory.frames // self.settings.chunk_frames])),
+            self._in_view(memory),
+            memory.agent_sound,
+            memory.agent_behaviour,
+            memory.user_behaviour,
+            memory.sound_keys,
+            memory.motion,
+            memory.motion_keys,
         )
-        user_sound, agent_sound = sounds[:1], sounds[1:].clone()  # memory holds no more than it needs
-        agent_behaviour = model.merge_agent(memory.agent_sound, memory.motion)
-        user_behaviour = model.merge_user(user_sound, self._face(speaker))
-        first = memory.frames == 0
-        c = self.settings.chunk_frames
-        now = replace(
-            memory,
-            frames=memory.frames + 1,
-            user_ears=user_ears,
-            agent_ears=agent_ears,
-            agent_sound=agent_sound,
-            agent_behaviour=_repeated(agent_behaviour, c) if first else _push(memory.agent_behaviour, agent_behaviour),
-            user_behaviour=_repeated(user_behaviour, c) if first else _push(memory.user_behaviour, user_behaviour),
-            sound_keys=_push(memory.sound_keys, model.progress.coarse.keys(agent_sound)),
-        )
-        return now, user_sound
+        return told, replace(memory, frames=memory.frames + 1, user_ears=user_ears, agent_ears=agent_ears)
 
-    def _face(self, speaker: SpeakerFrame) -> Tensor:
-        """(1, D) embedded; what is not finite or beyond all faces is not seen: memory would never be rid of it."""
+    def _face(self, speaker: SpeakerFrame) -> tuple[Tensor, Tensor]:
+        """(1, C) standardised, (1,) seen; what is not finite or beyond all faces is not: memory would keep it."""
         motion = None if speaker.face is None else speaker.face.motion
         if motion is None or not np.abs(motion).max() < BEYOND:  # false for NaN too
-            return self.model.embed_face(torch.zeros(1, self.model.channels), torch.tensor([False]))
-        face = self.model.standardise(torch.from_numpy(self.space.encode(motion[None])))
-        return self.model.embed_face(face, torch.tensor([True]))
+            return torch.zeros(1, self.model.channels), torch.tensor([False])
+        return self.model.standardise(torch.from_numpy(self.space.encode(motion[None]))), torch.tensor([True])
 
     def _in_view(self, memory: Memory) -> Tensor:
-        """Keys and values of the whole chunks there are; `memory.frames` counts the newest frame."""
+        """Keys and values of the whole chunks there are; `memory.frames` does not count the frame to come."""
         room = memory.context.shape[-2]
-        chunks = min((memory.frames - 1) // self.settings.chunk_frames, room)
+        chunks = min(memory.frames // self.settings.chunk_frames, room)
         return memory.context[..., room - chunks :, :]
-
-    def _sample(self, z: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
-        """z (1, D) -> what the sampler draws (1, C), and the generator's next state."""
-        generator = torch.Generator()
-        generator.set_state(random)
-        noise = torch.randn(1, *self.model.noise_shape, generator=generator)
-        head = self.model.head
-        motion = head.sample(z, noise, self._levels) if isinstance(head, Denoiser) else head.sample(z, noise)
-        return motion, generator.get_state()
-
-
-def _repeated(x: Tensor, count: int) -> Tensor:
-    """(1, D) -> (1, count, D)."""
-    return x[:, None].repeat(1, count, 1)
-
-
-def _push(queue: Tensor, new: Tensor) -> Tensor:
-    """(1, S, D) without its oldest row and with `new` (1, D) as its newest."""
-    return torch.cat([queue[:, 1:], new[:, None]], dim=1)
