@@ -23,11 +23,15 @@ def save_config(folder: Path, settings: config.Listener) -> None:
     (folder / CONFIG).write_text(text, encoding="utf-8")
 
 
-def save_weights(file: Path, module: nn.Module) -> None:
-    """Write the state of `module`, replacing `file` in one move so that an interrupted run leaves the old one."""
+def save_weights(file: Path, module: nn.Module, half: bool = False) -> None:
+    """Write the state of `module`, replacing `file` in one move so that an interrupted run leaves the old one.
+
+    `half`: in 16 bits, which is half the room; what loads it computes in 32 again.
+    """
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(".part")
-    save_file({name: value.contiguous() for name, value in module.state_dict().items()}, part)
+    state = {name: value.half() if half and value.is_floating_point() else value for name, value in module.state_dict().items()}
+    save_file({name: value.contiguous() for name, value in state.items()}, part)
     part.chmod(0o644)  # safetensors leaves it readable by its owner alone
     part.replace(file)
 

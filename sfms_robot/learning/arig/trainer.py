@@ -31,6 +31,8 @@ def train_arig(
 ) -> dict[str, Any]:
     """Train on `data`/train (and its speaking/ and interaction/) and write `out`/config.yaml and model.safetensors.
 
+    Weights are written in 16 bits: a frame differs by less than a hundredth of its spread (a test).
+
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on.
     """
     listener, phase = settings.listener, settings.training
@@ -43,7 +45,7 @@ def train_arig(
     job = arig_job(settings, pupil, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     checkpoint.save_config(out, listener)
-    checkpoint.save_weights(out / checkpoint.WEIGHTS, pupil.model.cpu())
+    checkpoint.save_weights(out / checkpoint.WEIGHTS, pupil.model.cpu(), half=True)
     parts = held_out_parts(pupil.to(run.device), held_out.to(run.device), phase)
     return {
         **asdict(outcome),

@@ -1,5 +1,6 @@
+import numpy as np
 import pytest
-from tiny_arig import RAW
+from tiny_arig import RAW, arig_listener, talk
 
 from sfms_robot import config
 from sfms_robot.config.kinds import KINDS, parse_listener
@@ -21,6 +22,8 @@ LISTENERS = data_dir("configs") / "listeners"
         ({"diffusion": {"sampler": "euler"}}, "diffusion.sampler = 'euler'.*'ddpm' or 'ddim'"),
         ({"context_chunks": 1}, "context_chunks = 1"),
         ({"sound": "mfcc"}, "sound = 'mfcc'.*'mel' or 'wav2vec2'"),
+        ({"diffusion": {"temperatures": {"nose": 1, "horn": 1}}}, "diffusion.temperatures.horn: no channel of arkit58"),
+        ({"diffusion": {"temperatures": {"eye": -1}}}, "diffusion.temperatures.eye = -1"),
         ({"chunks": 6}, "'chunks' is not a known key.*chunk_frames"),
         ({"code_levels": []}, "code_levels"),
         ({"kind": "argi"}, "kind = 'argi' is not a kind of listener.*arig"),
@@ -46,7 +49,7 @@ def test_shipped_sizes_hold_the_papers_numbers(name: str, context: int):
 
 def test_the_small_one_fits_in_12_megabytes(tmp_path):
     model = ArigModel(config.load(config.Arig, LISTENERS / "arig-small" / "config.yaml"))
-    checkpoint.save_weights(tmp_path / "model.safetensors", model)
+    checkpoint.save_weights(tmp_path / "model.safetensors", model, half=True)
     assert (tmp_path / "model.safetensors").stat().st_size < 12e6
 
 
@@ -58,6 +61,22 @@ def test_a_folder_is_loaded_again_as_it_was_saved(tmp_path):
     loaded = load(tmp_path)
     assert loaded.settings == settings
     assert all((loaded.model.state_dict()[name] == value).all() for name, value in model.state_dict().items())
+
+
+def test_weights_in_16_bits_make_a_frame_that_differs_by_less_than_a_hundredth_of_its_spread(tmp_path):
+    exact = arig_listener()
+    exact.model.motion_mean.fill_(0.5)  # inside 0..1, where nothing is clipped
+    exact.model.motion_std.fill_(0.02)
+    checkpoint.save_config(tmp_path, exact.settings)
+    checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, exact.model, half=True)
+    shorter, memory, frames = load(tmp_path), exact.start(1), []
+    for frame in talk(40):
+        other, _ = shorter.step(frame, memory)
+        plan, memory = exact.step(frame, memory)
+        frames.append((plan.frames[0], other.frames[0]))
+    before, after = np.array(frames).swapaxes(0, 1)
+    distance = np.sqrt(np.square(after - before).mean(0)) / before.std(0)
+    assert 0 < distance.mean() < 0.01
 
 
 def test_weights_of_another_size_are_refused(tmp_path):
