@@ -30,7 +30,10 @@ def save_weights(file: Path, module: nn.Module, half: bool = False) -> None:
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(".part")
-    state = {name: value.half() if half and value.is_floating_point() else value for name, value in module.state_dict().items()}
+    state = {
+        name: value.half() if half and value.is_floating_point() else value
+        for name, value in module.state_dict().items()
+    }
     save_file({name: value.contiguous() for name, value in state.items()}, part)
     part.chmod(0o644)  # safetensors leaves it readable by its owner alone
     part.replace(file)

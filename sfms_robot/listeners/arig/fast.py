@@ -1,4 +1,4 @@
-"""The fast path: what a frame computes as graphs, large layers in 8-bit integers, scaled anew for every input.
+"""The fast path: large layers in 8-bit integers, scaled anew for every input (dynamic quantization).
 
 One frame at a time, a layer costs what it takes to read its weights; in bytes that is a quarter. Weights are rounded
 per output row, the input by its own range. The sampler and small layers stay in 32 bits: they gain nothing, and what
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -41,24 +40,6 @@ class Int8Linear(nn.Module):
         return out
 
     __call__ = forward  # as parts.Part
-
-
-WARM_UPS = 3  # a graph is put together in its first two runs
-
-
-def graph(part: Callable[..., Any], example: tuple[Tensor, ...]) -> Callable[..., Any]:
-    """`part`, a module whose weights stay as they are, as one graph for inputs such as `example`.
-
-    Without Python between its products a small model takes a quarter less time. torch.jit is on its way out; what
-    takes its place wants a C++ compiler on the machine that runs.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        traced = torch.jit.trace(part, example, check_trace=False)  # type: ignore[no-untyped-call]
-        made: Callable[..., Any] = torch.jit.freeze(traced)
-    for _ in range(WARM_UPS):
-        made(*example)
-    return made
 
 
 def supported() -> bool:

@@ -1,7 +1,7 @@
 """What a stream computes of one frame, as two functions of tensors: `Frame` up to the sampler, `Draw` from there on.
 
 Offline the same parts run over all frames at once (`model.condition`, `model.generate`); that both agree is a law of
-the tests. As functions of tensors alone they can become graphs (`fast.graph`).
+the tests. As functions of tensors alone they can become graphs (`graphs`).
 
 A features of sound, C channels, D width, c frames of a chunk, S whole chunks in view.
 """

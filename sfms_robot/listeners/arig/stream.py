@@ -26,6 +26,7 @@ from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.frame import Draw, Frame, repeated
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sound import Ears
+from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.space import MotionSpace
 
 BEYOND = 1e3  # rad, m or of a blendshape: no face
@@ -72,8 +73,8 @@ class ArigListener:
         self.settings = settings
         self.model = fast.with_precision(model, settings.precision).eval()
         self.space = space or MotionSpace.of(settings)
-        self._frame: Callable[..., Any] = Frame(self.model).eval()
-        self._draw: Callable[..., Any] = Draw(self.model).eval()
+        self._frame: Callable[..., Any] = Frame(self.model)
+        self._draw: Callable[..., Any] = Draw(self.model)
 
     @property
     def hop(self) -> int:
@@ -85,13 +86,13 @@ class ArigListener:
 
     @torch.inference_mode()
     def settle(self) -> ArigListener:
-        """The weights stay as they are from now on: what a frame computes becomes graphs (`fast.graph`). Itself."""
+        """The weights stay as they are from now on: what a frame computes becomes graphs. Itself."""
         memory = self.start(0)
         told, _ = self._told(SpeakerFrame(0.0, np.zeros(0, np.float32)), memory)
         z, *_ = self._frame(*told)
         noise = torch.zeros(1, *self.model.noise_shape)
-        self._frame = fast.graph(self._frame, told)
-        self._draw = fast.graph(self._draw, (z, noise, memory.standard, memory.motion_keys))
+        self._frame = graph(Frame(self.model), told)
+        self._draw = graph(Draw(self.model), (z, noise, memory.standard, memory.motion_keys))
         return self
 
     @torch.inference_mode()

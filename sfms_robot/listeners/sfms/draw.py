@@ -14,14 +14,17 @@ little was learned: guidance fades to 1 there, and a group may draw from a small
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sfms_robot import config
+from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.sfms.model import SfmsModel
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, Trail, trails
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, Predictor, Trail, trails
 from sfms_robot.listeners.sfms.reach import Reach
 from sfms_robot.signals.phase import PHRASE_KNOTS_S, SILENCE_KNOTS_S, SPEECH_KNOTS_S
 
@@ -32,61 +35,103 @@ SILENCE_LATELY = torch.tensor(
 LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing, and sorting it takes time
 
 
+class Ahead(nn.Module):
+    """What is known of every future frame before any of them is drawn."""
+
+    def __init__(self, predictor: Predictor, nobody: Tensor | None) -> None:
+        super().__init__()
+        self.predictor = predictor
+        self.register_buffer("nobody", nobody, persistent=False)
+
+    def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The fields of a Context -> slots (B, H, W), or (2, B, H, W) with the speaker and with nobody, and trails."""
+        context = Context(*seen)
+        past = trails(context.tokens)
+        slots = self.predictor(context, past, self.nobody)
+        return (slots if self.nobody is None else slots.unflatten(0, (2, -1))), past.tokens, past.at
+
+
+class Next(nn.Module):
+    """One future frame drawn after those before it."""
+
+    bias: Tensor
+
+    def __init__(self, settings: config.Sfms, model: SfmsModel) -> None:
+        super().__init__()
+        self.predictor = model.predictor
+        self.temperature = settings.sampling.temperature
+        bias = torch.tensor([group.transition_bias for group in settings.groups.values()])
+        self.register_buffer("bias", bias, persistent=False)
+        self.reach = Reach(model)
+
+    def forward(
+        self, slots: Tensor, last: Tensor, at: Tensor, frame: Tensor, guidance: Tensor, nucleus: Tensor, chance: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One frame.
+
+        Args:
+            slots: (B, W) of this frame, or (2, B, W) where a group is guided.
+            last, at: the trail (B, G, 2) of the frame before; frame: () its number.
+            guidance: (1 or B, G, 1); nucleus, chance: (1 or B, G), as `sample` takes them.
+
+        Returns:
+            Tokens (B, G) and the trail (B, G, 2) after them.
+        """
+        trail = Trail(last, at)
+        logits = self.predictor.classes(slots, trail, frame)
+        if slots.dim() == 3:
+            logits = guided(logits[0], logits[1], guidance)  # (B, G, V)
+        too_soon = self.reach.too_soon(last[..., 0], frame + 1 - at[..., 0])
+        drawn = sample(logits.masked_fill(too_soon, -torch.inf) / self.temperature, self.bias, nucleus, chance)
+        after = trail.then(drawn, frame + 1)
+        return drawn, after.tokens, after.at
+
+
 class Sampler:
     """How the tokens of one listener are drawn: its predictor, and what its settings say of every group."""
 
     @torch.no_grad()
     def __init__(self, settings: config.Sfms, model: SfmsModel) -> None:
         groups, common = list(settings.groups.values()), settings.sampling
-        self._predictor = model.predictor
-        self._reach = Reach(model)
-        self._future = settings.future_frames
-        self._bias = torch.tensor([group.transition_bias for group in groups])
         self._nucleus = torch.tensor([group.nucleus or common.nucleus for group in groups])
-        self._temperature = common.temperature
         alone = [group.nucleus_in_silence or group.nucleus or common.nucleus for group in groups]
         self._nucleus_in_silence = torch.tensor(alone)
         self._guidance = torch.tensor([group.guidance for group in groups])[:, None]
         guided = any(group.guidance != 1.0 for group in groups)
-        self._nobody = model.predictor.nobody(settings.past_frames) if guided else None
+        self._ahead = Ahead(model.predictor, model.predictor.nobody(settings.past_frames) if guided else None).eval()
+        self._next = Next(settings, model).eval()
+        self._graphs: tuple[Callable[..., Any], Callable[..., Any]] | None = None
+
+    @torch.inference_mode()
+    def settle(self, seen: Context) -> None:
+        """The weights stay as they are: what a single stream such as `seen` draws is drawn by graphs from now on."""
+        told = tuple(getattr(seen, field.name) for field in fields(seen))
+        slots, last, at = self._ahead(*told)
+        frame, chance = torch.tensor(0), torch.zeros(1, seen.tokens.shape[2])
+        example = (slots[..., 0, :], last[:, 0], at[:, 0], frame, self._guidance[None], self._nucleus[None], chance)
+        self._graphs = graph(self._ahead, told), graph(self._next, example)
 
     def draw(self, seen: Context, generators: Sequence[torch.Generator]) -> Tensor:
         """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b by the numbers of generators[b]."""
+        ahead, after = self._graphs if self._graphs and len(generators) == 1 else (self._ahead, self._next)
         tokens = seen.tokens.clone()
         first = int((tokens[0] > UNDECIDED).all(-1).sum())  # the same for all streams
-        future = tokens.shape[1] - self._future
-        past = trails(tokens)
-        slots = self._predictor(seen, past, self._nobody)  # (B, H, W)
-        if self._nobody is not None:
-            slots = slots.unflatten(0, (2, -1))  # with the speaker, and with nobody
-        trail = Trail(*(part[:, first - 1] for part in past))
+        slots, last, at = ahead(*(getattr(seen, field.name) for field in fields(seen)))
+        last, at = last[:, first - 1], at[:, first - 1]
         left, groups = tokens.shape[1] - first, tokens.shape[2]
         chances = torch.stack([torch.rand(left, groups, generator=one) for one in generators], dim=1)
         lately = self._lately(seen)
         guidance = 1 + (self._guidance - 1) * lately[:, None, None]  # (1 or B, G, 1)
         nucleus = self._nucleus_in_silence + (self._nucleus - self._nucleus_in_silence) * lately[:, None]
         for frame, chance in enumerate(chances, first):
-            logits = self._logits(slots[..., frame - future, :], trail, frame - 1, guidance)  # (B, G, V)
-            logits = logits.masked_fill(
-                self._reach.too_soon(trail.tokens[..., 0], frame - trail.at[..., 0]), -torch.inf
-            )
-            drawn = sample(logits / self._temperature, self._bias, nucleus, chance)
-            tokens[:, frame] = drawn
-            trail = trail.then(drawn, frame)
+            slot = slots[..., frame - tokens.shape[1], :]
+            tokens[:, frame], last, at = after(slot, last, at, torch.tensor(frame - 1), guidance, nucleus, chance)
         return tokens
 
     def _lately(self, seen: Context) -> Tensor:
         """(1 or B,) 1 where somebody speaks or did 1.6 s ago, 0 from 3.2 s of silence on; 1 if that is unknown."""
         silence = seen.phase[:, -1] @ SILENCE_LATELY if seen.phase.shape[-1] else torch.ones(len(seen.heard))
         return torch.where(seen.heard[:, -1], silence, 1.0)
-
-    def _logits(self, slots: Tensor, trail: Trail, frame: int, guidance: Tensor) -> Tensor:
-        """(B, G, V) of slots (B, W), or (2, B, W) where a group is guided."""
-        logits = self._predictor.classes(slots, trail, frame)
-        if self._nobody is None:
-            return logits
-        heard, unheard = logits
-        return guided(heard, unheard, guidance)
 
 
 def guided(heard: Tensor, unheard: Tensor, guidance: Tensor) -> Tensor:

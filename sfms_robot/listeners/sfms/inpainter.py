@@ -51,12 +51,12 @@ class Inpainter(nn.Module):
         seen = (mask > 0.5).any(-1)
         seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
         # Other frames are neither looked at nor kept; but a gradient, which learned placement needs, passes there.
-        keys = slice(None) if torch.is_grad_enabled() else seen.any(0).nonzero()[:, 0]
+        every = torch.arange(seen.shape[1], device=seen.device)
+        keys = every if torch.is_grad_enabled() else seen.any(0).nonzero()[:, 0]
         seen, z_keys = seen[:, keys], z_kf[:, keys]
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
-        z_kf = torch.zeros_like(z_kf)
-        z_kf[:, keys] = z_keys * mask[:, keys].amax(-1, keepdim=True)
+        z_kf = torch.zeros_like(z_kf).index_copy(1, keys, z_keys * mask[:, keys].amax(-1, keepdim=True))
         between = neighbours.interpolate(keyed)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
         z_tf = self.transition_in(query) + places

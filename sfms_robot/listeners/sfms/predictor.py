@@ -53,12 +53,12 @@ class Trail(NamedTuple):
     tokens: Tensor
     at: Tensor
 
-    def then(self, drawn: Tensor, frame: int) -> Trail:
-        """After the tokens (..., G) `drawn` for `frame`."""
+    def then(self, drawn: Tensor, frame: Tensor | int) -> Trail:
+        """After the tokens (..., G) `drawn` for `frame`, a number."""
         drawn = drawn[..., None]
         key = drawn > 0
         newer = torch.cat([drawn, self.tokens[..., :1]], dim=-1)
-        newer_at = torch.nn.functional.pad(self.at[..., :1], (1, 0), value=frame)
+        newer_at = torch.cat([torch.zeros_like(self.at[..., :1]) + frame, self.at[..., :1]], dim=-1)
         return Trail(torch.where(key, newer, self.tokens), torch.where(key, newer_at, self.at))
 
 

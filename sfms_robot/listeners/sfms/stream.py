@@ -9,15 +9,17 @@ fades over `seam_frames`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sfms_robot import config
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, Plan, SpeakerFrame
+from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.sfms.draw import Sampler
 from sfms_robot.listeners.sfms.hearing import Ears, Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
@@ -77,6 +79,17 @@ def neutral_tokens(model: SfmsModel, space: MotionSpace, frames: int) -> Tensor:
     return model.tokenizer.encode(still, mask)[0]
 
 
+class Decode(nn.Module):
+    """Tokens (B, P + H, G) -> the motion of their last frames (B, last, C)."""
+
+    def __init__(self, model: SfmsModel, last: int) -> None:
+        super().__init__()
+        self.tokenizer, self.last = model.tokenizer, last
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        return self.tokenizer.decode(tokens, last=self.last)
+
+
 class SfmsListener:
     """`ports.Listener` over an SfmsModel. Holds weights only."""
 
@@ -95,6 +108,15 @@ class SfmsListener:
         head = [float(channel in HEAD) for channel in settings.channels]
         self._smoothing = settings.sampling.smoothing * torch.tensor(head)
         self._neutral = neutral_tokens(self.model, self.space, settings.past_frames)
+        self._decode = Decode(self.model, settings.future_frames + 2).eval()
+        self._decode_one: Callable[..., Any] = self._decode
+
+    def settle(self) -> SfmsListener:
+        """The weights stay as they are from now on: what a single stream computes of a plan becomes graphs. Itself."""
+        memory = self.start(0)
+        self.sampler.settle(_context(memory.speaker, memory.tokens[None]))
+        self._decode_one = graph(self._decode, (memory.tokens[None],))
+        return self
 
     @property
     def hop(self) -> int:
@@ -168,7 +190,7 @@ class SfmsListener:
     def plan(self, seen: Context, path: Tensor, generators: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
         """New plans of B streams: tokens (B, P + H, G), path (B, 2 + H, C). `path` is the old one, as played so far."""
         tokens = self.sampler.draw(seen, generators)
-        decoded = self.model.tokenizer.decode(tokens, last=self.horizon + 2)
+        decoded = (self._decode_one if len(tokens) == 1 else self._decode)(tokens)
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
     def _hear(self, speaker: SpeakerFrame, before: Heard) -> Heard:
