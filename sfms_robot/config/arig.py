@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from sfms_robot.config.base import Model, NonNegative
 from sfms_robot.config.listener import Count, Listener
+
+
+def _both(value: Any) -> Any:
+    return (value, value) if isinstance(value, int | float) else value
+
+
+Temperature = Annotated[tuple[NonNegative, NonNegative], BeforeValidator(_both)]  # first and last; one number is both
 
 
 class Diffusion(Model):
@@ -18,7 +25,8 @@ class Diffusion(Model):
         train_steps: noise levels in training.
         steps: of them used to sample one frame, spread evenly.
         sampler: `ddpm` is the paper's (4); `ddim` adds no noise between steps, which suits few of them.
-        temperature: factor on the noise that is added between steps.
+        temperature: factor on the noise that is added between steps; two: after the first step and before the last,
+            evenly in between. Early noise decides what happens, late noise is jitter.
         temperatures: the same, in its place, for channels whose names begin so: `{eye: 1.1}`; the first that fits.
     """
 
@@ -27,10 +35,10 @@ class Diffusion(Model):
     train_steps: Annotated[int, Field(ge=2)] = 1000
     steps: Count = 15
     sampler: Literal["ddpm", "ddim"] = "ddpm"
-    temperature: NonNegative = 1.0
-    temperatures: dict[str, NonNegative] = {}
+    temperature: Temperature = (1.0, 1.0)
+    temperatures: dict[str, Temperature] = {}
 
-    def temperature_of(self, channel: str) -> float:
+    def temperature_of(self, channel: str) -> tuple[float, float]:
         fits = (value for prefix, value in self.temperatures.items() if channel.startswith(prefix))
         return next(fits, self.temperature)
 

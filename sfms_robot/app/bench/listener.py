@@ -84,7 +84,10 @@ def _sfms_paper() -> Row:
         torch.manual_seed(0)
         model = SfmsModel(training.listener)
     params = sum(each.numel() for each in model.parameters())
-    return _plans(SfmsListener(training.listener, model)) | {"params": params, "weights": "seeded, not trained"}
+    return _plans(SfmsListener(training.listener, model).settle()) | {
+        "params": params,
+        "weights": "seeded, not trained",
+    }
 
 
 def _plans(listener: Listener) -> Row:

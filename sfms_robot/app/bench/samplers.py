@@ -47,7 +47,7 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
 
     @torch.inference_mode()
     def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        plain = {"temperature": 1.0, "temperatures": {}}
+        plain = {"temperature": (1.0, 1.0), "temperatures": {}}
         settings = head.settings.model_copy(update={"sampler": sampler, "steps": steps} | plain)
         other = Denoiser(listener.settings.channels, listener.settings.width, settings)
         other.load_state_dict(head.state_dict())

@@ -48,7 +48,9 @@ class Denoiser(nn.Module):
         self.register_buffer("low", torch.full((channels,), -8.0))  # standardised motion that is possible at all
         self.register_buffer("high", torch.full((channels,), 8.0))
         self.register_buffer("share", signal_share(settings.train_steps).float(), persistent=False)
-        warmth = torch.tensor([settings.temperature_of(name) for name in names])
+        first, last = torch.tensor([settings.temperature_of(name) for name in names]).unbind(-1)
+        late = torch.linspace(0, 1, max(1, settings.steps - 1))[:, None]
+        warmth = first + late * (last - first)  # (K - 1, C)
         self.register_buffer("warmth", warmth, persistent=False)
         self.register_buffer("places", sinusoidal(settings.train_steps, width), persistent=False)
         self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))

@@ -82,8 +82,9 @@ def test_without_added_noise_the_start_decides(changes):
 
 @torch.no_grad()
 def test_a_temperature_of_some_channels_scales_the_noise_that_is_added_to_them():
-    model = denoiser(temperatures={"eye": 2.0, "jaw": 0.5})
-    z, noise, warmth = torch.randn(2, 8), torch.randn(2, 5, 3), torch.tensor([0.5, 2.0, 2.0])
+    model = denoiser(temperature=0.3, temperatures={"eye": 2.0, "jaw": (1.4, 0.2)})
+    z, noise = torch.randn(2, 8), torch.randn(2, 5, 3)
+    warmth = torch.tensor([[1.4, 2.0, 2.0], [1.0, 2.0, 2.0], [0.6, 2.0, 2.0], [0.2, 2.0, 2.0]])
     scaled = torch.cat([noise[:, :1], noise[:, 1:] * warmth], dim=1)
     torch.testing.assert_close(model.sample(z, noise), denoiser().sample(z, scaled))
 
