@@ -100,6 +100,16 @@ def test_both_phases_give_figures_and_a_folder_that_runs(capsys, arguments, tmp_
     assert "tensorboard" not in names
 
 
+def test_both_phases_train_in_16_bits(capsys, arguments, monkeypatch):
+    monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: True)
+    raw = tiny()
+    for phase in ("tokenizer", "predictor"):
+        raw[phase] |= {"precision": "bf16", "steps": 2}
+        command = "listener" if phase == "predictor" else phase
+        figures, _ = done(capsys, command, *arguments(raw), "--no-tensorboard")
+        assert figures["steps"] == 2
+
+
 def test_curves_go_to_tensorboard(capsys, arguments, tmp_path):
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     done(capsys, "tokenizer", *arguments(), "--tensorboard")

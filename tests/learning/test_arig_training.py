@@ -52,7 +52,7 @@ def quiet(**changes) -> config.ArigPhase:
 @pytest.mark.parametrize(
     "changes",
     [{}, {"state_guidance": False}, {"visual": False}, {"discrete": True}, {"interaction": "linear"},
-     {"context_chunks": 4}],
+     {"context_chunks": 4}, {"draws": "step"}],
     ids=lambda changes: "-".join(changes) or "full",
 )  # fmt: skip
 def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, changes):
@@ -62,6 +62,13 @@ def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, chan
     silence = np.zeros(FRAME_SAMPLES, np.float32)
     plan, _ = listener.step(SpeakerFrame(0.04, silence, None, silence), listener.start(1))
     assert plan.frames.shape == (1, 58) and np.isfinite(plan.frames).all()
+
+
+@pytest.mark.parametrize("changes", [{}, {"discrete": True}, {"interaction": "linear"}], ids=str)
+def test_it_trains_in_16_bits(data, tmp_path, monkeypatch, changes):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    figures = train_arig(settings(listener=changes, steps=3, precision="bf16"), data, tmp_path)
+    assert np.isfinite(figures["loss"])
 
 
 def test_losses_fall(data, tmp_path):
