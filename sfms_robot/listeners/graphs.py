@@ -1,4 +1,4 @@
-"""What a listener computes, as graphs: without Python between their products small models take a quarter less time."""
+"""What a listener computes, as graphs: without Python between their products small models take a fifth less time."""
 
 from __future__ import annotations
 
