@@ -71,8 +71,8 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
 
 def _states(played: Sequence[Played], dyads: Sequence[Dyad], data: Path, clips: int | None) -> dict[str, Any]:
     """The listener's answers, and beside them what training labels, where there are any, make of voices alone."""
-    labelled = [(one.states, dyad, dyad.states) for one, dyad in zip(played, dyads, strict=True)
-                if dyad.states is not None]  # fmt: skip
+    pairs = zip(played, dyads, strict=True)
+    labelled = [(one.states, dyad, dyad.states) for one, dyad in pairs if dyad.states is not None]
     if not labelled or (np.concatenate([said for said, _, _ in labelled]) < 0).all():
         return {}
     said = np.concatenate([said for said, _, _ in labelled])

@@ -31,10 +31,10 @@ from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
 from sfms_robot.listeners.sfms.stream import neutral_tokens
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.mel import LN_PER_DB
 
 CALIBRATION_DYADS = 8
 HELD_OUT_BATCHES, HELD_OUT_BATCH = 20, 64
-LN_PER_DB = math.log(10) / 10  # of power
 
 
 def train_listener(

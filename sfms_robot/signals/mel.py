@@ -6,6 +6,7 @@ finished row can do without: 240 of them after whole frames. The recording start
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -18,6 +19,7 @@ HOP: Final = 160
 WINDOW: Final = 400
 FFT: Final = 512
 ROWS_PER_FRAME: Final = FRAME_SAMPLES // HOP  # 4
+LN_PER_DB: Final = math.log(10) / 10  # of power, whose natural logarithm the rows are
 FLOOR: Final = 1e-6  # added to the power: about -80 dB below full scale
 
 

@@ -152,7 +152,7 @@ def test_a_still_face_has_no_variance_and_no_diversity():
     assert found["SID exp"] == pytest.approx(0, abs=1e-5) and np.isnan(found["RPCC exp"])
 
 
-CENTRES = tables.centres_of(clips())
+CENTRES = tables.centres_of(clips(), tables.PARTS, tables.CLUSTERS)
 
 
 def test_clips_without_a_speakers_face_do_not_count_for_rpcc():

@@ -14,7 +14,7 @@ from sfms_robot.config import parse_training
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.learning.arig.corpus import SCENES, fit_scales, gather, open_scenes
-from sfms_robot.learning.arig.losses import LN_PER_DB, Pupil, augment, loss_parts, previous_states
+from sfms_robot.learning.arig.losses import Pupil, augment, loss_parts, previous_states
 from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
@@ -22,6 +22,7 @@ from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sound import MEL_WIDTH, WIDTHS
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.mel import LN_PER_DB
 
 ARKIT = MotionSpace("arkit58", np.zeros(58))
 WINDOW = 24

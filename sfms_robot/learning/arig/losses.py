@@ -9,7 +9,6 @@ sounds within fewer steps.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,7 +21,6 @@ from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.sound import MEL_WIDTH
 from sfms_robot.signals import mel
 
-LN_PER_DB = math.log(10) / 10  # of power
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
 COLOURS = 4  # waves over the bands that make up another microphone's colour
 JUMPS = 0.04  # of frames at which the slow part jumps
@@ -120,13 +118,13 @@ def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, gener
     off = torch.zeros(b, n, model.sound_width)
     if model.settings.sound != "mel":
         return off
-    size = torch.rand(b, 1, 2, generator=generator) * LN_PER_DB
+    size = torch.rand(b, 1, 2, generator=generator) * mel.LN_PER_DB
     waves = torch.randn(b, 1, COLOURS, generator=generator) / COLOURS**0.5
     place = torch.arange(mel.MEL_BINS) / mel.MEL_BINS
     colour = waves @ torch.cos(torch.pi * torch.arange(1, COLOURS + 1)[:, None] * place)
     grain = torch.randn(b, n, mel.ROWS_PER_FRAME, mel.MEL_BINS, generator=generator)
     gain = torch.rand(b, 1, 1, generator=generator) * 2 - 1
-    bands = gain * LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
+    bands = gain * mel.LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
     off[..., :MEL_WIDTH] = (bands[:, :, None] + size[..., 1:2, None] * phase.grain_db * grain).flatten(2)
     return off
 

@@ -23,13 +23,12 @@ from sfms_robot.learning.datasets.clips import Dyad
 from sfms_robot.learning.datasets.collection import Clip, ClipError, Dataset, Layout, Order, Problem
 from sfms_robot.learning.datasets.reading import dyad, npy, pose_last, track
 from sfms_robot.metrics.l2l import l2l_bilateral
-from sfms_robot.signals.mel import FLOOR, MEL_BINS, ROWS_PER_FRAME
+from sfms_robot.signals.mel import FLOOR, LN_PER_DB, MEL_BINS, ROWS_PER_FRAME
 
 FPS: Final = 30.0
 WIDTH: Final = 56
 UNUSED: Final = "devi2"  # there, and never used by the reference
 HOST_IS_P1: Final = ("fallon",)
-LN_PER_DB: Final = np.log(10) / 10
 
 
 def _file(person: int, role: str, kind: str) -> str:

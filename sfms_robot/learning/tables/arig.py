@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot import metrics
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE, SHAPES, Doubles, Floats
+from sfms_robot.learning.tables.listeners import centres_of
 
 CLIP_FRAMES: Final = 250
 PARTS: Final[Mapping[str, slice]] = {"exp": SHAPES, "pose": POSE}
@@ -65,18 +65,7 @@ def cut(motions: Sequence[Floats], frames: int = CLIP_FRAMES) -> Doubles:
     return np.stack(clips).astype(np.float64)
 
 
-Centres = Mapping[str, Doubles]  # of the clusters of each part
-
-
-def centres_of(truth: Doubles) -> Centres:
-    """What SID counts in: clusters of the truth (M, T, 58), the same for every row of a table. Raises ConfigError."""
-    try:
-        return {part: metrics.cluster_centres(truth[..., where], CLUSTERS[part]) for part, where in PARTS.items()}
-    except ValueError as error:
-        raise ConfigError(f"the clips' own motion: {error}") from error
-
-
-def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Centres) -> dict[str, float]:
+def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str, Doubles]) -> dict[str, float]:
     """FD, RPCC, SID and Var of expression and pose; clips (M, T, 58), a speaker's face NaN where it is not seen.
 
     RPCC is over the clips in which the speaker's face is seen throughout, NaN when there is none or one of the three
@@ -98,7 +87,7 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Centres) ->
 
 def table_2(truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles]) -> list[dict[str, Any]]:
     """Rows: truth, ours by name, the paper's."""
-    centres = centres_of(truth)
+    centres = centres_of(truth, PARTS, CLUSTERS)
     every = {"Ground truth": truth, **answers}
     rows = [_row(name, "here", scores(truth, made, speaker, centres)) for name, made in every.items()]
     rows += [_row(name, "paper", dict(zip(_NAMES, row, strict=True))) for name, row in PAPER_2.items()]
@@ -111,7 +100,7 @@ def ablation_table(
     """Table 1 or 4 without its image columns: rows as in `table_2`, with the paper's RPCC, SID and Var beside them."""
     paper = PAPER_1 if number == 1 else PAPER_4
     columns = ("paper RPCC", "paper SID", "paper Var")
-    centres, rows = centres_of(truth), []
+    centres, rows = centres_of(truth, PARTS, CLUSTERS), []
     for name, made in {"GT": truth, **answers}.items():
         beside = dict(zip(columns, paper.get(name, (None,) * 3), strict=True))
         rows.append(_row(name, "here", scores(truth, made, speaker, centres)) | beside)

@@ -107,6 +107,17 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+def centres_of(truth: Doubles, parts: Mapping[str, slice], clusters: Mapping[str, int]) -> Mapping[str, Doubles]:
+    """Of each part of a face the clusters of the truth (M, T, D), the same for every row of a table.
+
+    Raises ConfigError for clips that are too alike.
+    """
+    try:
+        return {part: metrics.cluster_centres(truth[..., where], clusters[part]) for part, where in parts.items()}
+    except ValueError as error:
+        raise ConfigError(f"the clips' own motion: {error}") from error
+
+
 def _features(number: int, space: str) -> str:
     if number == 1 and space == "deca56":
         return "L2L-standardised: less the mean, over the deviation between clips of their deviations"
@@ -120,9 +131,7 @@ def _table_1(clips: Clips) -> Callable[[Doubles], dict[str, Any]]:
     most = max(CLUSTERS.values())
     if (frames := truth.shape[0] * truth.shape[1]) < most:
         raise ConfigError(f"table 1 needs {most} frames for the clusters of SI, the clips have {frames} in all")
-    centres = {
-        part: metrics.cluster_centres(truth[..., where], CLUSTERS[part]) for part, where in PARTS[clips.space].items()
-    }
+    centres = centres_of(truth, PARTS[clips.space], CLUSTERS)
 
     def score(pred: Doubles) -> dict[str, Any]:
         row: dict[str, Any] = {}

@@ -110,8 +110,8 @@ class Denoiser(nn.Module):
         # The modulation of every step in one product: (K, N, W) conditions, of a single sample (K, W).
         told = self.condition(z) + levels[:, None] if n > 1 else self.condition(z) + levels
         parts = [each.chunk(self.modulation.parts, -1) for each in self.modulation.linear(F.silu(told)).unbind(0)]
-        first, *added = noise[:, 0], *(noise[:, 1:] * self.warmth).unbind(1)
-        low, high, weights, x = self.low, self.high, self._weights(), first
+        x, added = noise[:, 0], (noise[:, 1:] * self.warmth).unbind(1)
+        low, high, weights = self.low, self.high, self._weights()
         for index, step in enumerate(self.table):
             found = _denoise(x, parts[k - 1 - index], weights)
             clean = found.mul_(step.denoise[1]).add_(x, alpha=step.denoise[0]).clamp_(low, high)

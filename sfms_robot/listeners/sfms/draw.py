@@ -15,7 +15,6 @@ little was learned: guidance fades to 1 there, and a group may draw from a small
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any
 
 import torch
@@ -44,7 +43,7 @@ class Ahead(nn.Module):
         self.register_buffer("nobody", nobody, persistent=False)
 
     def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The fields of a Context -> slots (B, H, W), or (2, B, H, W) with the speaker and with nobody, and trails."""
+        """The parts of a Context -> slots (B, H, W), or (2, B, H, W) with the speaker and with nobody, and trails."""
         context = Context(*seen)
         past = trails(context.tokens)
         slots = self.predictor(context, past, self.nobody)
@@ -105,18 +104,17 @@ class Sampler:
     @torch.inference_mode()
     def settle(self, seen: Context) -> None:
         """The weights stay as they are: what a single stream such as `seen` draws is drawn by graphs from now on."""
-        told = tuple(getattr(seen, field.name) for field in fields(seen))
-        slots, last, at = self._ahead(*told)
+        slots, last, at = self._ahead(*seen.parts)
         frame, chance = torch.tensor(0), torch.zeros(1, seen.tokens.shape[2])
         example = (slots[..., 0, :], last[:, 0], at[:, 0], frame, self._guidance[None], self._nucleus[None], chance)
-        self._graphs = graph(self._ahead, told), graph(self._next, example)
+        self._graphs = graph(self._ahead, seen.parts), graph(self._next, example)
 
     def draw(self, seen: Context, generators: Sequence[torch.Generator]) -> Tensor:
         """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b by the numbers of generators[b]."""
         ahead, after = self._graphs if self._graphs and len(generators) == 1 else (self._ahead, self._next)
         tokens = seen.tokens.clone()
         first = int((tokens[0] > UNDECIDED).all(-1).sum())  # the same for all streams
-        slots, last, at = ahead(*(getattr(seen, field.name) for field in fields(seen)))
+        slots, last, at = ahead(*seen.parts)
         last, at = last[:, first - 1], at[:, first - 1]
         left, groups = tokens.shape[1] - first, tokens.shape[2]
         chances = torch.stack([torch.rand(left, groups, generator=one) for one in generators], dim=1)

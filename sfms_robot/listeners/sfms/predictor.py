@@ -11,7 +11,7 @@ Shapes: B batch, P past frames, H future frames, G channel groups, D digits of a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple
 
 import torch
@@ -45,6 +45,11 @@ class Context:
     heard: Tensor
     phase: Tensor
     tokens: Tensor
+
+    @property
+    def parts(self) -> tuple[Tensor, ...]:
+        """All of them, in this order."""
+        return tuple(getattr(self, field.name) for field in fields(self))
 
 
 class Trail(NamedTuple):
