@@ -34,4 +34,5 @@ def stream(head: str, listener: str) -> str:
 if __name__ == "__main__":
     for each_head in HEADS:
         for each_listener in LISTENERS:
-            print(stream(each_head, each_listener), flush=True)
+            sys.stdout.write(stream(each_head, each_listener) + "\n")
+            sys.stdout.flush()

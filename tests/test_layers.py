@@ -11,16 +11,17 @@ import sfms_robot
 
 PACKAGE = Path(sfms_robot.__file__).parent
 BASE = {"errors", "frames", "ports", "signals", "data", "config"}
-PEERS = {"sources", "listeners", "learning", "metrics", "retarget", "motion", "servo", "simulator"}
+PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
 ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},
-    "learning": BASE | {"learning", "listeners", "metrics"},
-    "simulator": BASE | {"simulator", "servo"},
-    "runtime": BASE | {"runtime"},
-    "app": BASE | PEERS | {"runtime", "app"},
+    "emulator": BASE | {"emulator", "servo"},
+    "corpora": BASE | {"corpora"},
+    "learning": BASE | {"learning", "listeners", "corpora"},
+    "evaluation": BASE | {"evaluation", "learning", "listeners", "corpora", "face"},
+    "app": BASE | PEERS | {"emulator", "corpora", "learning", "evaluation", "app"},
     "cli": {"app", "config", "errors", "data", "cli"},
 }
-SERVO_PARTS_FOR_THE_SIMULATOR = {"codecs", "registers"}
+SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
@@ -53,8 +54,8 @@ def test_module_imports_only_what_its_layer_may(module: Path) -> None:
         if not target or target[0] == "__version__":
             continue
         assert target[0] in ALLOWED[layer], f"{layer} may not import {'.'.join(target)}"
-        if layer == "simulator" and target[0] == "servo":
-            assert set(target[1:2]) <= SERVO_PARTS_FOR_THE_SIMULATOR, f"simulator may not import {'.'.join(target)}"
+        if layer == "emulator" and target[0] == "servo":
+            assert set(target[1:2]) <= SERVO_PARTS_FOR_THE_EMULATOR, f"emulator may not import {'.'.join(target)}"
 
 
 def test_every_layer_has_a_rule() -> None:

@@ -51,7 +51,7 @@ def _trial(name: Bench, minutes: float, json: bool) -> None:
     import logging
     from dataclasses import asdict
 
-    from sfms_robot.app import campaign, fuzz
+    from sfms_robot.app.bench import campaign, fuzz
     from sfms_robot.cli.tables import print_rows
 
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere

@@ -28,8 +28,8 @@ def doctor(
 
     Exit code 0: fit to run. 3: the port cannot be opened. 4: a finding stops the head from running.
     """
-    from sfms_robot.app.doctor import examine
-    from sfms_robot.app.servo_wire import real_clock
+    from sfms_robot.app.servo.doctor import examine
+    from sfms_robot.app.servo.servo_wire import real_clock
     from sfms_robot.cli.servo_tables import bar, print_doctor
 
     with bar("looking", hidden=json) as progress:

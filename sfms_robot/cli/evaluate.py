@@ -56,13 +56,13 @@ def tokenizer(
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
     if table is None:
-        from sfms_robot.app.learn import evaluate_tokenizer
+        from sfms_robot.app.train.learn import evaluate_tokenizer
 
         if data is None:
             raise typer.BadParameter("--data is needed without --table")
         _print(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
-    from sfms_robot.app.tables import TableOptions, evaluate_table
+    from sfms_robot.app.evaluate.tables import TableOptions, evaluate_table
 
     options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
     result = interruptible(lambda: evaluate_table(options))
@@ -91,7 +91,7 @@ def listener_(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.app.learn import evaluate_listener, listener_table
+    from sfms_robot.app.train.learn import evaluate_listener, listener_table
 
     if table is None:
         _print(evaluate_listener(listener, data, seed, order.value if order else None), json)
@@ -99,7 +99,7 @@ def listener_(
     if table.value.startswith("arig"):
         if order is not None:
             raise typer.BadParameter("--order is for --table 1 and 2, or none")
-        from sfms_robot.app.arig import AblationOptions, arig_table
+        from sfms_robot.app.evaluate.arig import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
         _print(interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations)), json)
@@ -133,7 +133,7 @@ def timing(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
-    from sfms_robot.app import timing as command
+    from sfms_robot.app.evaluate import timing as command
 
     if fit_table is not None:
         _print(command.fit_table(data, fit_table), json)
@@ -151,7 +151,7 @@ def interaction(
     json: bool = JSON,
 ) -> None:
     """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
-    from sfms_robot.app.arig import evaluate_interaction
+    from sfms_robot.app.evaluate.arig import evaluate_interaction
 
     result = evaluate_interaction(listener, data, clips, seed)
     if json:
@@ -169,7 +169,7 @@ def fidelity(
     json: bool = JSON,
 ) -> None:
     """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""
-    from sfms_robot.app.fidelity import fidelity as measure
+    from sfms_robot.app.head.fidelity import fidelity as measure
 
     _print(measure(head, data), json)
 

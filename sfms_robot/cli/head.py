@@ -21,7 +21,7 @@ app.command("fit")(fit)
 @app.command("list")
 def list_heads(json: bool = typer.Option(False, "--json", help="Print as one JSON object.")) -> None:
     """Shipped heads, with joints and buses."""
-    from sfms_robot.app.heads import shipped_heads
+    from sfms_robot.app.session import shipped_heads
 
     heads = shipped_heads()
     if json:
@@ -41,14 +41,14 @@ def check(
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
-    from sfms_robot.app.head_check import check as check_head
-    from sfms_robot.app.plot_style import checked_png
+    from sfms_robot.app.evaluate.plot_style import checked_png
+    from sfms_robot.app.head.head_check import check as check_head
 
     if plot is not None:
         checked_png(plot, "--plot")
     checked = check_head(name, data, listener)
     if plot is not None and not checked.problems:
-        from sfms_robot.app.head_plot import plot as draw
+        from sfms_robot.app.head.head_plot import plot as draw
 
         draw(checked, plot)
     if json:
@@ -93,7 +93,7 @@ def calibrate(
     json: bool = typer.Option(False, "--json", help="Print the outcome as one JSON object, last line of stdout."),
 ) -> None:
     """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
-    from sfms_robot.app.calibrate import calibrate as lead_through
+    from sfms_robot.app.head.calibrate import calibrate as lead_through
     from sfms_robot.cli.head_tables import Terminal, print_calibration
 
     outcome = lead_through(name, port, Terminal(), joint, again)
@@ -118,7 +118,7 @@ def pose(
     json: bool = typer.Option(False, "--json", help="Print what moved as one JSON object, last line of stdout."),
 ) -> None:
     """Move one expression or channel under the head's limits, hold it, and go back to rest."""
-    from sfms_robot.app.pose import PoseOptions, pose_head
+    from sfms_robot.app.head.pose import PoseOptions, pose_head
     from sfms_robot.cli.head_tables import print_pose
 
     told = pose_head(PoseOptions(name, tuple(face), port, hold, fast, yes))
@@ -142,7 +142,7 @@ def solve(
     residual: bool = typer.Option(False, "--residual", help="Also print what is missing: residual_rad,residual_m."),
 ) -> None:
     """The neck's joints for each pose, as CSV in rad, and whether the pose is reached (1) or only approached (0)."""
-    from sfms_robot.app.head_solve import solve_poses
+    from sfms_robot.app.head.head_solve import solve_poses
 
     table = solve_poses(name, poses)
     solved = table.solved

@@ -29,14 +29,14 @@ def fit(
     Written as the fit of this build, beside the shipped file. On a real port --babble records the joints alone: track
     the face with a camera of yours, put the track beside it as face.csv, and fit the recording.
     """
-    from sfms_robot.app.fit import fit_head, see_virtual_face
+    from sfms_robot.app.head.fit import fit_head, see_virtual_face
 
     if babble == (recording is not None):
         raise ConfigError("head fit: give one of --recording DIR and --babble")
     if recording is not None:
         _tell(fit_head(name, recording), json)
         return
-    from sfms_robot.app.babble import babble as move
+    from sfms_robot.app.head.babble import babble as move
 
     if port != "sim" and record is None:
         raise ConfigError("head fit --babble on a real port needs --record DIR, where the face track goes too")
@@ -52,7 +52,7 @@ def fit(
 
 
 def _tell(result: object, json: bool) -> None:
-    from sfms_robot.app.fit import HeadFit
+    from sfms_robot.app.head.fit import HeadFit
     from sfms_robot.cli.head_fit_table import print_fit
 
     assert isinstance(result, HeadFit)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich import box
 from rich.table import Table
 
-from sfms_robot.app.fit import HeadFit
+from sfms_robot.app.head.fit import HeadFit
 from sfms_robot.cli.screen import screen
 
 

@@ -8,8 +8,8 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from sfms_robot.app.calibrate import Outcome
-from sfms_robot.app.head_check import HeadCheck
+from sfms_robot.app.head.calibrate import Outcome
+from sfms_robot.app.head.head_check import HeadCheck
 from sfms_robot.cli.screen import screen
 
 _OVER = "bold red"

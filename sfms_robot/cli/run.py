@@ -42,8 +42,8 @@ def run(
     json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.progress import RunProgress
-    from sfms_robot.app.run import RunOptions, run_head
+    from sfms_robot.app.listen.progress import RunProgress
+    from sfms_robot.app.listen.run import RunOptions, run_head
     from sfms_robot.cli.tables import print_dry_run, print_run
 
     options = RunOptions(

@@ -15,7 +15,7 @@ from sfms_robot.cli.servo_wiring import Wiring, on_wire
 from sfms_robot.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
-    from sfms_robot.app.servo_wire import Seen, Wire
+    from sfms_robot.app.servo.servo_wire import Seen, Wire
 
 app = typer.Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
 app.command("maps")(servo_maps.maps)
@@ -38,8 +38,8 @@ def scan(
     ids: Annotated[str | None, typer.Option("--ids", help="Ask these one by one, as 1-9,12. Default: all.")] = None,
 ) -> None:
     """Who is there, at which rate."""
-    from sfms_robot.app.servo_tools import parse_ids
-    from sfms_robot.app.servo_tools import scan as look
+    from sfms_robot.app.servo.servo_tools import parse_ids
+    from sfms_robot.app.servo.servo_tools import scan as look
 
     asked = parse_ids(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
@@ -76,7 +76,7 @@ def read(
     registers: Annotated[list[str], typer.Argument(metavar="REGISTER...", help="Names, or 'all'.")],
 ) -> None:
     """Registers by name: raw and in their unit."""
-    from sfms_robot.app.servo_tools import read_registers
+    from sfms_robot.app.servo.servo_tools import read_registers
 
     def look(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
         return [{"id": seen.id, **value.row()} for value in read_registers(wire, seen, registers)]
@@ -94,7 +94,7 @@ def write(
     yes: YesOption = False,
 ) -> None:
     """Write a register and read it back. What lasts (EEPROM) is asked about first, and refused while torque is on."""
-    from sfms_robot.app.servo_tools import write_register
+    from sfms_robot.app.servo.servo_tools import write_register
 
     confirm = _confirm(yes, ids)
 
@@ -117,7 +117,7 @@ def set_id(
     yes: YesOption = False,
 ) -> None:
     """Give a servo another id. Best with that one servo on the wire."""
-    from sfms_robot.app.servo_tools import set_id as change
+    from sfms_robot.app.servo.servo_tools import set_id as change
 
     _each(
         str(old),
@@ -136,7 +136,7 @@ def set_baud(
     yes: YesOption = False,
 ) -> None:
     """Give servos another rate, and check that they answer at it."""
-    from sfms_robot.app.servo_tools import set_baud as change
+    from sfms_robot.app.servo.servo_tools import set_baud as change
 
     confirm = _confirm(yes, ids)
     _each(
@@ -155,7 +155,7 @@ def reboot(
     yes: YesOption = False,
 ) -> None:
     """Start servos over: torque goes off, latched hardware errors go away."""
-    from sfms_robot.app.servo_tools import reboot as restart
+    from sfms_robot.app.servo.servo_tools import reboot as restart
 
     confirm = _confirm(yes, ids)
     _each(
@@ -175,7 +175,7 @@ def factory_reset(
     yes: YesOption = False,
 ) -> None:
     """Put a servo's settings back to what they were when it was new."""
-    from sfms_robot.app.servo_tools import factory_reset as reset
+    from sfms_robot.app.servo.servo_tools import factory_reset as reset
 
     _each(
         str(servo),
@@ -194,8 +194,8 @@ def monitor(
     rate: Annotated[float, typer.Option("--rate", min=0.1, max=50.0, help="Looks per second.")] = 5.0,
 ) -> None:
     """Position, load, voltage, temperature and faults, live. Reads only."""
-    from sfms_robot.app.servo_state import samples as looks
-    from sfms_robot.app.servo_tools import scan as look
+    from sfms_robot.app.servo.servo_state import samples as looks
+    from sfms_robot.app.servo.servo_tools import scan as look
 
     taken: list[list[dict[str, Any]]] = []
     with on.open() as wire:
@@ -219,7 +219,7 @@ def monitor(
 
 
 def _parsed(ids: str) -> list[int]:
-    from sfms_robot.app.servo_tools import parse_ids
+    from sfms_robot.app.servo.servo_tools import parse_ids
 
     return parse_ids(ids)
 

@@ -16,7 +16,7 @@ def maps(
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """The servo models and boards that have a firmware map."""
-    from sfms_robot.app.maps import check_maps, list_maps
+    from sfms_robot.app.servo.maps import check_maps, list_maps
 
     if not check:
         rows = list_maps(files or [])

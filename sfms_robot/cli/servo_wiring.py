@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from sfms_robot.app.servo_wire import Wire
+    from sfms_robot.app.servo.servo_wire import Wire
 
 
 class Family(StrEnum):
@@ -39,7 +39,7 @@ class Wiring:
 
     @contextmanager
     def open(self) -> Iterator[Wire]:
-        from sfms_robot.app.servo_wire import open_wire, real_clock
+        from sfms_robot.app.servo.servo_wire import open_wire, real_clock
 
         with open_wire(self.port, self.family.value, self.baud, self.head, real_clock(), self.model) as wire:
             yield wire

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from sfms_robot.config.base import Model, NonNegative
 from sfms_robot.config.listener import Count, Listener
+
+# Conversational states (3.3), in the order of the model's classes.
+STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
 
 
 def _both(value: Any) -> Any:

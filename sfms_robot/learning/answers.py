@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from sfms_robot.learning.corpus import Corpus, gather
-from sfms_robot.learning.datasets.clips import Dyad
+from sfms_robot.corpora.clips import Dyad
+from sfms_robot.learning.sfms.corpus import Corpus, gather
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.sfms.stream import SfmsListener, passed
 

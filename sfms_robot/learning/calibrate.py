@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
+from sfms_robot.corpora.clips import Dyad
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Floats
 from sfms_robot.learning.answers import Answers, answers, heard_by
-from sfms_robot.learning.corpus import gather
-from sfms_robot.learning.datasets.clips import Dyad
-from sfms_robot.learning.tokens import tokenise
+from sfms_robot.learning.sfms.corpus import gather
+from sfms_robot.learning.sfms.tokens import tokenise
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
-from sfms_robot.metrics import timing
+from sfms_robot.signals import events as timing
 
 LARGEST_STEP = 1.0  # of a bias, per round
 STREAMS = 4  # of every dyad, side by side

@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from sfms_robot.corpora.clips import Dyad
 from sfms_robot.frames import (
     CHANNEL_INDEX,
     FRAME_HZ,
@@ -19,9 +20,8 @@ from sfms_robot.frames import (
     Plan,
     SpeakerFrame,
 )
-from sfms_robot.learning.datasets.clips import Dyad
-from sfms_robot.metrics import timing
 from sfms_robot.ports import Listener
+from sfms_robot.signals import events as timing
 
 ROTATIONS = slice(0, 3)
 

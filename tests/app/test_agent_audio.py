@@ -8,13 +8,13 @@ import soundfile
 import torch
 
 from sfms_robot import config
+from sfms_robot.app.listen.run import RunOptions, run_head
 from sfms_robot.app.replay import read_recording
-from sfms_robot.app.run import RunOptions, run_head
 from sfms_robot.cli.main import main
+from sfms_robot.config.arig import STATES
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.arig.csu import STATES
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.registry import load_listener
 from sfms_robot.sources.recording import open_source

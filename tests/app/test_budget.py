@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.app.budget import wire_budget
+from sfms_robot.app.servo.budget import wire_budget
 from sfms_robot.servo.codecs import dxl2
 
 FACTORY = {"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}

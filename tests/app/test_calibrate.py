@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from sfms_robot.app.calibrate import Outcome, calibrate, calibrate_on
-from sfms_robot.app.heads import emulated
-from sfms_robot.app.unit import identify, unit_head
+from sfms_robot.app.calibrated_head import identify, unit_head
+from sfms_robot.app.head.calibrate import Outcome, calibrate, calibrate_on
+from sfms_robot.app.session import emulated
 from sfms_robot.config import load_head
 from sfms_robot.config.caution import cautious
 from sfms_robot.config.overlay import calibrated, head_hash, load_overlay, overlay_file
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
 
 DAY = date(2026, 5, 17)
 LIMIT = {"speed_deg_s": 90, "acceleration_deg_s2": 900, "jerk_deg_s3": 9000}

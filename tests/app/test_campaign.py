@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.campaign import FAMILIES, SPECS, Judge, Outcome, Rig, head_of, one, run_campaign, table
-from sfms_robot.app.fuzz import BYTES, fuzz_one
-from sfms_robot.app.heads import build_bus, emulated
+from sfms_robot.app.bench.campaign import FAMILIES, SPECS, Judge, Outcome, Rig, head_of, one, run_campaign, table
+from sfms_robot.app.bench.fuzz import BYTES, fuzz_one
+from sfms_robot.app.session import build_bus, emulated
+from sfms_robot.emulator.faults import KINDS
+from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.simulator.faults import KINDS
-from sfms_robot.simulator.launch import launch
 
 SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
 

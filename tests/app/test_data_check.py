@@ -7,10 +7,10 @@ import dataset_writers as write
 import numpy as np
 import pytest
 
-from sfms_robot.app.data_check import check_data
+from sfms_robot.app.train.data_check import check_data
 from sfms_robot.cli.main import main
+from sfms_robot.corpora.formats import open_dataset, with_feature
 from sfms_robot.errors import ConfigError
-from sfms_robot.learning.datasets.formats import open_dataset, with_feature
 from sfms_robot.signals.features import MFCC78
 
 

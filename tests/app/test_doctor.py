@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 import typer
 
-from sfms_robot.app.budget import wire_budget
-from sfms_robot.app.diagnosis import (
+from sfms_robot.app.servo.budget import wire_budget
+from sfms_robot.app.servo.diagnosis import (
     Command,
     Finding,
     Wanted,
@@ -22,16 +22,16 @@ from sfms_robot.app.diagnosis import (
     judge_rate,
     judge_twins,
 )
-from sfms_robot.app.doctor import Line, examine, examine_line
-from sfms_robot.app.servo_tools import parse_ids, reboot, set_baud, write_register
-from sfms_robot.app.servo_wire import FAMILIES, Wire
+from sfms_robot.app.servo.doctor import Line, examine, examine_line
+from sfms_robot.app.servo.servo_tools import parse_ids, reboot, set_baud, write_register
+from sfms_robot.app.servo.servo_wire import FAMILIES, Wire
 from sfms_robot.cli.main import app
 from sfms_robot.config import load_firmware_map, map_files
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.servo.discovery import Holder, SerialDevice
 from sfms_robot.servo.port import SerialPort, VirtualTimePort
-from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
 
 BAUD = 1_000_000
 COMMAND = Command("/dev/ttyUSB0", "dynamixel2")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.app.listen.run import RunOptions, run_head
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 

@@ -5,16 +5,16 @@ import json
 import numpy as np
 import pytest
 
-from sfms_robot.app.babble import Faces, babble
-from sfms_robot.app.faces import named_faces
-from sfms_robot.app.fidelity import of_head
-from sfms_robot.app.fit import fit_head, read_pairs, see_virtual_face, virtual_tracker, with_drives
+from sfms_robot.app.head.babble import Faces, babble
+from sfms_robot.app.head.faces import named_faces
+from sfms_robot.app.head.fidelity import of_head
+from sfms_robot.app.head.fit import fit_head, read_pairs, see_virtual_face, virtual_tracker, with_drives
 from sfms_robot.config import load_head
 from sfms_robot.config.overlay import load_overlay, overlay_file
 from sfms_robot.errors import ConfigError
+from sfms_robot.face.tracker import Skin, skin_motion
 from sfms_robot.frames import SHAPES
 from sfms_robot.retarget.fit import Units, asked, fit, looks_like, rms
-from sfms_robot.simulator.tracker import Skin, skin_motion
 
 
 def recorded_shapes():

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from sfms_robot.app.head_solve import solve_poses
+from sfms_robot.app.head.head_solve import solve_poses
 from sfms_robot.cli.main import main
 from sfms_robot.errors import ConfigError
 

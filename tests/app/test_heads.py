@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.heads import FAMILIES, build_bus, emulated, plugged_in
+from sfms_robot.app.session import FAMILIES, build_bus, emulated, plugged_in
 from sfms_robot.config import Faults, Head, Safety, load_head, parse
+from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.simulator.launch import EmulatedServo, launch
 
 
 def head_of(**more) -> Head:

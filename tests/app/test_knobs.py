@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.bench.lead import Nobody, Waves
-from sfms_robot.app.heads import build_bus, build_motion, emulated
-from sfms_robot.app.knobs import turned
-from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.run import RunOptions, run_head
+from sfms_robot.app.session import build_bus, build_motion, emulated
 from sfms_robot.config import load_head
+from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.simulator.launch import launch
 
 RETARGETER = build_motion(load_head("face28"), 100.0).retargeter
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.pose import EXPRESSIONS, RISE_S, Held, PoseOptions, parse_face, pose_head
+from sfms_robot.app.head.pose import EXPRESSIONS, RISE_S, Held, PoseOptions, parse_face, pose_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import soundfile
 
+from sfms_robot.app.listen.run import RunOptions, run_head
 from sfms_robot.app.replay import read_recording
-from sfms_robot.app.run import RunOptions, run_head
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError, PortError
 

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from sfms_robot.app.servo_state import read_all, watch
-from sfms_robot.app.servo_tools import (
+from sfms_robot.app.servo.servo_state import read_all, watch
+from sfms_robot.app.servo.servo_tools import (
     factory_reset,
     parse_ids,
     parse_value,
@@ -17,13 +17,13 @@ from sfms_robot.app.servo_tools import (
     set_id,
     write_register,
 )
-from sfms_robot.app.servo_wire import Wire, check_device, open_wire
+from sfms_robot.app.servo.servo_wire import Wire, check_device, open_wire
 from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
-from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
 
 THREE = (EmulatedServo(1), EmulatedServo(2, baud=57_600, start_ticks=1500), EmulatedServo(7, start_ticks=2300))
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.simulator.launch import launch
+from sfms_robot.emulator.launch import launch
 
 
 @pytest.fixture

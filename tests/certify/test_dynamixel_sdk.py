@@ -14,7 +14,7 @@ from dynamixel_sdk import (
     Protocol2PacketHandler,
 )
 
-from sfms_robot.simulator.launch import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 
 IDS = (1, 2, 3)
 NO_ERROR = (COMM_SUCCESS, 0)

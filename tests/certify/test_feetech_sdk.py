@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.simulator.launch import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 
 sdk = pytest.importorskip("scservo_sdk")
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from sfms_robot.simulator.launch import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 
 rustypot = pytest.importorskip("rustypot")
 

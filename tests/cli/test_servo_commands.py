@@ -11,7 +11,7 @@ import typer
 
 import sfms_robot
 from sfms_robot.cli.main import app, main
-from sfms_robot.simulator.launch import EmulatedServo, launch
+from sfms_robot.emulator.launch import EmulatedServo, launch
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.app.unit import ready
+from sfms_robot.app.calibrated_head import ready
 from sfms_robot.config import load_head
 from sfms_robot.config.caution import PACE, TRAVEL, cautious
 from sfms_robot.data import data_dir, shipped_names

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from sfms_robot import config
-from sfms_robot.learning.masks import exact_each
-from sfms_robot.learning.scores import imitation, lively, regrets, states
-from sfms_robot.learning.tokenizer import tokenizer_loss
+from sfms_robot.learning.sfms.keyframe_scores import imitation, lively, regrets, states
+from sfms_robot.learning.sfms.masks import exact_each
+from sfms_robot.learning.sfms.tokenizer import tokenizer_loss
 from sfms_robot.listeners.sfms.choice import choose
 from sfms_robot.listeners.sfms.exact import best_frames, completion_errors, mask_cost
 from sfms_robot.listeners.sfms.model import Tokenizer

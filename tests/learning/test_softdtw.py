@@ -4,8 +4,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.learning.losses_dtw import keyframe_dtw, soft_dtw
-from sfms_robot.metrics import dtw
+from sfms_robot.evaluation.metrics import dtw
+from sfms_robot.learning.sfms.losses_dtw import keyframe_dtw, soft_dtw
 
 
 def cost_of(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -8,14 +8,15 @@ import pytest
 import torch
 
 from sfms_robot import config
+from sfms_robot.corpora import clips
+from sfms_robot.corpora.clips import Dyad
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNELS, FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.learning import listener, tokenizer
-from sfms_robot.learning.corpus import Corpus, fit_scales, gather, place_all, windows
-from sfms_robot.learning.datasets import clips
-from sfms_robot.learning.datasets.clips import Dyad
 from sfms_robot.learning.job import Run
 from sfms_robot.learning.rollout import evaluate_rollout
+from sfms_robot.learning.sfms import predictor_training as listener
+from sfms_robot.learning.sfms import tokenizer
+from sfms_robot.learning.sfms.corpus import Corpus, fit_scales, gather, place_all, windows
 from sfms_robot.listeners import checkpoint, sfms
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes

@@ -6,9 +6,9 @@ import numpy as np
 
 from sfms_robot import config
 from sfms_robot.config import parse_training
+from sfms_robot.corpora import clips
+from sfms_robot.corpora import states as labels
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
-from sfms_robot.learning.arig import labels
-from sfms_robot.learning.datasets import clips
 
 HZ = 25
 TINY = {

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.heads import build_motion
+from sfms_robot.app.session import build_motion
 from sfms_robot.config import load_head
+from sfms_robot.corpora.compose.motions import load
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan
-from sfms_robot.learning.datasets.motions import load
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
 

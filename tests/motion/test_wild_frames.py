@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.bench.adversary import wild
-from sfms_robot.app.heads import build_motion
+from sfms_robot.app.session import build_motion
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.runtime.loop import difference

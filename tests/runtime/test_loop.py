@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfms_robot.app.heads import HANGING, build_bus, build_motion, emulated
+from sfms_robot.app.session import HANGING, build_bus, build_motion, emulated
 from sfms_robot.config import load_head
+from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
@@ -16,9 +17,8 @@ from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.servo.dxl2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.port import VirtualTimePort
-from sfms_robot.simulator.launch import Chain, launch
 from sfms_robot.sources.recording import Recording
 
 RATE_HZ = 100.0

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import settings
 
 from sfms_robot.config import Bus, Faults, Safety, load_firmware_map
-from sfms_robot.servo.dxl2_link import Dxl2Link
-from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.port import VirtualTimePort
-from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
 
 settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure
 settings.load_profile("no_stopwatch")

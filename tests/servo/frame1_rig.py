@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sfms_robot.config import Faults, Safety, load_firmware_map
+from sfms_robot.emulator.protocol1 import Frame1Device
+from sfms_robot.emulator.protocol1_servo import Frame1Servo
 from sfms_robot.errors import BusError
-from sfms_robot.servo.dynamixel1 import Dynamixel1Bus
-from sfms_robot.servo.feetech import FeetechBus
+from sfms_robot.servo.chain.dynamixel1_bus import Dynamixel1Bus
+from sfms_robot.servo.chain.feetech_bus import FeetechBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
-from sfms_robot.simulator.frame1 import Frame1Device
-from sfms_robot.simulator.frame1_servo import Frame1Servo
 
 LIMIT_RAD = 1.0
 

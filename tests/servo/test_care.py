@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Faults, LoadRule, Safety, Threshold, load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.servo.policy import BusServo, LoadWatch, Measured, counts, load_rules
-from sfms_robot.simulator.launch import EmulatedServo
 
 RAD_PER_TICK = 2 * np.pi / 4096
 OVERLOAD, VOLTAGE = 1 << 5, 1 << 0

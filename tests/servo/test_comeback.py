@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError
-from sfms_robot.simulator.launch import EmulatedServo
 
 RAD_PER_TICK = 2 * np.pi / 4096
 

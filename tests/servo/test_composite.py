@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import Reading
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
 from sfms_robot.servo.composite import CompositeBus
-from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
 from sfms_robot.servo.port import SerialPort
-from sfms_robot.simulator.launch import EmulatedServo, launch
 
 
 class Monotonic:

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
 from sfms_robot.servo.port import SerialPort
-from sfms_robot.simulator.launch import EmulatedServo, launch
 
 RAD_PER_TICK = 2 * math.pi / 4096
 

@@ -7,7 +7,7 @@ from frame1_rig import rig_of
 from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
 from sfms_robot.errors import BusError, ConfigError, ServoError
 from sfms_robot.ports import Bus
-from sfms_robot.servo.dynamixel1 import Dynamixel1Bus
+from sfms_robot.servo.chain.dynamixel1_bus import Dynamixel1Bus
 from sfms_robot.servo.registers import Table
 
 MODELS = ["ax-12a", "mx-28-1.0", "mx-64-1.0", "sts3215", "scs0009"]

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
-from sfms_robot.servo.codecs import dxl1, feetech, frame1
-from sfms_robot.servo.codecs.frame1 import Frame, encode, salvage
-from sfms_robot.servo.codecs.frame1 import maybe_frame as take
+from sfms_robot.servo.codecs import dxl1, feetech
+from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs.protocol1 import Frame, encode, salvage
+from sfms_robot.servo.codecs.protocol1 import maybe_frame as take
 
 ASSET = Path(__file__).parent.parent / "assets" / "frame1_packets.csv"
 ROWS = list(csv.DictReader(line for line in ASSET.read_text().splitlines() if not line.startswith("#")))

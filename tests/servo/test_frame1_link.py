@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
-from sfms_robot.servo.codecs.frame1 import encode
-from sfms_robot.servo.frame1_link import Frame1Link
-from sfms_robot.servo.link import Answer, Found, RegisterLink
+from sfms_robot.servo.chain.link import Answer, Found, RegisterLink
+from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.codecs.protocol1 import encode
 
 
 def link_of(model, starts, **more):

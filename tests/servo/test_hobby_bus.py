@@ -7,13 +7,13 @@ import pytest
 from device_port import DevicePort, Time
 
 from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.emulator.boards import MaestroBoard, Ssc32Board
 from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.servo.boards.maestro_bus import MaestroBus
+from sfms_robot.servo.boards.ssc32_bus import Ssc32Bus
 from sfms_robot.servo.codecs import maestro, ssc32
-from sfms_robot.servo.maestro import MaestroBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
-from sfms_robot.servo.ssc32 import Ssc32Bus
-from sfms_robot.simulator.boards import MaestroBoard, Ssc32Board
 
 LIMIT_RAD = 0.7
 KINDS = {

@@ -10,7 +10,7 @@ import typer
 import yaml
 from typer.testing import CliRunner
 
-from sfms_robot.app.maps import check_maps, list_maps
+from sfms_robot.app.servo.maps import check_maps, list_maps
 from sfms_robot.cli import servo_maps
 from sfms_robot.config import FirmwareMap, load, load_firmware_map, map_files, parse, variant
 from sfms_robot.errors import ConfigError

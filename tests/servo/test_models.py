@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_telemetry import common
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
-from sfms_robot.servo.telemetry import common
-from sfms_robot.simulator.launch import EmulatedServo, launch
 
 
 class Time:

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 import pytest
 
 from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, PortError
+from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.dxl2_link import Dxl2Link
 from sfms_robot.servo.port import SerialPort, VirtualTimePort, stable_name
-from sfms_robot.simulator.launch import EmulatedServo
 
 
 class Frozen:

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.servo.roster import LONGEST_PAUSE_S, QUIET_POLLS, Roster
+from sfms_robot.servo.chain.roster import LONGEST_PAUSE_S, QUIET_POLLS, Roster
 
 
 def test_servo_where_answers_stop_leaves_the_list_at_once():

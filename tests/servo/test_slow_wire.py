@@ -1,6 +1,6 @@
 from device_port import DevicePort, Time
 
-from sfms_robot.servo.slow_wire import SlowWire
+from sfms_robot.servo.boards.rate_limit import SlowWire
 
 
 class Echo:

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Bus, load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.schedule import Rotation, blocks_per_tick, read_s, write_s
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.codecs.frame1 import encode
-from sfms_robot.servo.dxl2_link import Dxl2Link
-from sfms_robot.servo.dynamixel import BusServo, DynamixelBus
-from sfms_robot.servo.frame1_link import Frame1Link
+from sfms_robot.servo.codecs.protocol1 import encode
 from sfms_robot.servo.port import VirtualTimePort
-from sfms_robot.servo.schedule import Rotation, blocks_per_tick, read_s, write_s
-from sfms_robot.simulator.launch import EmulatedServo
 
 
 class Through:

@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 import pytest
 
-from sfms_robot.servo.codecs import dxl2, frame1
-from sfms_robot.servo.twins import hear_ping
+from sfms_robot.servo.chain.duplicate_ids import hear_ping
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.codecs import protocol1 as frame1
 
 ONE = dxl2.encode_status(3, 0, bytes([0xB0, 0x04, 53]))
 OTHER = dxl2.encode_status(3, 0, bytes([0xA6, 0x04, 52]))

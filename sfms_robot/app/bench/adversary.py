@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfms_robot.app.bench.measure import Row
-from sfms_robot.app.heads import Motion, build_motion
+from sfms_robot.app.session import Motion, build_motion
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan

@@ -22,10 +22,10 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from sfms_robot.app.bench.measure import HEAD, Row, row, times
-from sfms_robot.app.heads import build_bus, emulated
+from sfms_robot.app.session import build_bus, emulated
 from sfms_robot.config import Head, load_head
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.runtime.clock import RealClock, beats
-from sfms_robot.simulator.launch import Chain, EmulatedServo, launch
 
 RATE_HZ: Final = 100.0
 DEADLINE_MS: Final = 8.0
@@ -168,7 +168,7 @@ def _ours(head: Head, device: str) -> Iterator[Host]:
 @contextmanager
 def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
     """The two requests of a tick that `where` stands for, as the bus makes them: goals, and one fast sync read."""
-    from sfms_robot.servo.dxl2_link import Dxl2Link
+    from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
     from sfms_robot.servo.port import SerialPort
 
     config = next(iter(head.buses.values()))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.app.bench.measure import HEAD
-from sfms_robot.app.run import RunOptions, run_head
+from sfms_robot.app.listen.run import RunOptions, run_head
 from sfms_robot.listeners.remote import threads
 from sfms_robot.sources.recording import DEFAULT_SPEAKER
 

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.bench.measure import HEAD, Row, row
-from sfms_robot.app.heads import build_bus, build_motion, emulated
+from sfms_robot.app.session import build_bus, build_motion, emulated
 from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock, Tick
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.simulator.launch import Chain, launch
 
 HORIZON, HOP = 8, 4  # frames of a plan, and between two plans
 LATENCY_S = 0.010  # from the last frame heard to the plan

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sfms_robot.app.replay.recording import RunRecording
-from sfms_robot.simulator.sheet import Instant, render_sheet
+from sfms_robot.face.contact_sheet import Instant, render_sheet
 
 
 def sheet(recording: RunRecording, png: Path | str) -> list[Instant]:

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sfms_robot.corpora import clips
+from sfms_robot.corpora.collection import Dataset, usable
+from sfms_robot.corpora.formats import open_dataset
+from sfms_robot.corpora.states import UNKNOWN
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
-from sfms_robot.learning.arig.labels import UNKNOWN
-from sfms_robot.learning.corpus import in_space, spread_bounds, windows
-from sfms_robot.learning.datasets import clips
-from sfms_robot.learning.datasets.collection import Dataset, usable
-from sfms_robot.learning.datasets.formats import open_dataset
+from sfms_robot.learning.sfms.corpus import in_space, spread_bounds, windows
 from sfms_robot.listeners.arig import sound
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel, Dyad

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.arig.csu import FIRST, STATES
+from sfms_robot.config.arig import STATES
+from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.sound import MEL_WIDTH
 from sfms_robot.signals import mel

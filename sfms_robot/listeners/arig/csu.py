@@ -19,9 +19,9 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
+from sfms_robot.config.arig import STATES
 from sfms_robot.listeners.arig.parts import LayerNorm, Linear, Look, Part
 
-STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
 FIRST: Final = STATES.index("waiting")  # of a stream: nobody has spoken yet
 
 

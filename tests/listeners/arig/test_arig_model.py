@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_arig import arig_model
 
-from sfms_robot.listeners.arig.csu import FIRST, STATES
+from sfms_robot.config.arig import STATES
+from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.ibu import LongRange
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.parts import windows

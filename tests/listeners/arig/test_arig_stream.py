@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
 
 from sfms_robot import config
+from sfms_robot.config.arig import STATES
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
-from sfms_robot.listeners.arig.csu import STATES
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import ArigListener

@@ -5,7 +5,7 @@ from families import FAMILIES
 from hypothesis import settings
 from rig import emulated, real
 
-from sfms_robot.simulator.launch import launch
+from sfms_robot.emulator.launch import launch
 
 settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure
 settings.load_profile("no_stopwatch")

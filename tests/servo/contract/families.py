@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.ports import Bus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
-from sfms_robot.simulator.launch import EmulatedServo
 
 LIMIT_RAD = 0.7
 STARTS_RAD = (-0.2, 0.0, 0.4, 0.1)

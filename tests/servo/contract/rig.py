@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from families import FAMILIES, Family
 
+from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
-from sfms_robot.simulator.launch import Chain, launch
 
 TICK_S = 0.02
 EASE_RAD_S = 0.5  # as slowly as a limiter begins: a joint that rejoins takes goals only where it stands

@@ -1,0 +1,280 @@
+"""`head calibrate`: joint by joint, where its ends and its rest are and which way it turns.
+
+    who answers -> torque off, moved by hand, or moved by keys -> ends, rest, direction -> a slow check -> saved
+
+All it needs of a terminal is a line out and a line in, so it works over any connection. Every joint is saved when it
+is done: who stops in the middle goes on there the next time. Only the overlay of this build is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Any, Final, Literal, Protocol
+
+from sfms_robot.app.calibrated_head import identify
+from sfms_robot.app.head.joint_probe import Probe, jumps, probe
+from sfms_robot.app.session import SIM, build_motion, devices, emulated
+from sfms_robot.config import Head, Joint, load_head
+from sfms_robot.config.overlay import (
+    CalibrateLayer,
+    Identity,
+    Layered,
+    Measured,
+    Overlay,
+    head_hash,
+    layered,
+    load_overlay,
+    overlay_file,
+    save_overlay,
+)
+from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.ports import Clock
+from sfms_robot.runtime.clock import RealClock
+
+LEAST_TRAVEL_DEG: Final = 2.0
+ARRIVED_DEG: Final = 3.0  # a held servo sags a little
+STEPS_DEG: Final[Mapping[str, float]] = {"+": 1.0, "-": -1.0, "++": 5.0, "--": -5.0}
+Point = Literal["min", "max", "rest"]
+TITLES: Final[Mapping[Point, str]] = {"min": "LOWER end", "max": "UPPER end", "rest": "REST"}
+
+
+class Talk(Protocol):
+    """Somebody who reads and answers lines. `ask` raises EOFError or KeyboardInterrupt when they have gone."""
+
+    def say(self, text: str) -> None: ...
+
+    def ask(self, prompt: str) -> str: ...
+
+
+class Stopped(Exception):  # noqa: N818  (nothing is wrong)
+    """Whoever calibrates wants to stop here."""
+
+
+class Skipped(Exception):  # noqa: N818
+    """Not this joint."""
+
+
+class Again(Exception):  # noqa: N818
+    """This joint once more; the text says why."""
+
+
+@dataclass
+class Outcome:
+    """What came of it: joints measured now and before, joints left out with the reason, and what the check found."""
+
+    head: str
+    file: Path
+    exit: Literal["done", "interrupted"] = "done"
+    measured: list[str] = field(default_factory=list)
+    before: list[str] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"version": 1, **vars(self), "file": str(self.file)}
+
+
+def calibrate(name: str, port: str, talk: Talk, joints: Sequence[str] = (), again: bool = False) -> Outcome:
+    """Lead through the joints of a head on `port`, or those named.
+
+    Emulated servos (`sim`) are for practice: what is measured there is kept apart and never used. `again`: also joints
+    that are measured already. Raises RobotError.
+    """
+    head = load_head(name)
+    with ExitStack() as stack:
+        where: dict[str, Chain | str] = {}
+        if port == SIM:
+            where |= {bus: stack.enter_context(launch(servos)) for bus, servos in emulated(head).items()}
+        else:
+            where |= devices(head, port)
+        file = overlay_file(head.name, practice=port == SIM)
+        return calibrate_on(name, where, RealClock(), talk, file, date.today(), joints, again)
+
+
+def calibrate_on(
+    name: str,
+    where: Mapping[str, Chain | str],
+    clock: Clock,
+    talk: Talk,
+    file: Path,
+    today: date,
+    joints: Sequence[str] = (),
+    again: bool = False,
+) -> Outcome:
+    """As `calibrate`, on buses that are there, into `file`."""
+    head, sha256 = load_head(name), head_hash(name)
+    for joint in joints:
+        if joint not in head.joints:
+            raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", head.joints)
+    wanted = list(joints or head.joints)
+    outcome = Outcome(head.name, file)
+    overlay = load_overlay(head, file)
+    servos = identify(head, wanted, where, clock)
+    try:
+        overlay = _of_this_file(overlay, sha256, talk)
+        holds = layered(head, overlay, sha256, servos).calibrated
+        outcome.before = [joint for joint in wanted if joint in holds and not again]
+        todo = [joint for joint in wanted if joint not in outcome.before]
+        talk.say(f"{head.name}: {len(outcome.before)} joints are measured, {len(todo)} to go; saved to {file}")
+        talk.say("Enter takes what stands first; q stops at any question, and the next time goes on from there.")
+        for number, joint in enumerate(todo, 1):
+            talk.say(f"\n[{number}/{len(todo)}] {_described(joint, head.joints[joint])}")
+            found = _one(head, joint, servos[joint], where, clock, talk, today, outcome)
+            if found is not None:
+                overlay = _with(overlay, sha256, joint, found)
+                save_overlay(overlay, file)
+                outcome.measured.append(joint)
+                talk.say("  saved")
+    except (Stopped, KeyboardInterrupt):
+        outcome.exit = "interrupted"
+    _check(head, sha256, servos, outcome)
+    return outcome
+
+
+def _one(
+    head: Head,
+    joint: str,
+    identity: Identity | None,
+    where: Mapping[str, Chain | str],
+    clock: Clock,
+    talk: Talk,
+    today: date,
+    outcome: Outcome,
+) -> Measured | None:
+    """Measure one joint until it is right; None when it is left out."""
+    config = head.joints[joint]
+    try:
+        if identity is None:
+            raise BusError(f"no answer from id {config.id} on bus {config.bus!r}")
+        by_hand = _ask_how(talk, jumps(head, joint))
+        with probe(head, joint, where[config.bus], clock) as at:
+            while True:
+                try:
+                    return _measure(config, identity, at, by_hand, talk, today)
+                except Again as reason:
+                    talk.say(f"  {reason}; once more")
+    except (Skipped, BusError) as reason:
+        outcome.skipped[joint] = str(reason)
+        talk.say(f"  left out: {reason}")
+        return None
+
+
+def _ask_how(talk: Talk, blind: bool) -> bool:
+    """True: by hand."""
+    if blind:
+        _ask(talk, "  It reports no position and JUMPS when it comes on: keep clear. Enter: by keys, s: skip > ")
+        return False
+    return _ask(talk, "  Enter: by hand, torque off; k: by keys; s: skip > ") != "k"
+
+
+def _measure(joint: Joint, identity: Identity, at: Probe, by_hand: bool, talk: Talk, today: date) -> Measured:
+    ticks = {point: _point(joint, point, at, by_hand, talk) for point in _points(joint)}
+    low, high = ticks["min"], ticks["max"]
+    travel_deg = abs(high - low) / at.ticks_per_deg
+    if travel_deg < LEAST_TRAVEL_DEG:
+        raise Again(f"its ends are only {travel_deg:.1f} deg apart")
+    rest = ticks.get("rest", low if joint.rest_deg == joint.min_deg else high)
+    if not min(low, high) <= rest <= max(low, high):
+        raise Again(f"its rest, {rest} ticks, is not between its ends, {low} and {high}")
+    sign: Literal[1, -1] = 1 if high > low else -1
+    talk.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {joint.max_deg - joint.min_deg:.1f})")
+    if sign != joint.sign:
+        turns = "fall" if sign < 0 else "rise"
+        question = f"  Ticks {turns} towards the upper end, other than its file says. Is that so? Enter: yes, n: no > "
+        if _ask(talk, question) == "n":
+            raise Again("its ends were mixed up")
+    _look(low, high, rest, at, talk)
+    found = {"date": today, "min_ticks": low, "center_ticks": rest, "max_ticks": high, "sign": sign}
+    return Measured(**identity.model_dump(), **found)
+
+
+def _points(joint: Joint) -> tuple[Point, ...]:
+    """A joint that rests at an end has no rest of its own to show."""
+    return ("min", "max") if joint.rest_deg in (joint.min_deg, joint.max_deg) else ("min", "max", "rest")
+
+
+def _point(joint: Joint, point: Point, at: Probe, by_hand: bool, talk: Talk) -> int:
+    where = f"  {TITLES[point]} ({getattr(joint, f'{point}_deg'):g} deg in its file)"
+    if by_hand:
+        at.limp()
+        _ask(talk, f"{where}: move it there by hand, not into its stop. Enter records > ")
+        return at.ticks()
+    while True:
+        key = _ask(talk, f"{where}, now at {at.ticks()} ticks: + - (1 deg) ++ -- (5 deg) or degrees; Enter records > ")
+        if not key:
+            return at.ticks()
+        try:
+            at.by(STEPS_DEG[key] if key in STEPS_DEG else float(key))
+        except (ValueError, OverflowError):
+            talk.say(f"  {key!r} is not a step (+, -, ++, --, a number of degrees, Enter)")
+
+
+def _look(low: int, high: int, rest: int, at: Probe, talk: Talk) -> None:
+    """Go to the ends and to rest slowly, and ask whether that was right."""
+    if _ask(talk, "  Enter: check it, slowly to both ends and to rest; n: without a check > ") == "n":
+        return
+    for ticks in (low, high, rest):
+        at.go(ticks)
+        off_deg = abs(at.ticks() - ticks) / at.ticks_per_deg
+        if off_deg > ARRIVED_DEG:
+            talk.say(
+                f"  at {at.ticks()} ticks in place of {ticks}: it is {off_deg:.1f} deg off, is something in its way?"
+            )
+    if _ask(talk, "  Was that right? Enter: yes, n: measure again > ") == "n":
+        raise Again("it was not right")
+
+
+def _ask(talk: Talk, prompt: str) -> str:
+    try:
+        answer = talk.ask(prompt).strip().lower()
+    except (EOFError, KeyboardInterrupt):
+        raise Stopped from None
+    if answer == "q":
+        raise Stopped
+    if answer == "s":
+        raise Skipped("skipped")
+    return answer
+
+
+def _described(name: str, joint: Joint) -> str:
+    note = f" ({joint.note})" if joint.note else ""
+    return f"{name}{note}: {joint.model} id {joint.id} on bus {joint.bus}"
+
+
+def _of_this_file(overlay: Overlay, sha256: str, talk: Talk) -> Overlay:
+    """Measurements of an older head file are kept only if somebody says so."""
+    old = overlay.calibrate
+    if old is None or old.head_sha256 == sha256 or not old.joints:
+        return overlay
+    try:
+        kept = (
+            _ask(talk, "The head's file has changed since. Enter: measure again; k: keep what was measured > ") == "k"
+        )
+    except Skipped:
+        kept = False
+    joints = old.joints if kept else {}
+    return overlay.model_copy(update={"calibrate": CalibrateLayer(head_sha256=sha256, joints=joints)})
+
+
+def _with(overlay: Overlay, sha256: str, joint: str, found: Measured) -> Overlay:
+    joints = overlay.calibrate.joints if overlay.calibrate is not None else {}
+    layer = CalibrateLayer(head_sha256=sha256, joints={**joints, joint: found})
+    return overlay.model_copy(update={"calibrate": layer})
+
+
+def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: Outcome) -> None:
+    """Read back what was written, lay it over the head, and build the head's motion from it."""
+    try:
+        layers: Layered = layered(head, load_overlay(head, outcome.file), sha256, servos)
+        build_motion(layers.head, max(bus.rate_hz for bus in head.buses.values()))
+    except ConfigError as error:
+        outcome.problems.append(str(error))
+        return
+    outcome.problems += [f"{joint}: {problem}" for joint, problem in layers.refused.items()]
+    outcome.missing = [joint for joint in head.joints if joint not in layers.calibrated]

@@ -1,0 +1,130 @@
+"""One joint on its own, in servo ticks: where it stands, limp, and by keys. What a calibration does to a servo.
+
+The joint's bus is opened with this joint alone and with the whole travel of its servo as its range, for what its
+range is has yet to be found. It moves only while somebody asks it to, at a slow and steady pace.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.app.session import BOARDS, build_bus
+from sfms_robot.config import Head, Joint, load_firmware_map
+from sfms_robot.emulator.launch import Chain
+from sfms_robot.errors import ServoError
+from sfms_robot.ports import Bus, Clock
+
+PACE_DEG_S: Final = 20.0
+_PERIOD_S: Final = 0.01
+_TRIES: Final = 20
+_PULSE_US: Final = (500.0, 2500.0)  # what a hobby servo may be sent, whatever its board can make
+
+
+class Probe:
+    """A joint whose bus is open.
+
+    Attributes:
+        tells: whether its servo says where it stands.
+        lowest, highest: ticks it may be sent to.
+    """
+
+    def __init__(self, name: str, joint: Joint, bus: Bus, clock: Clock) -> None:
+        self.name = name
+        self.tells = "position" in bus.capabilities[name]
+        self.lowest, self.highest = _travel_ticks(joint)
+        self._joint, self._bus, self._clock = joint, bus, clock
+        self._per_rad: float = math.degrees(1.0) * _ticks_per_deg(joint)
+        self._goal_rad: float | None = None  # with torque, where it is held
+
+    @property
+    def ticks_per_deg(self) -> float:
+        """Of the joint, without direction."""
+        return abs(self._per_rad) / math.degrees(1.0)
+
+    def ticks(self) -> int:
+        """Where it stands; for a servo that does not tell, where it was sent. Raises ServoError."""
+        if not self.tells:
+            return self._ticks(self._goal_rad if self._goal_rad is not None else self._joint.rest_rad)
+        for _ in range(_TRIES):
+            reading = self._bus.poll(self._clock.now_s())[self.name]
+            if reading.position_rad is not None and reading.age_s < 2 * _PERIOD_S:
+                return self._ticks(reading.position_rad)
+            self._clock.wait_until(self._clock.now_s() + _PERIOD_S)
+        raise ServoError(f"{self.name} (id {self._joint.id}) does not say where it stands")
+
+    def limp(self) -> None:
+        """Torque off, for a hand to move it."""
+        self._bus.stop("release")
+        self._goal_rad = None
+
+    def go(self, ticks: int) -> int:
+        """Slowly to `ticks`, torque on from where it stands; held there. Returns the ticks it was sent to."""
+        if self._goal_rad is None:
+            self._goal_rad = float(self._bus.enable([self.name])[0])
+        start_rad, to_rad = self._goal_rad, self._angle(min(max(ticks, self.lowest), self.highest))
+        steps = max(1, math.ceil(math.degrees(abs(to_rad - start_rad)) / (PACE_DEG_S * _PERIOD_S)))
+        began_s = self._clock.now_s()
+        for k in range(1, steps + 1):
+            self._goal_rad = start_rad + (to_rad - start_rad) * k / steps
+            self._bus.write(np.array([self._goal_rad]), self._clock.now_s())
+            self._bus.poll(self._clock.now_s())
+            self._clock.wait_until(began_s + k * _PERIOD_S)
+        return self._ticks(to_rad)
+
+    def by(self, step_deg: float) -> int:
+        """As `go`, from where it is held, so that one that sags under its load still moves. Raises ValueError."""
+        here = self.ticks() if self._goal_rad is None else self._ticks(self._goal_rad)
+        return self.go(here + round(step_deg * self.ticks_per_deg))
+
+    def _ticks(self, angle_rad: float) -> int:
+        return round(self._joint.zero_ticks + self._per_rad * angle_rad)
+
+    def _angle(self, ticks: int) -> float:
+        return (ticks - self._joint.zero_ticks) / self._per_rad
+
+
+@contextmanager
+def probe(head: Head, name: str, where: Chain | str, clock: Clock) -> Iterator[Probe]:
+    """The joint's bus, open; limp again at the end. Raises RobotError for a servo that is not what the head says."""
+    joint = head.joints[name]
+    if joint.safety is not None or head.safety.stop != "release":
+        joint = joint.model_copy(update={"safety": head.safety_of(name).model_copy(update={"stop": "release"})})
+    joint = joint.model_copy(update=_whole_travel(joint))
+    # A person thinks longer than a watchdog waits.
+    config = head.buses[joint.bus].model_copy(update={"watchdog_ms": 0})
+    alone = head.model_copy(update={"joints": {name: joint}, "buses": {joint.bus: config}})
+    bus = build_bus(alone, {joint.bus: where}, clock, confirmed=True)
+    try:
+        bus.connect()
+        yield Probe(name, joint, bus, clock)
+    finally:
+        bus.stop("release")
+        bus.close()
+
+
+def jumps(head: Head, name: str) -> bool:
+    """Whether the servo comes on with a jump: one that does not tell where it stands."""
+    return head.buses[head.joints[name].bus].family in BOARDS
+
+
+def _ticks_per_deg(joint: Joint) -> float:
+    return joint.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
+
+
+def _travel_ticks(joint: Joint) -> tuple[int, int]:
+    """First and last tick that the servo, or a common one on a board, may be sent to."""
+    firmware = load_firmware_map(joint.model)
+    if firmware.pulse_us is not None and firmware.tick_us is not None:
+        shortest, longest = max(firmware.pulse_us.min, _PULSE_US[0]), min(firmware.pulse_us.max, _PULSE_US[1])
+        return math.ceil(shortest / firmware.tick_us), math.floor(longest / firmware.tick_us)
+    return 0, int(firmware.ticks_per_revolution) - 1
+
+
+def _whole_travel(joint: Joint) -> dict[str, float]:
+    ends = sorted((ticks - joint.zero_ticks) / _ticks_per_deg(joint) for ticks in _travel_ticks(joint))
+    return {"min_deg": min(ends[0], joint.rest_deg), "max_deg": max(ends[1], joint.rest_deg)}

@@ -1,0 +1,316 @@
+"""`sfms-robot doctor`: look at a port, its adapter and every servo on it, and say what to do. Reads only.
+
+Without a head it tells who is there, at every rate. With a head it also tells who is missing, at another rate, of
+another model or not in the file, and whether the bus reaches the head's rate.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, cast
+
+from sfms_robot.app.servo.budget import BOARDS, Budget, board_budget, wire_budget
+from sfms_robot.app.servo.diagnosis import (
+    Command,
+    Finding,
+    Wanted,
+    grouped,
+    judge_adapter,
+    judge_board,
+    judge_opening,
+    judge_port,
+    judge_presence,
+    judge_rate,
+    judge_servo,
+    judge_twins,
+    summary,
+)
+from sfms_robot.app.servo.servo_state import State, read_all
+from sfms_robot.app.servo.servo_tools import Progress, scan, twins
+from sfms_robot.app.servo.servo_wire import FAMILIES, SIM, Seen, Wire, only_port, table_of
+from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.emulator.launch import launch
+from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
+from sfms_robot.ports import Clock
+from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
+from sfms_robot.servo.port import Port, SerialPort
+from sfms_robot.servo.registers import Table
+
+FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
+DEFAULT_RATE_HZ: Final = 100.0
+_USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
+_READ: Final = ("present_position", "present_speed", "present_load", "present_current")
+_TOOL_FAMILY: Final = {"dynamixel": "dynamixel2"}  # the others are called the same in a head's file
+
+OpenPort = Callable[[str, int], Port]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One port to look at, and what is expected on it."""
+
+    bus: str | None
+    device: str
+    shown: str
+    family: str
+    baud: int | None
+    rate_hz: float
+    wanted: dict[int, Wanted]
+
+
+def examine(
+    port: str | None, head: str | None, family: str, baud: int | None, clock: Clock, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Every bus of a head, or one port; the report, whose `exit_code` is that of the command.
+
+    Raises ConfigError for a head, a family or a port description that cannot be used.
+    """
+    if family not in FAMILIES:
+        raise ConfigError.at("doctor", "family", family, "is unknown", FAMILIES)
+    with ExitStack() as stack:
+        lines = list(_lines(port, head, family, baud, stack))
+        buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress) for line in lines]
+    return {
+        "version": 1,
+        "head": head,
+        "port": port or lines[0].device,
+        "buses": buses,
+        "findings": sum((each["findings"] for each in buses), []),
+        "exit_code": next(
+            (code for code in (PORT_FAILED, BUS_FAILED) if code in {b["exit_code"] for b in buses}), FINE
+        ),
+    }
+
+
+def examine_line(line: Line, clock: Clock, open_port: OpenPort, progress: Progress | None = None) -> dict[str, Any]:
+    """One port: report with `adapter`, `servos`, `budget`, `findings`, `exit_code`."""
+    path = line.device
+    problem = None if "://" in path else access_problem(path)
+    report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
+    findings = list(judge_port(path, problem, group_of(path), list_ports()))
+    if problem is None:
+        held_by = [] if _is_terminal(path) else holders(path)
+        try:
+            port = open_port(path, _first_baud(line))
+        except PortError as error:
+            findings += judge_opening(path, str(error), held_by)
+        else:
+            try:
+                adapter = describe(path)  # after opening, which may have set the latency
+                findings += judge_adapter(adapter, held_by)
+                if line.family in BOARDS:
+                    found, facts = _look_at_board(line)
+                else:
+                    found, facts = _look(line, port, clock, adapter, progress)
+            except BusError as error:
+                findings.append(Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable"))
+                return _finished({**report, "adapter": asdict(adapter), "servos": [], "budget": None}, findings)
+            finally:
+                port.close()
+            return _finished({**report, "adapter": asdict(adapter), **facts}, [*findings, *found])
+    return _finished({**report, "adapter": None, "servos": [], "budget": None}, findings, PORT_FAILED)
+
+
+def _is_terminal(path: str) -> bool:
+    """A pseudo terminal, behind which an emulator sits: it has the port open too, and no adapter."""
+    return os.path.realpath(path).startswith("/dev/pts/")
+
+
+def _lines(port: str | None, head: str | None, family: str, baud: int | None, stack: ExitStack) -> Iterator[Line]:
+    if head is None:
+        if port == SIM:
+            head = "face28"
+        else:
+            device = port or only_port()
+            yield Line(None, device, device, family, baud, DEFAULT_RATE_HZ, {})
+            return
+    from sfms_robot.app.session import devices, plugged_in  # slow to load, and only a head needs it
+
+    described = load_head(head)
+    if port == SIM:
+        where = {
+            name: stack.enter_context(launch(servos)).device for name, servos in plugged_in(head, described).items()
+        }
+    else:
+        where = devices(described, port or only_port())
+    for name, device in where.items():
+        bus = described.buses[name]
+        speaks = _TOOL_FAMILY.get(bus.family, bus.family)
+        shown = SIM if port == SIM else device
+        yield Line(name, device, shown, speaks, bus.baud, bus.rate_hz, _wanted(described, name))
+
+
+def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
+    masked = frozenset(head.faults.mask)
+    thresholds = {name: (each.min, each.max) for name, each in head.faults.thresholds.items()}
+    joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
+    return {
+        joint.id: Wanted(name, joint.model, load_firmware_map(joint.model).model_number, masked, thresholds)
+        for name, joint in joints.items()
+    }
+
+
+def _look(
+    line: Line, port: Port, clock: Clock, adapter: SerialDevice, progress: Progress | None
+) -> tuple[list[Finding], dict[str, Any]]:
+    """Everything that needs the open port."""
+    command = Command(line.shown, line.family)
+    wire = Wire(port, line.family, clock, _first_baud(line))
+    here, elsewhere = (
+        {servo: _as_wanted(seen, line) for servo, seen in found.items()} for found in _who(wire, line, progress)
+    )
+    baud = line.baud or next(iter(seen.baud for seen in here.values()), wire.baud)
+    findings = list(judge_presence(line.wanted, here, elsewhere, baud, command))
+    states: list[State] = []
+    double: list[int] = []
+    for done, seen in enumerate([*here.values(), *elsewhere.values()]):
+        if progress:
+            progress(done, len(here) + len(elsewhere), f"id {seen.id}")
+        wire.at(seen.baud)
+        double += [seen.id] if twins(wire, seen.id) else []
+        try:
+            states.append(read_all(wire, seen))
+        except ServoError as error:
+            findings.append(Finding("error", f"id {seen.id}", str(error), _speak_again(seen, command), seen.id))
+    findings += judge_twins(double)
+    for state in states:
+        findings += judge_servo(state, line.wanted.get(state.seen.id), command)
+    members = [state for state in states if state.seen.id in here and state.seen.table is not None]
+    wire.at(baud)
+    fast = _fast_read_works(wire, members)
+    budget = _budget(line, baud, members, adapter)
+    if budget is not None:
+        findings += judge_rate(budget, line.rate_hz, fast, command)
+    facts = {
+        "baud": baud,
+        "rate_hz": line.rate_hz,
+        "servos": [_servo_row(state, line) for state in states],
+        "fast_sync_read": fast,
+        "budget": budget and budget.plain_data(),
+    }
+    return findings, facts
+
+
+def _look_at_board(line: Line) -> tuple[list[Finding], dict[str, Any]]:
+    """What can be said of a board of hobby servos, whose port could be opened."""
+    budget = board_budget(line.family, max(1, len(line.wanted)), _first_baud(line))
+    command = Command(line.shown, line.family)
+    findings = [*judge_board(line.family, len(line.wanted)), *judge_rate(budget, line.rate_hz, None, command)]
+    facts = {"baud": budget.baud, "rate_hz": line.rate_hz, "servos": [], "fast_sync_read": None}
+    return findings, {**facts, "budget": budget.plain_data()}
+
+
+def _first_baud(line: Line) -> int:
+    return line.baud or FAMILIES[line.family].bauds[0]
+
+
+def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, Seen], dict[int, Seen]]:
+    """(at the line's rate, at others), by id. With a head, other rates are looked at only for ids that are missing."""
+    if line.baud is None and not line.wanted:
+        found = scan(wire, None, progress)
+        usual = max({each.baud for each in found}, key=lambda b: sum(s.baud == b for s in found), default=0)
+        return {s.id: s for s in found if s.baud == usual}, {s.id: s for s in found if s.baud != usual}
+    wanted = list(line.wanted)
+    here = _at_this_rate(wire, wanted)
+    elsewhere: dict[int, Seen] = {}
+    for step, _ in enumerate(wire.reachable()):
+        missing = [servo for servo in wanted if servo not in here and servo not in elsewhere]
+        if not missing:
+            break
+        if step == 0:
+            continue
+        if progress:
+            progress(step, len(wire.bauds), f"{len(missing)} missing, {wire.baud} baud")
+        elsewhere |= {i: seen for i, seen in _at_this_rate(wire, missing).items() if i not in here}
+    return here, elsewhere
+
+
+def _as_wanted(seen: Seen, line: Line) -> Seen:
+    """The head knows better than the number which map holds: some models have none of their own, or share one."""
+    want = line.wanted.get(seen.id)
+    if want is None or want.model_number not in (None, seen.model_number):
+        return seen
+    if want.model_number is None:
+        return replace(seen, table=Table.of(load_firmware_map(want.model)))
+    return replace(seen, table=table_of(line.family, seen.model_number, seen.firmware, want.model))
+
+
+def _at_this_rate(wire: Wire, ids: Sequence[int]) -> dict[int, Seen]:
+    """Who answers: to a question to everybody where there is one, and those of `ids` that are asked once more."""
+    found: dict[int, Seen] = {}
+    if wire.kind.broadcast:
+        found = {servo: wire.seen(servo, each) for servo, each in sorted(wire.link.broadcast_ping().items())}
+    if found or not wire.kind.broadcast:
+        for servo in ids:
+            if servo not in found and (seen := wire.ping(servo)) is not None:
+                found[servo] = seen
+    return found
+
+
+def _speak_again(seen: Seen, command: Command) -> str:
+    level = seen.table.role("status_level") if seen.table else None
+    return command.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
+
+
+def _fast_read_works(wire: Wire, members: Sequence[State]) -> bool | None:
+    """Tried on the servos themselves, which know better than a table of firmware numbers."""
+    if wire.family != "dynamixel2" or not members:
+        return None
+    field = _table(members[0]).role("present_position")
+    alike = [state.seen.id for state in members if field is not None and _table(state).role(field.name) == field]
+    if field is None:
+        return None
+    link = cast(Dxl2Link, wire.link)
+    return any(set(link.fast_sync_read(field.address, field.size, alike)) == set(alike) for _ in range(2))
+
+
+def _budget(line: Line, baud: int, members: Sequence[State], adapter: SerialDevice) -> Budget | None:
+    if not members:
+        return None
+    table = _table(members[0])
+    fields = [field for role in _READ if (field := table.role(role)) is not None]
+    goal = table.role("goal_position")
+    latency_ms = 0.0 if _is_terminal(line.device) else _USB_MS if adapter.latency_ms is None else adapter.latency_ms
+    start = min(field.address for field in fields)
+    return wire_budget(
+        line.family,
+        max(len(line.wanted), len(members)),
+        baud,
+        max(state.in_unit("return_delay") or 0.0 for state in members),
+        latency_ms,
+        read_bytes=max(field.address + field.size for field in fields) - start,
+        write_bytes=goal.size if goal else 2,
+        together=table.byte_order == "little",
+    )
+
+
+def _servo_row(state: State, line: Line) -> dict[str, Any]:
+    want = line.wanted.get(state.seen.id)
+    return {
+        **state.seen.row(),
+        "joint": want.joint if want else None,
+        "voltage_V": _tenth(state.in_unit("voltage")),
+        "temperature_degC": _tenth(state.in_unit("temperature")),
+        "return_delay_us": _tenth(state.in_unit("return_delay")),
+        "torque": None if (torque := state.value("torque_enable")) is None else bool(torque),
+        "faults": state.faults(),
+    }
+
+
+def _finished(report: dict[str, Any], findings: Sequence[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
+    together = grouped(findings)
+    counts = summary(together)
+    found = [each.plain() for each in together]
+    return {**report, "findings": found, "counts": counts, "exit_code": failed if counts["error"] else FINE}
+
+
+def _table(state: State) -> Table:
+    return state.seen.registers()
+
+
+def _tenth(value: float | None) -> float | None:
+    return None if value is None else round(value, 1)

@@ -1,0 +1,179 @@
+"""The AMI meeting annotations, seen from each listener: when he nods, looks, laughs, speaks, and when others speak.
+
+Reads the tables head_gestures, gaze_focus, words, dialogue_acts and participants (CSV, gzipped or not) of one folder.
+Times are seconds of the meeting; an interval table is (K, 2) start, end, sorted by start.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.corpora.compose.motions import table
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import Doubles
+
+GAP_S: Final = 0.2  # shorter silences are part of a phrase
+_COLUMNS: Final = {
+    "participants": ("meeting", "agent", "participant", "head_annotated_until_s", "has_gaze_focus"),
+    "head_gestures": ("meeting", "agent", "start_s", "end_s", "type", "form"),
+    "gaze_focus": ("meeting", "agent", "start_s", "end_s", "type", "target"),
+    "words": ("meeting", "agent", "start_s", "end_s", "kind", "text"),
+    "dialogue_acts": ("meeting", "agent", "start_s", "end_s", "type"),
+}
+_Rows = dict[str, list[str]]
+_Spans = dict[tuple[str, str], list[tuple[float, float, str]]]
+
+
+@dataclass(frozen=True)
+class Person:
+    """One participant of one meeting, as a listener to everybody else in it.
+
+    Attributes:
+        meeting, agent, participant: who; `agent` is the letter used as a gaze target.
+        until_s: his head was annotated from 0 to here.
+        nods, shakes, tilts: head gestures (concord signal; discord or negative; other communicative).
+        unseen: his head was off camera.
+        gaze: (start, end, target): an agent's letter, a place, or "" (unspecified); None where nobody annotated it.
+        laughs, talk, backchannels: his own voice.
+        others: phrases of all the others together, joined across gaps under 0.2 s.
+        floor: (start, end, agent) phrases of each of the others.
+        others_laughs: laughs of the others.
+        asked: ends of the others' acts that ask for something.
+        others_backchannels: of the others.
+    """
+
+    meeting: str
+    agent: str
+    participant: str
+    until_s: float
+    nods: Doubles
+    shakes: Doubles
+    tilts: Doubles
+    unseen: Doubles
+    gaze: tuple[tuple[float, float, str], ...] | None
+    laughs: Doubles
+    talk: Doubles
+    backchannels: Doubles
+    others: Doubles
+    floor: tuple[tuple[float, float, str], ...]
+    others_laughs: Doubles
+    asked: Doubles
+    others_backchannels: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+def read_people(folder: Path) -> list[Person]:
+    """Everybody whose head was annotated. Raises ConfigError naming the table, and the column that is missing."""
+    gestures, gaze = _spans(folder, "head_gestures", "type", "form"), _spans(folder, "gaze_focus", "target")
+    words, acts = _spans(folder, "words", "kind", "text"), _spans(folder, "dialogue_acts", "type")
+    listed = _table(folder, "participants")
+    agents = defaultdict(list)
+    for meeting, agent in zip(listed["meeting"], listed["agent"], strict=True):
+        agents[meeting].append(agent)
+    people = []
+    for row in zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True):
+        meeting, agent, participant, until, has_gaze = row
+        if float(until or 0) < 60:
+            continue
+        key, others = (meeting, agent), [(meeting, other) for other in agents[meeting] if other != agent]
+        people.append(
+            Person(
+                meeting,
+                agent,
+                participant,
+                float(until),
+                nods=_pick(gestures[key], ("concord_signal nod",)),
+                shakes=_pick(gestures[key], ("discord_signal shake", "negative_signal shake")),
+                tilts=_pick(gestures[key], ("other_comm_head ",)),
+                unseen=_pick(gestures[key], ("off_camera ",)),
+                gaze=tuple(gaze[key]) if has_gaze == "1" and gaze[key] else None,
+                laughs=_pick(words[key], ("vocalsound laugh",)),
+                talk=phrases(_spoken(words[key])),
+                backchannels=_pick(acts[key], ("bck",)),
+                others=phrases(span for other in others for span in _spoken(words[other])),
+                floor=tuple(
+                    sorted(
+                        (float(start), float(end), other[1])
+                        for other in others
+                        for start, end in phrases(_spoken(words[other]))
+                    )
+                ),
+                others_laughs=phrases((a, b) for o in others for a, b, what in words[o] if what == "vocalsound laugh"),
+                asked=np.sort([b for o in others for _, b, what in acts[o] if what.startswith("el.")]),
+                others_backchannels=phrases((a, b) for o in others for a, b, what in acts[o] if what == "bck"),
+            )
+        )
+    if not people:
+        raise ConfigError(f"{folder}: participants: nobody has head annotations of a minute or more")
+    return people
+
+
+def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
+    """Spans in any order -> (K, 2), overlapping ones and gaps under 0.2 s joined."""
+    joined: list[list[float]] = []
+    for start, end in sorted(spans):
+        if joined and start - joined[-1][1] < GAP_S:
+            joined[-1][1] = max(joined[-1][1], end)
+        elif end > start:
+            joined.append([start, end])
+    return np.array(joined, np.float64).reshape(-1, 2)
+
+
+def series(meeting: str) -> str:
+    """Meetings of one series share their people: "IS1008c" -> "IS1008"."""
+    return meeting.rstrip("abcdefgh")
+
+
+def split_series(people: Iterable[Person]) -> dict[str, list[Person]]:
+    """Every fourth series (sorted by name, from the first) is kept for validation, whole."""
+    everybody = list(people)
+    names = sorted({series(person.meeting) for person in everybody})
+    held_out = set(names[::4]) if len(names) > 1 else set()
+    people_of = {
+        "train": [person for person in everybody if series(person.meeting) not in held_out],
+        "validation": [person for person in everybody if series(person.meeting) in held_out],
+    }
+    seen = {person.participant for person in people_of["train"]}
+    people_of["validation"] = [person for person in people_of["validation"] if person.participant not in seen]
+    return people_of
+
+
+def _spoken(spans: Iterable[tuple[float, float, str]]) -> list[tuple[float, float]]:
+    return [(start, end) for start, end, what in spans if what.startswith("w ")]
+
+
+def _pick(spans: Iterable[tuple[float, float, str]], wanted: tuple[str, ...]) -> Doubles:
+    return np.array([(start, end) for start, end, what in spans if what in wanted], np.float64).reshape(-1, 2)
+
+
+def _spans(folder: Path, name: str, *what: str) -> _Spans:
+    rows = _table(folder, name)
+    spans: _Spans = defaultdict(list)
+    try:
+        for meeting, agent, start, end, *rest in zip(
+            *(rows[column] for column in ("meeting", "agent", "start_s", "end_s", *what)), strict=True
+        ):
+            spans[meeting, agent].append((float(start), float(end), " ".join(rest)))
+    except ValueError as error:
+        raise ConfigError(f"{folder}: {name}: {error}") from error
+    for found in spans.values():
+        found.sort()
+    return spans
+
+
+def _table(folder: Path, name: str) -> _Rows:
+    for file in (folder / f"{name}.csv.gz", folder / f"{name}.csv"):
+        if file.is_file():
+            break
+    else:
+        raise ConfigError(f"{folder / name}.csv.gz: no such file; an AMI folder holds {', '.join(_COLUMNS)}")
+    rows = table(file)
+    for column in _COLUMNS[name]:
+        if column not in rows:
+            raise ConfigError.at(file, "column", column, "is missing", rows)
+    return rows

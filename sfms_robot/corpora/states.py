@@ -1,0 +1,108 @@
+"""Which of the seven conversational states (3.3) the agent is in, from who speaks, what is feedback, and nods.
+
+The paper annotated its data by hand and shows the result in a figure alone; this rule is ours. Voice activity decides
+what is possible, `PATTERNS`; dialogue acts decide the rest:
+
+| agent | user | state |
+|---|---|---|
+| speaks | silent | speaking; giving feedback when it is an "mm-hm" into the other's pause |
+| speaks | speaks | giving feedback when the agent's words are; receiving it when the user's are; else interrupted |
+| silent | speaks | receiving feedback in the agent's turn; giving it while he nods; else listening |
+| silent | silent | thinking when the agent spoke last and speaks next; else waiting |
+
+Feedback does not take the floor: who spoke last or speaks next leaves it out. Where no dialogue acts are at hand,
+`short_answers` stands in for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.config.arig import STATES
+from sfms_robot.frames import FRAME_HZ
+from sfms_robot.signals.events import runs
+
+Mask = NDArray[np.bool_]
+STATE: Final[Mapping[str, int]] = {name: index for index, name in enumerate(STATES)}
+UNKNOWN: Final = -1
+ANSWER_S: Final = 1.0  # shorter utterances in the other's turn are feedback, where nobody annotated it
+
+# (agent speaks, user speaks) that a state may have.
+PATTERNS: Final[Mapping[str, frozenset[tuple[bool, bool]]]] = {
+    "speaking": frozenset({(True, False)}),
+    "listening": frozenset({(False, True)}),
+    "receiving_feedback": frozenset({(True, True), (False, True)}),
+    "thinking": frozenset({(False, False)}),
+    "interrupted": frozenset({(True, True)}),
+    "waiting": frozenset({(False, False)}),
+    "giving_feedback": frozenset({(True, False), (True, True), (False, True)}),
+}
+
+
+@dataclass(frozen=True)
+class Voices:
+    """(N,) per frame: who speaks, which of it is feedback (may reach beyond the speech), and whether the agent nods."""
+
+    agent: Mask
+    user: Mask
+    agent_feedback: Mask
+    user_feedback: Mask
+    nods: Mask
+
+
+def of_activity(agent: Mask, user: Mask) -> Voices:
+    """Voice activity alone, short answers as feedback, no nods."""
+    nods = np.zeros(len(agent), bool)
+    return Voices(agent, user, short_answers(agent, user), short_answers(user, agent), nods)
+
+
+def label(heard: Voices) -> NDArray[np.int8]:
+    """(N,) one state per frame; see the table above."""
+    agent, user = heard.agent, heard.user
+    told, answered = agent & heard.agent_feedback, user & heard.user_feedback
+    own_turn = _own_turn(agent & ~told, user & ~answered)
+    rules = (  # the first that holds
+        (told, "giving_feedback"),
+        (agent & answered, "receiving_feedback"),
+        (agent & user, "interrupted"),
+        (agent, "speaking"),
+        (answered & own_turn, "receiving_feedback"),
+        (user & heard.nods, "giving_feedback"),
+        (user, "listening"),
+        (own_turn, "thinking"),
+    )
+    return np.select([rule for rule, _ in rules], [STATE[name] for _, name in rules], STATE["waiting"]).astype(np.int8)
+
+
+def _own_turn(agent: Mask, user: Mask) -> Mask:
+    """(N,) frames before and after which the agent is the next to have the floor, at any distance."""
+    floor = np.where(agent, 1, np.where(user, -1, 0))
+    own: Mask = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)
+    return own
+
+
+def _latest(floor: NDArray[np.int_]) -> NDArray[np.int_]:
+    """(N,) the newest value that is not 0, up to and with each frame; 0 before the first."""
+    newest = np.maximum.accumulate(np.where(floor != 0, np.arange(len(floor)), -1))
+    return np.where(newest >= 0, floor[newest], 0)
+
+
+def short_answers(active: Mask, other: Mask) -> Mask:
+    """(N,) utterances under a second that begin while the other speaks and after which he speaks again."""
+    out = np.zeros(len(active), bool)
+    for start, end in runs(active):
+        before, after = other[max(0, start - FRAME_HZ // 2) : start + 1], other[end : end + FRAME_HZ]
+        if end - start < ANSWER_S * FRAME_HZ and before.any() and after.any():
+            out[start:end] = True
+    return out
+
+
+def shares(states: NDArray[np.int8]) -> dict[str, float]:
+    """Share of each state among the labelled frames."""
+    known = states[states >= 0]
+    return {name: float((known == index).mean()) if len(known) else 0.0 for name, index in STATE.items()}

@@ -1,0 +1,196 @@
+"""Faults on request: which, of whom, from when to when, how much.
+
+    KIND[:IDS][@START[-END]][=VALUE]        drop:3,5-7@2-4=0.5    delay:2=0.012    brownout@1    noise=0.1
+
+Times are seconds of the emulator's clock; an END left out means for good, except for the two that pass by themselves
+(brownout, hangup). Everything that is left to chance comes from one seeded generator, so that in virtual time the same
+requests meet the same faults.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import random
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from sfms_robot.emulator.device import Reply
+from sfms_robot.errors import ConfigError
+
+
+class Kind(NamedTuple):
+    """What VALUE means (none where it is empty), its default and range, and how long the fault lasts by default."""
+
+    meaning: str
+    value: float = 1.0
+    low: float = 0.0
+    high: float = 1.0
+    lasts_s: float = math.inf
+    ids: bool = True
+
+
+_SHARE: Final = "share of replies"
+KINDS: Final[dict[str, Kind]] = {
+    "drop": Kind(_SHARE),
+    "delay": Kind("seconds", 0.02, 0.0, 60.0),
+    "corrupt": Kind(_SHARE),
+    "duplicate": Kind(_SHARE),
+    "truncate": Kind(_SHARE),
+    "echo": Kind("share of requests", ids=False),
+    "noise": Kind("share of requests", ids=False),
+    "silent": Kind(""),
+    "stuck": Kind(""),
+    "overload": Kind(""),
+    "overheat": Kind(""),
+    "load": Kind("share of full torque", 0.1, -1.0, 1.0),
+    "voltage": Kind("volts", 0.0, 0.0, 60.0, ids=False),
+    "brownout": Kind("volts", 0.0, 0.0, 60.0, lasts_s=0.2, ids=False),
+    "hangup": Kind("", lasts_s=1.0, ids=False),
+}
+_SPEC: Final = re.compile(
+    r"(?P<kind>[a-z]+)(:(?P<ids>[0-9,-]+))?(@(?P<start>[0-9.]+)(?P<dash>-(?P<end>[0-9.]+)?)?)?(=(?P<value>-?[0-9.e-]+))?"
+)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault. `ids` None = everybody. `text` is the spec as it was given."""
+
+    kind: str
+    ids: frozenset[int] | None
+    start_s: float
+    end_s: float
+    value: float
+    text: str
+
+    def meets(self, servos: Sequence[int], now_s: float) -> bool:
+        if not self.start_s <= now_s < self.end_s:
+            return False
+        return self.ids is None or not self.ids.isdisjoint(servos)
+
+
+def parse_fault(text: str, now_s: float = 0.0) -> Fault:
+    """A fault from its spec; `now_s` is when it starts unless it says. Raises ConfigError of one line."""
+
+    def refuse(problem: str, choices: Iterable[object] = ()) -> ConfigError:
+        return ConfigError.at("emulate", "fault", text, problem, choices)
+
+    found = _SPEC.fullmatch(text.strip())
+    if found is None:
+        raise refuse("is no fault: KIND[:IDS][@START[-END]][=VALUE]", KINDS)
+    name, kind = found["kind"], KINDS.get(found["kind"])
+    if kind is None:
+        raise refuse(f"has no such kind as {name!r}", KINDS)
+    if found["ids"] and not kind.ids:
+        raise refuse(f"cannot name ids: {name} concerns the whole wire")
+    if name == "voltage" and found["value"] is None:
+        raise refuse("needs a value in volts, as in voltage=7.2")
+    if found["value"] is not None and not kind.meaning:
+        raise refuse(f"takes no value: {name} is there or not")
+    try:
+        start_s = now_s if found["start"] is None else float(found["start"])
+        end_s = start_s + kind.lasts_s if found["end"] is None else float(found["end"])
+        value = kind.value if found["value"] is None else float(found["value"])
+        ids = parse_ids(found["ids"]) if found["ids"] else None
+    except ValueError:
+        raise refuse("holds a number that is none") from None
+    if not kind.low <= value <= kind.high:
+        raise refuse(f"is out of range: {kind.meaning} of {name}", [f"{kind.low:g}..{kind.high:g}"])
+    if end_s <= start_s:
+        raise refuse(f"ends at {end_s:g} s, before it starts")
+    return Fault(name, ids, start_s, end_s, value, text.strip())
+
+
+def parse_ids(text: str) -> frozenset[int]:
+    """`3,5-7` -> {3, 5, 6, 7}. Raises ValueError."""
+    out: set[int] = set()
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        ids = range(int(first), int(last or first) + 1)
+        if not ids or ids[-1] > 255:
+            raise ValueError(f"{part!r} is no range of ids")
+        out.update(ids)
+    return frozenset(out)
+
+
+class Faults:
+    """The faults of one wire and the dice they throw."""
+
+    def __init__(self, faults: Iterable[Fault] = (), seed: int = 0) -> None:
+        self._random = random.Random(seed)
+        self._faults: list[Fault] = []
+        self._edges: list[tuple[float, int, bool, Fault]] = []
+        self._count = 0
+        for fault in faults:
+            self.add(fault)
+
+    def add(self, fault: Fault) -> None:
+        self._faults.append(fault)
+        for time_s, began in ((fault.start_s, True), (fault.end_s, False)):
+            if time_s < math.inf:
+                self._count += 1
+                heapq.heappush(self._edges, (time_s, self._count, began, fault))
+
+    def clear(self, now_s: float) -> None:
+        """No more faults. Those that hold a servo or the supply are let go at `now_s`."""
+        begun = [fault for fault in self._faults if fault.start_s <= now_s < fault.end_s]
+        self._faults, self._edges = [], []
+        for fault in begun:
+            self._count += 1
+            heapq.heappush(self._edges, (now_s, self._count, False, fault))
+
+    def texts(self, now_s: float) -> list[str]:
+        """What is still to come or goes on."""
+        return [fault.text for fault in self._faults if now_s < fault.end_s]
+
+    @property
+    def next_s(self) -> float:
+        """When the next fault begins or ends."""
+        return self._edges[0][0] if self._edges else math.inf
+
+    def edges(self, now_s: float) -> Iterator[tuple[float, Fault, bool]]:
+        """(time, fault, whether it begins) of all that began or ended by now, once each, in order."""
+        while self._edges and self._edges[0][0] <= now_s:
+            time_s, _, began, fault = heapq.heappop(self._edges)
+            if not began and fault in self._faults:
+                self._faults.remove(fault)
+            yield time_s, fault, began
+
+    def spoil(self, reply: Reply, now_s: float) -> list[tuple[bytes, float]]:
+        """What becomes of a reply: (bytes, seconds late), none when it is lost."""
+        out = [(reply.data, 0.0)]
+        for fault in self._faults:
+            if not fault.meets(reply.servos, now_s):
+                continue
+            if fault.kind == "delay":
+                out = [(data, late_s + fault.value) for data, late_s in out]
+            elif fault.kind in _SPOILERS and self._random.random() < fault.value:
+                out = [(spoilt, late_s) for data, late_s in out for spoilt in _SPOILERS[fault.kind](data, self._random)]
+        return out
+
+    def echoes(self, now_s: float) -> bool:
+        """Whether the adapter sends the host its own request back."""
+        return any(self._random.random() < f.value for f in self._faults if f.kind == "echo" and f.meets((), now_s))
+
+    def noise(self, now_s: float) -> bytes:
+        """What the wire makes up by itself after a request."""
+        for fault in self._faults:
+            if fault.kind == "noise" and fault.meets((), now_s) and self._random.random() < fault.value:
+                return self._random.randbytes(self._random.randint(1, 12))
+        return b""
+
+
+def _corrupted(data: bytes, dice: random.Random) -> list[bytes]:
+    at = dice.randrange(len(data))
+    return [data[:at] + bytes([data[at] ^ 1 << dice.randrange(8)]) + data[at + 1 :]]
+
+
+_SPOILERS: Final = {
+    "drop": lambda data, dice: [],
+    "duplicate": lambda data, dice: [data, data],
+    "truncate": lambda data, dice: [data[: dice.randrange(len(data))]],
+    "corrupt": _corrupted,
+}

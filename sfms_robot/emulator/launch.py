@@ -1,0 +1,280 @@
+"""Start an emulated servo chain in a process of its own, and stop it again.
+
+    with launch([EmulatedServo(1), EmulatedServo(2, start_ticks=1500)]) as chain:
+        SerialPort(chain.device, 1_000_000, clock)
+
+Servos of several protocols, and boards, may share one wire.
+
+The process ends with the `with` block, and by itself when this one dies.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from types import TracebackType
+from typing import IO, Any, Literal, Self, cast
+
+from sfms_robot.config import FirmwareMap, load_firmware_map, variant
+from sfms_robot.emulator.faults import parse_fault
+from sfms_robot.errors import BusError, ConfigError
+
+_START_S = 20.0
+
+
+@dataclass(frozen=True)
+class EmulatedServo:
+    """What is plugged in, or on a board one of its channels.
+
+    `start_ticks`: where its position stands at power-up, torque off. `registers`: what somebody stored in it before,
+    by name (homing offset, shutdown, ...). `supply_v` None: a voltage that it is content with.
+    """
+
+    id: int
+    model: str = "xl330-m288"
+    baud: int = 1_000_000
+    start_ticks: int = 2048
+    firmware: int = 53
+    registers: Mapping[str, int] = field(default_factory=dict)
+    supply_v: float | None = None
+
+
+class Chain:
+    """A running chain.
+
+    Attributes:
+        device: path of the serial device; it stays the same when the adapter is unplugged and comes back.
+        control: path of the control socket.
+        virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], virtual: bool, device: str, control: str, folder: str) -> None:
+        self.virtual = virtual
+        self.device = device
+        self.control = control
+        self._process = process
+        self._folder = folder
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def kill(self, servo_id: int) -> None:
+        """The servo falls silent, as with its cable out; its motor keeps doing what it was told."""
+        self.ask(f"kill {servo_id}")
+
+    def revive(self, servo_id: int) -> None:
+        self.ask(f"revive {servo_id}")
+
+    def fault(self, servo_id: int, bits: int) -> None:
+        """Latch hardware error bits until the servo is rebooted."""
+        self.ask(f"fault {servo_id} {bits}")
+
+    def turn(self, servo_id: int, ticks: int) -> None:
+        """Turn the shaft by hand."""
+        self.ask(f"turn {servo_id} {ticks}")
+
+    def state(self, servo_id: int) -> dict[str, Any]:
+        """What an onlooker sees: position [ticks], goal, torque, faults, temperature_C."""
+        return cast("dict[str, Any]", self._json(f"state {servo_id}"))
+
+    def inject(self, spec: str) -> None:
+        """A fault from now on, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
+        self.ask(f"inject {spec}")
+
+    def clear_faults(self) -> None:
+        self.ask("clear")
+
+    def faults(self) -> list[str]:
+        """Specs of the faults that go on or are to come."""
+        return cast("list[str]", self._json("faults"))
+
+    def supply(self, volts: float) -> None:
+        """Another supply voltage for all servos."""
+        self.ask(f"supply {volts!r}")
+
+    def hang_up(self) -> None:
+        """Unplug the adapter: hosts see the device vanish."""
+        self.ask("hangup")
+
+    def come_back(self) -> None:
+        """Plug it in again."""
+        self.ask("return")
+
+    def time_is(self, now_s: float) -> None:
+        """In virtual time: let happen what happens by itself by `now_s`, though no host says a word."""
+        self.ask(f"time {now_s!r}")
+
+    def statistics(self) -> dict[str, Any]:
+        """bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
+        return cast("dict[str, Any]", self._json("stats"))
+
+    def stamps(self) -> list[dict[str, Any]]:
+        """The last replies: ids, due_s, sent_s."""
+        return cast("list[dict[str, Any]]", self._json("stamps"))
+
+    @property
+    def stdout(self) -> IO[bytes]:
+        """Says nothing any more, and ends with the process."""
+        return cast("IO[bytes]", self._process.stdout)
+
+    def digest(self) -> tuple[str, int]:
+        """SHA-256 and number of all bytes that hosts have sent."""
+        _, sha, count = self.ask("digest").split()
+        return sha, int(count)
+
+    def close(self) -> None:
+        """End the process and remove its folder. Idempotent."""
+        if self._process.poll() is None:
+            self._process.terminate()
+        _reap(self._process)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        if os.path.islink(self.device) and not os.path.exists(self.device):
+            os.unlink(self.device)  # it was killed, and left its link behind
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def _json(self, request: str) -> Any:
+        return json.loads(self.ask(request).removeprefix("json "))
+
+    def ask(self, request: str) -> str:
+        """One line to the control socket, and its answer. Raises BusError when it is refused."""
+        try:
+            with socket.socket(socket.AF_UNIX) as control:
+                control.connect(self.control)
+                control.sendall(request.encode() + b"\n")
+                answer = control.makefile().readline().strip()
+        except OSError as error:
+            raise BusError(f"the emulated chain {self.device} is gone: {error}") from error
+        if not answer or answer.startswith("error"):
+            raise BusError(f"the emulated chain {self.device} refuses {request!r}: {answer or 'no answer'}")
+        return answer
+
+
+def launch(
+    servos: Sequence[EmulatedServo],
+    virtual: bool = False,
+    *,
+    timing: Literal["instant", "wire"] = "instant",
+    behind_silent: Literal["chain_break", "skip"] = "chain_break",
+    faults: Sequence[str] = (),
+    seed: int = 0,
+    link: str | None = None,
+) -> Chain:
+    """Start a chain and wait until it can be opened.
+
+    Args:
+        virtual: time is what the host says it is (see `servo.port.VirtualTimePort`).
+        timing: replies at once, or in the time that bytes and return delays take.
+        behind_silent: whether the ids behind a silent one in a sync read are silent too.
+        faults: specs (see `emulator.faults`); `seed` throws their dice.
+        link: a symbolic link to the device, removed at the end.
+
+    Raises ConfigError for an unknown model, register or fault, a baud the model does not have, an id used twice or a
+    link that is taken; BusError when the process does not start.
+    """
+    maps = {(servo.model, servo.firmware): _map(servo) for servo in servos}
+    _check(servos, maps)
+    for text in faults:
+        parse_fault(text)
+    if link is not None:
+        _check_link(link)
+    description = {
+        "virtual": virtual,
+        "timing": timing,
+        "behind_silent": behind_silent,
+        "faults": list(faults),
+        "seed": seed,
+        "link": link and os.path.abspath(link),
+        "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
+        "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sfms_robot.emulator.serve"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,  # signals of the terminal are for the host
+    )
+    stdin, stdout = cast("IO[bytes]", process.stdin), cast("IO[bytes]", process.stdout)
+    try:
+        stdin.write(json.dumps(description).encode() + b"\n")
+        stdin.flush()
+        ready = stdout.readline() if select.select([stdout], [], [], _START_S)[0] else b""
+    except OSError:
+        ready = b""
+    if not ready.startswith(b"ready "):
+        process.kill()
+        _reap(process)
+        if ready.startswith(b"refused "):
+            raise ConfigError(ready.removeprefix(b"refused ").decode().strip())
+        raise BusError(f"the emulated chain did not start (exit code {process.returncode})")
+    told = json.loads(ready.removeprefix(b"ready "))
+    return Chain(process, virtual, told["device"], told["control"], told["folder"])
+
+
+def wait(chains: Sequence[Chain]) -> Chain:
+    """Block until a chain ends by itself, and say which."""
+    pipes = {chain.stdout: chain for chain in chains}
+    return pipes[select.select(list(pipes), [], [])[0][0]]
+
+
+def _map(servo: EmulatedServo) -> FirmwareMap:
+    """The layout that holds for its firmware; for families without such layouts, the only one."""
+    named = load_firmware_map(servo.model)
+    return variant(servo.model, servo.firmware) if named.protocol == 2 else named
+
+
+def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], FirmwareMap]) -> None:
+    seen: set[tuple[str, int]] = set()
+    for servo in servos:
+        table = maps[servo.model, servo.firmware]
+        highest = 252 if table.channels is None else table.channels - 1
+        key = ("" if table.channels is None else servo.model, servo.id)
+        if key in seen:
+            raise ConfigError.at("emulated chain", "id", servo.id, "is used twice")
+        seen.add(key)
+        if not 0 <= servo.id <= highest:
+            raise ConfigError.at("emulated chain", "id", servo.id, "is not a servo id", [f"0..{highest}"])
+        bauds = sorted(table.baud_codes.values())
+        if bauds and servo.baud not in bauds:
+            raise ConfigError.at("emulated chain", "baud", servo.baud, f"is no rate of {servo.model}", bauds)
+        if table.channels is not None and (servo.registers or servo.supply_v is not None):
+            problem = "is a board of hobby servos: it has no registers, and does not know its supply"
+            raise ConfigError.at("emulated chain", "model", servo.model, problem)
+        for name, value in servo.registers.items():
+            register = table.registers.get(name)
+            if register is None:
+                raise ConfigError.at("emulated chain", "register", name, f"is none of {servo.model}", table.registers)
+            if not register.low <= value <= register.high:
+                allowed = [f"{register.low}..{register.high}"]
+                raise ConfigError.at("emulated chain", name, value, f"is out of range of {servo.model}", allowed)
+
+
+def _check_link(link: str) -> None:
+    if os.path.exists(link) or (os.path.lexists(link) and not os.path.islink(link)):
+        raise ConfigError.at("emulated chain", "link", link, "is already there")
+    if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
+        raise ConfigError.at("emulated chain", "link", link, "lies in a folder that does not exist")
+
+
+def _reap(process: subprocess.Popen[bytes]) -> None:
+    """Wait for the end, with force if it takes too long, and close the pipes."""
+    try:
+        process.wait(timeout=5.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None and not pipe.closed:
+            pipe.close()

@@ -1,0 +1,54 @@
+"""Metrics under the names their papers use, as their reference code computes them; `timing` is this project's own.
+
+FRRea, a distance between rendered images, is out of scope: nothing here renders faces for judging.
+"""
+
+from sfms_robot.evaluation.metrics.dim import (
+    cluster_centres,
+    frechet_distance,
+    l2,
+    paired_frechet_distance,
+    rpcc_channels,
+    rpcc_flat,
+    shannon_index,
+    sts,
+    variance,
+)
+from sfms_robot.evaluation.metrics.react import (
+    ccc,
+    dtw,
+    frc,
+    frd,
+    frdiv,
+    frdvs,
+    frsyn,
+    frvar,
+    reactface_frc,
+    reactface_frd,
+)
+from sfms_robot.signals.l2l import faceverse_rotation, l2l_bilateral, l2l_mean_std
+
+__all__ = [
+    "ccc",
+    "cluster_centres",
+    "dtw",
+    "faceverse_rotation",
+    "frc",
+    "frd",
+    "frdiv",
+    "frdvs",
+    "frechet_distance",
+    "frsyn",
+    "frvar",
+    "l2",
+    "l2l_bilateral",
+    "l2l_mean_std",
+    "paired_frechet_distance",
+    "reactface_frc",
+    "reactface_frd",
+    "rpcc_channels",
+    "rpcc_flat",
+    "shannon_index",
+    "sts",
+    "variance",
+]

@@ -1,0 +1,102 @@
+"""A Pololu Maestro as a bus. The rules of every hobby board are in `hobby`; these are the Maestro's own.
+
+1. Asking for its errors clears them, and shows that it is there. One that detects its baud rate hears nothing before
+   the byte AA, which is sent only when it does not answer: to one that is running, AA alone may be a protocol error.
+2. Any error sends the channels to their home, which from the factory is no pulses at all. So after an error that it
+   reports all goals are sent anew.
+3. All but the 6 channel board take the targets of neighbours in one command.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from sfms_robot.config import Bus as BusConfig
+from sfms_robot.frames import Doubles
+from sfms_robot.ports import TickConversion
+from sfms_robot.servo.boards.board import Ask, Health, pulses_beyond
+from sfms_robot.servo.boards.pulse_bus import HobbyBus
+from sfms_robot.servo.codecs import maestro
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
+
+log = logging.getLogger(__name__)
+
+READ_DEADLINE_S: Final = 0.02
+_MICRO: Final = 6  # channels of the one board without "set multiple targets"
+
+
+class _Maestro:
+    """`hobby.Dialect` of a Maestro."""
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+        self._groups = (table.channels or 0) > _MICRO
+
+    answer_length = 2
+
+    def question(self, lost: bool) -> bytes:
+        return bytes([maestro.BAUD_INDICATION] * lost) + maestro.get_errors()
+
+    def health(self, answer: bytes) -> Health | None:
+        bits = int.from_bytes(answer, "little")
+        if bits >> (max(self._table.faults, default=15) + 1):
+            return None
+        return Health(self._table.fault_names(bits), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
+
+    def pulses(self, ask: Ask, channels: Sequence[int]) -> dict[int, int] | None:
+        answers = {channel: ask(maestro.get_position(channel), 2) for channel in channels}
+        told = {channel: int.from_bytes(data, "little") for channel, data in answers.items() if data is not None}
+        return told if len(told) == len(answers) else None
+
+    def goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+        if not self._groups:
+            return b"".join(maestro.set_target(channel, target) for channel, target in sorted(ticks.items()))
+        return b"".join(
+            maestro.set_targets(run[0], [ticks[channel] for channel in run])
+            if len(run) > 1
+            else maestro.set_target(run[0], ticks[run[0]])
+            for run in _runs(sorted(ticks))
+        )
+
+    def off(self, channels: Sequence[int]) -> bytes:
+        return b"".join(maestro.set_target(channel, maestro.OFF) for channel in channels)
+
+
+def _runs(channels: Sequence[int]) -> list[list[int]]:
+    """Ascending channels, cut where a number is left out."""
+    runs: list[list[int]] = []
+    for channel in channels:
+        if runs and channel == runs[-1][-1] + 1:
+            runs[-1].append(channel)
+        else:
+            runs.append([channel])
+    return runs
+
+
+class MaestroBus(HobbyBus):
+    """One Maestro with the compact protocol, as `ports.Bus`; see `hobby.HobbyBus` for what is true of it."""
+
+    def __init__(
+        self,
+        name: str,
+        servos: Sequence[BusServo],
+        conversion: TickConversion,
+        open_port: Callable[[], Port],
+        baud: int,
+        read_deadline_s: float = READ_DEADLINE_S,
+        *,
+        confirmed: bool = False,
+        rest_rad: Doubles | None = None,
+        config: BusConfig | None = None,
+    ) -> None:
+        table = Table.of(servos[0].map)
+        super().__init__(
+            name, servos, conversion, open_port, baud, read_deadline_s,
+            dialect=_Maestro(table), confirmed=confirmed, rest_rad=rest_rad, config=config,
+        )  # fmt: skip
+        if wide := pulses_beyond(servos, conversion, table, maestro.FACTORY_PULSE_US):
+            log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, ", ".join(wide))

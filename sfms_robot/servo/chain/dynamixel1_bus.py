@@ -1,0 +1,20 @@
+"""A bus of Dynamixel servos of Protocol 1.0: AX, and MX with their old firmware.
+
+MX servos answer a bulk read, one request for all. AX servos do not, nor does a bus that has one of them: there servos
+are read one by one, in rotation. Which it is, the bus finds out when it connects.
+"""
+
+from __future__ import annotations
+
+from sfms_robot.servo.chain.protocol1_bus import Frame1Bus
+from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_poll import GroupRead
+
+
+class Dynamixel1Bus(Frame1Bus):
+    """`ports.Bus` of Dynamixel 1.0 servos."""
+
+    family = "dynamixel"
+
+    def _group_reader(self, link: Frame1Link) -> GroupRead | None:
+        return link.bulk_read

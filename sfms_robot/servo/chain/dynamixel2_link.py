@@ -1,0 +1,261 @@
+"""Requests to Dynamixel Protocol 2.0 servos and their answers, over a `Port`.
+
+The vendor SDK builds what is sent on every tick, and this is the only file that knows it. A request that is sent
+again is not built again: reads go out as they were, and of a sync write only the data and the crc are new. Single
+writes are built by our own codec, because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
+
+Answers are not read by the SDK, which waits at least 34 ms, spins meanwhile and stops at the first failure, but from
+the byte stream: by id and length, so that a late or foreign reply can never be taken for another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
+from numpy.typing import NDArray
+
+from sfms_robot.errors import PacketError
+from sfms_robot.servo.chain.link import CHUNK, NO_PATIENCE, Answer, Found, RegisterLink
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, Packet, maybe_packet
+from sfms_robot.servo.port import Port
+
+_REQUESTS_KEPT: Final = 512
+_WRITES_KEPT: Final = 16  # each has a table of 0.5 KiB per byte of data
+_PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
+_HEADER: Final = b"\xff\xff\xfd"
+_SYNC_DATA: Final = 12  # where the first id of a sync write stands
+
+
+class _Draft:
+    """Our port as the SDK's packet builders see one: what they send is kept instead."""
+
+    def __init__(self) -> None:
+        self.is_using = False
+        self.packet = b""
+
+    def clearPort(self) -> None:
+        """Sending does that."""
+
+    def writePort(self, packet: Sequence[int]) -> int:
+        self.packet = bytes(packet)
+        return len(packet)
+
+    def setPacketTimeout(self, packet_length: int) -> None:
+        """The SDK sets it after each request; we have our own deadlines."""
+
+
+class Dxl2Link(RegisterLink):
+    """One wire of Protocol 2.0 servos."""
+
+    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
+        super().__init__(port, baud, silence_s)
+        self._sdk = Protocol2PacketHandler()
+        self._requests: dict[tuple[object, ...], bytes] = {}
+        self._writes: dict[tuple[int, int, tuple[int, ...]], _SyncWrite] = {}
+        self._sent = 0
+
+    # --- one servo ----------------------------------------------------------------------------------------------
+
+    def ping(self, servo: int) -> Found | None:
+        self._send(dxl2.encode_instruction(servo, dxl2.PING))
+        packet = self._answers([servo], 3).get(servo)
+        return _found(packet) if packet is not None and len(packet.params) == 3 else None
+
+    def broadcast_ping(self) -> dict[int, Found]:
+        """Everybody who answers at this baud, by id; takes 253 answering times, and no more than it needs to."""
+        self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING))
+        everybody = range(dxl2.MAX_ID + 1)
+        with self.patient(len(everybody) * _PING_S):
+            packets = self._answers(everybody, 3)
+        return {servo: _found(packet) for servo, packet in packets.items() if len(packet.params) == 3}
+
+    def reboot(self, servo: int) -> Answer | None:
+        self._send(dxl2.encode_instruction(servo, dxl2.REBOOT))
+        return self._answer(servo, 0)
+
+    def factory_reset(self, servo: int, option: int) -> Answer | None:
+        """0xFF everything, 1 all but the id, 2 all but id and baud."""
+        self._send(dxl2.encode_instruction(servo, dxl2.FACTORY_RESET, bytes([option])))
+        return self._answer(servo, 0)
+
+    def clear_turns(self, servo: int) -> Answer | None:
+        """Forget whole turns: present position back into one revolution. Only at rest."""
+        self._send(dxl2.encode_instruction(servo, dxl2.CLEAR, b"\x01\x44\x58\x4c\x22"))
+        return self._answer(servo, 0)
+
+    def read(self, servo: int, address: int, length: int) -> Answer | None:
+        self._send(
+            self._request(
+                ("read", servo, address, length), lambda draft: self._sdk.readTx(draft, servo, address, length)
+            )
+        )
+        return self._answer(servo, length)
+
+    def write(self, servo: int, address: int, data: bytes) -> Answer | None:
+        """The servo's acknowledgement, or None when it did not answer."""
+        self._send(dxl2.encode_instruction(servo, dxl2.WRITE, address.to_bytes(2, "little") + data))
+        return self._answer(servo, 0)
+
+    def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
+        """As `write`, but kept by the servo until `action`."""
+        self._send(dxl2.encode_instruction(servo, dxl2.REG_WRITE, address.to_bytes(2, "little") + data))
+        return self._answer(servo, 0)
+
+    def action(self) -> None:
+        """All registered writes take effect at once. Nothing answers."""
+        self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.ACTION))
+
+    # --- many servos --------------------------------------------------------------------------------------------
+
+    def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
+        """One packet for all servos; all values have one length. Nothing answers."""
+        length = len(next(iter(values.values())))
+        self.sync_write_block(address, tuple(values), length, b"".join(values.values()))
+
+    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
+        """As `sync_write`, the values one behind the other."""
+        key = (address, length, servos)
+        write = self._writes.get(key)
+        if write is None:
+            if len(self._writes) >= _WRITES_KEPT:
+                self._writes.clear()
+            blank = [byte for servo in servos for byte in (servo, *[0] * length)]
+            build = self._build(lambda draft: self._sdk.syncWriteTxOnly(draft, address, length, blank, len(blank)))
+            write = self._writes[key] = _SyncWrite(build, length)
+        self._send(write.packet(data))
+
+    def sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Packet]:
+        """Answers by id, of those that answered."""
+        self._send(self._read_request(address, length, servos, fast=False))
+        return self._answers(servos, length)
+
+    def fast_sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Packet]:
+        """As `sync_read`, but all answer in one packet, which stops where somebody is silent."""
+        self._send(self._read_request(address, length, servos, fast=True))
+        size = 8 + len(servos) * (length + 4)
+        buffer, start = bytearray(), -1
+        deadline_s = self.port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
+        last_s = deadline_s + size * self._byte_s + NO_PATIENCE * self.silence_s
+        while len(buffer) < max(start, 0) + size and self.port.now_s() < last_s:
+            data = self.port.read(CHUNK, deadline_s)
+            if not data:
+                break
+            buffer += data
+            if start < 0:
+                start = buffer.find(_HEADER + b"\x00\xfe")
+            if len(buffer) > dxl2.MAX_PACKET + CHUNK:
+                break
+            deadline_s = self.port.now_s() + self.silence_s
+        answers: dict[int, Packet] = {}
+        for servo, error, data in dxl2.split_fast_status(buffer[max(start, 0) :], length):
+            if servo in servos:
+                answers[servo] = Packet(servo, STATUS, data, error)
+        return answers
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    def _read_request(self, address: int, length: int, servos: Sequence[int], fast: bool) -> bytes:
+        return self._request(
+            (address, length, fast, *servos),
+            lambda draft: self._sdk.syncReadTx(draft, address, length, servos, len(servos), fast),
+        )
+
+    def _request(self, key: tuple[object, ...], build: Callable[[_Draft], int]) -> bytes:
+        packet = self._requests.get(key)
+        if packet is None:
+            if len(self._requests) >= _REQUESTS_KEPT:
+                self._requests.clear()
+            packet = self._requests[key] = self._build(build)
+        return packet
+
+    def _build(self, build: Callable[[_Draft], int]) -> bytes:
+        draft = _Draft()
+        result = build(draft)
+        if result != COMM_SUCCESS:
+            raise PacketError(f"{self.port.name}: the request cannot be built: {self._sdk.getTxRxResult(result)}")
+        return draft.packet
+
+    def _send(self, packet: bytes) -> None:
+        self.port.discard_input()
+        self.port.write(packet)
+        self._sent = len(packet)
+
+    def _answer(self, servo: int, length: int) -> Answer | None:
+        packet = self._answers([servo], length).get(servo)
+        return None if packet is None else Answer(packet.error, packet.params)
+
+    def _answers(self, servos: Sequence[int], length: int) -> dict[int, Packet]:
+        """Status packets of `servos` with `length` bytes of data, or with an error and none.
+
+        Waits until all are there, or nothing came for `silence_s` beyond the time that the bytes take.
+        """
+        port, buffer, answers = self.port, bytearray(), dict[int, Packet]()
+        pending = set(servos)
+        size = STATUS_OVERHEAD + length
+        deadline_s = port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
+        last_s = deadline_s + 2 * len(servos) * size * self._byte_s + NO_PATIENCE * self.silence_s
+        while pending and port.now_s() < last_s:
+            data = port.read(CHUNK, deadline_s)
+            if not data:
+                break
+            buffer += data
+            while (packet := maybe_packet(buffer)) is not None:
+                servo, instruction, params, error = packet
+                expected = len(params) == length or (error & 0x7F and not params)
+                if instruction == STATUS and servo in pending and expected:
+                    answers[servo] = packet
+                    pending.remove(servo)
+            deadline_s = port.now_s() + self.silence_s
+        return answers
+
+
+class _SyncWrite:
+    """A sync write as the SDK built it, with data and crc to be filled in.
+
+    A crc is linear: that of the packet is that of the packet with zeros, xored with what each byte adds on its own.
+    So one table per place and byte, looked up all at once, replaces the walk along the packet.
+    """
+
+    def __init__(self, blank: bytes, length: int) -> None:
+        count = (len(blank) - _SYNC_DATA - 2) // (length + 1)
+        starts = _SYNC_DATA + 1 + (length + 1) * np.arange(count)
+        self._at = (starts[:, None] + np.arange(length)).ravel()
+        self._length = length
+        self._packet = np.frombuffer(blank, np.uint8).copy()
+        self._blank_crc = dxl2.crc16(blank[:-2])
+        self._adds = _additions(len(blank) - 2, self._at)
+        self._rows = np.arange(len(self._at))
+
+    def packet(self, data: bytes) -> bytes:
+        """With the values `data`, one behind the other."""
+        values = np.frombuffer(data, np.uint8)
+        if len(values) != len(self._at):
+            raise ValueError(f"{len(data)} bytes of data for {len(self._at)}")
+        packet = self._packet
+        packet[self._at] = values
+        crc = self._blank_crc ^ int(np.bitwise_xor.reduce(self._adds[self._rows, values]))
+        packet[-2], packet[-1] = crc & 0xFF, crc >> 8
+        out = packet.tobytes()
+        if out.find(_HEADER, 7, len(out) - 2) < 0:
+            return out
+        # Data that look like a header have to be stuffed: the SDK's own stuffing (4.1.0) works on a copy it drops.
+        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, out[8:-2])
+
+
+def _additions(size: int, places: NDArray[np.intp]) -> NDArray[np.uint16]:
+    """(places, 256): what each byte at each place adds to the crc of a packet of `size` bytes before the crc."""
+    table = np.array([dxl2.crc16(bytes([byte])) for byte in range(256)], np.uint16)
+    adds = np.zeros((size, 256), np.uint16)
+    adds[size - 1] = table
+    for at in range(size - 2, -1, -1):  # one more zero byte behind it
+        crc = adds[at + 1]
+        adds[at] = (crc << 8) ^ table[crc >> 8]
+    return adds[places]
+
+
+def _found(packet: Packet) -> Found:
+    return Found(int.from_bytes(packet.params[:2], "little"), packet.params[2])

@@ -1,0 +1,31 @@
+"""A bus of Feetech servos.
+
+STS and SMS (low byte first) answer a sync read, one request for all. SCS (high byte first) do not reliably, so they
+are never asked to: there servos are read one by one, in rotation.
+"""
+
+from __future__ import annotations
+
+from sfms_robot.errors import ServoError
+from sfms_robot.servo.chain.protocol1_bus import Frame1Bus
+from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_poll import GroupRead
+
+
+class FeetechBus(Frame1Bus):
+    """`ports.Bus` of Feetech servos, all of one byte order."""
+
+    family = "feetech"
+
+    def _group_reader(self, link: Frame1Link) -> GroupRead | None:
+        return link.sync_read if self._tables[0].byte_order == "little" else None
+
+    def calibrate_here(self, joint: str) -> None:
+        """Make the present position the middle of the servo's range, for good. STS only.
+
+        Raises ServoError for a joint that has torque, or a model that cannot.
+        """
+        index = self.joints.index(joint)
+        if index in self._care.wanted:
+            raise ServoError(f"{joint} (id {self._servos[index].id}) has torque on: stop it before it is calibrated")
+        self._shake(self._connected()).calibrate_here(index)

@@ -1,0 +1,106 @@
+import math
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.emulator.device import Reply
+from sfms_robot.emulator.faults import KINDS, Faults, parse_fault
+from sfms_robot.errors import ConfigError
+
+REPLY = Reply((3,), bytes(range(40)))
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "ids", "start_s", "end_s", "value"),
+    [
+        ("drop", "drop", None, 0.0, math.inf, 1.0),
+        ("drop:3,5-7@2-4=0.5", "drop", {3, 5, 6, 7}, 2.0, 4.0, 0.5),
+        ("delay:2=0.012", "delay", {2}, 0.0, math.inf, 0.012),
+        ("noise@1.5-=0.1", "noise", None, 1.5, math.inf, 0.1),
+        ("brownout@1", "brownout", None, 1.0, 1.2, 0.0),
+        ("hangup@1-3", "hangup", None, 1.0, 3.0, 1.0),
+        ("load:1=-0.25", "load", {1}, 0.0, math.inf, -0.25),
+    ],
+)
+def test_spec_is_read(text, kind, ids, start_s, end_s, value):
+    fault = parse_fault(text)
+    assert (fault.kind, fault.ids) == (kind, ids and frozenset(ids))
+    assert (fault.start_s, fault.end_s, fault.value) == pytest.approx((start_s, end_s, value))
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("dorp", "has no such kind as 'dorp' (drop, delay"),
+        ("drop=1.5", "is out of range: share of replies of drop (0..1)"),
+        ("drop:9-3", "holds a number that is none"),
+        ("drop:1-999", "holds a number that is none"),
+        ("drop@4-2", "ends at 2 s, before it starts"),
+        ("drop@1.2.3", "holds a number that is none"),
+        ("stuck:1=4", "takes no value"),
+        ("noise:3", "cannot name ids"),
+        ("voltage", "needs a value in volts"),
+        ("drop three", "is no fault"),
+        ("", "is no fault"),
+    ],
+)
+def test_bad_spec_is_one_clear_line(text, problem):
+    with pytest.raises(ConfigError, match=re.escape(problem)) as caught:
+        parse_fault(text)
+    assert "\n" not in str(caught.value) and repr(text) in str(caught.value)
+
+
+@given(st.text(max_size=30))
+def test_any_text_is_a_fault_or_a_config_error(text):
+    try:
+        assert parse_fault(text).kind in KINDS
+    except ConfigError:
+        return
+
+
+def spoilt(*specs: str, reply: Reply = REPLY, now_s: float = 0.0, seed: int = 0):
+    return Faults([parse_fault(spec) for spec in specs], seed).spoil(reply, now_s)
+
+
+def test_what_becomes_of_a_reply():
+    assert spoilt() == [(REPLY.data, 0.0)]
+    assert spoilt("drop") == []
+    assert spoilt("duplicate") == [(REPLY.data, 0.0)] * 2
+    assert spoilt("delay=0.01") == [(REPLY.data, 0.01)]
+    [(short, _)] = spoilt("truncate")
+    assert REPLY.data.startswith(short) and len(short) < 40
+    [(wrong, _)] = spoilt("corrupt")
+    assert len(wrong) == 40 and sum(a != b for a, b in zip(wrong, REPLY.data, strict=True)) == 1
+    assert spoilt("duplicate", "delay=0.01", "drop:4") == [(REPLY.data, 0.01)] * 2
+
+
+def test_fault_is_only_there_in_its_time_and_for_its_ids():
+    assert spoilt("drop@1-2", now_s=0.9) and not spoilt("drop@1-2", now_s=1.0) and spoilt("drop@1-2", now_s=2.0)
+    assert spoilt("drop:4") and not spoilt("drop:3") and not spoilt("drop:4", reply=Reply((1, 4), b"x"))
+
+
+def test_one_seed_throws_the_same_dice():
+    def run(seed):
+        faults = Faults([parse_fault("drop=0.5"), parse_fault("corrupt=0.5")], seed)
+        return [faults.spoil(REPLY, 0.01 * k) for k in range(200)]
+
+    assert run(1) == run(1) != run(2)
+    assert 60 < sum(not replies for replies in run(1)) < 140
+
+
+def test_beginnings_and_ends_come_once_in_order():
+    faults = Faults([parse_fault("stuck:1@2-3"), parse_fault("overload:2@1")])
+    assert faults.next_s == 1.0
+    assert [(t, f.kind, began) for t, f, began in faults.edges(2.5)] == [(1.0, "overload", True), (2.0, "stuck", True)]
+    assert [(t, f.kind, began) for t, f, began in faults.edges(9.0)] == [(3.0, "stuck", False)]
+    assert list(faults.edges(9.0)) == [] and faults.next_s == math.inf
+
+
+def test_clearing_lets_go_what_goes_on():
+    faults = Faults([parse_fault("stuck:1"), parse_fault("drop@5"), parse_fault("drop")])
+    assert len(list(faults.edges(1.0))) == 2
+    faults.clear(1.0)
+    assert [(f.kind, began) for _, f, began in faults.edges(1.0)] == [("stuck", False), ("drop", False)]
+    assert faults.spoil(REPLY, 6.0) == [(REPLY.data, 0.0)] and faults.texts(6.0) == []
