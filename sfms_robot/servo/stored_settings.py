@@ -71,7 +71,10 @@ class Contradiction:
 
 
 def multi_turn(table: Table, needs: JointNeeds) -> bool:
-    """Whether the goals of a joint leave the one turn of position mode."""
+    """Whether the goals of a joint leave the one turn of position mode, and the model can follow."""
+    goal = table.role("goal_position")
+    if goal is None or goal.low <= needs.low_ticks and goal.high < table.ticks_per_revolution:
+        return False
     return needs.low_ticks < 0 or needs.high_ticks >= table.ticks_per_revolution
 
 
