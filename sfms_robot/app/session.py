@@ -106,7 +106,8 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
         hanging = np.array([joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)])
         ticks = int(_calibration({name: joint}).to_ticks(hanging)[0])
         baud = head.buses[joint.bus].baud
-        by_bus.setdefault(joint.bus, []).append(EmulatedServo(joint.id, joint.model, baud, ticks))
+        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=dict(joint.stored))
+        by_bus.setdefault(joint.bus, []).append(servo)
     return by_bus
 
 
@@ -121,7 +122,10 @@ def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
             raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
     joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
     return {
-        bus: [replace(servo, registers=stored.of(joints[bus, servo.id]), supply_v=stored.supply_v) for servo in servos]
+        bus: [
+            replace(servo, registers={**servo.registers, **stored.of(joints[bus, servo.id])}, supply_v=stored.supply_v)
+            for servo in servos
+        ]
         for bus, servos in emulated(head).items()
     }
 
@@ -161,7 +165,8 @@ def _build_one(
     maps = _maps(joints)
     check_safety(head, joints, maps)
     servos = [
-        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
+        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key), dict(j.stored))
+        for key, j in joints.items()
     ]
     if config.family in BOARDS:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])

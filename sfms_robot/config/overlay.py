@@ -217,4 +217,6 @@ def calibrated(joint: Joint, found: Measured) -> Joint:
     zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
     low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
     ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
-    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, **ends})
+    known = {"homing_offset": found.homing_offset, "drive_mode": found.drive_mode}
+    stored = {**joint.stored, **{name: value for name, value in known.items() if value is not None}}
+    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, "stored": stored, **ends})
