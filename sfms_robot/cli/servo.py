@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sfms_robot.cli import servo_maps
-from sfms_robot.cli.servo_wiring import Wiring, on_wire
-from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
+from sfms_robot.errors import BusError
 
 if TYPE_CHECKING:
     from sfms_robot.app.servo.servo_wire import Seen, Wire
@@ -38,14 +38,17 @@ def scan(
     ids: Annotated[str | None, typer.Option("--ids", help="Ask these one by one, as 1-9,12. Default: all.")] = None,
 ) -> None:
     """Who is there, at which rate."""
+    from sfms_robot.app.servo.protocol_hint import protocol_hint
     from sfms_robot.app.servo.servo_tools import parse_ids
     from sfms_robot.app.servo.servo_tools import scan as look
 
     asked = parse_ids(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
-        rows = [seen.row() for seen in look(wire, asked, progress)]
+        hint = protocol_hint(wire)
+        rows = [] if hint else [seen.row() for seen in look(wire, asked, progress)]
         where = wire.port.name
-    _show(rows, {"port": where, "servos": rows}, on.json, f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}")
+    title = f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}{f': {hint}' if hint else ''}"
+    _show(rows, {"port": where, "servos": rows, "hint": hint}, on.json, title)
 
 
 @app.command()
@@ -96,7 +99,7 @@ def write(
     """Write a register and read it back. What lasts (EEPROM) is asked about first, and refused while torque is on."""
     from sfms_robot.app.servo.servo_tools import write_register
 
-    confirm = _confirm(yes, ids)
+    confirm = confirmation(yes, ids)
 
     def change(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
         before, after = write_register(wire, seen, register, value, confirm)
@@ -122,7 +125,7 @@ def set_id(
     _each(
         str(old),
         on,
-        lambda wire, seen: [change(wire, seen, new, _confirm(yes), in_chain).row()],
+        lambda wire, seen: [change(wire, seen, new, confirmation(yes), in_chain).row()],
         "servos",
     )
 
@@ -138,7 +141,7 @@ def set_baud(
     """Give servos another rate, and check that they answer at it."""
     from sfms_robot.app.servo.servo_tools import set_baud as change
 
-    confirm = _confirm(yes, ids)
+    confirm = confirmation(yes, ids)
     _each(
         ids,
         on,
@@ -157,7 +160,7 @@ def reboot(
     """Start servos over: torque goes off, latched hardware errors go away."""
     from sfms_robot.app.servo.servo_tools import reboot as restart
 
-    confirm = _confirm(yes, ids)
+    confirm = confirmation(yes, ids)
     _each(
         ids,
         on,
@@ -180,7 +183,7 @@ def factory_reset(
     _each(
         str(servo),
         on,
-        lambda wire, seen: [reset(wire, seen, keep.value, _confirm(yes)).row()],
+        lambda wire, seen: [reset(wire, seen, keep.value, confirmation(yes)).row()],
         "servos",
     )
 
@@ -266,18 +269,3 @@ def _bar(text: str, hidden: bool) -> Any:
     from sfms_robot.cli.servo_tables import bar
 
     return bar(text, hidden)
-
-
-def _confirm(yes: bool, ids: str = "") -> Callable[[str], bool]:
-    """Ask once: a yes holds for the same change to the other servos of the command."""
-    alike = f" and the same for all of {ids}" if len(_parsed(ids or "0")) > 1 else ""
-    said: list[bool] = [True] if yes else []
-
-    def ask(question: str) -> bool:
-        if not said:
-            if not sys.stdin.isatty():
-                raise ConfigError(f"{question}: nobody is there to ask, say --yes")
-            said.append(typer.confirm(f"{question}{alike}. Do it?", err=True))
-        return said[0]
-
-    return ask
