@@ -6,13 +6,14 @@ import json as json_module
 import sys
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sfms_robot.cli import servo_maps
 from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
-from sfms_robot.errors import BusError
+from sfms_robot.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
     from sfms_robot.app.servo.servo_wire import Seen, Wire
@@ -108,6 +109,70 @@ def write(
                  "raw": row["raw"], "value": row["value"], "unit": row["unit"]}]  # fmt: skip
 
     _each(ids, on, change, "written")
+
+
+@app.command(context_settings={"ignore_unknown_options": True})
+@on_wire
+def move(
+    on: Wiring,
+    servo: Annotated[int, typer.Argument(metavar="ID")],
+    to: Annotated[str | None, typer.Option("--to", help="Ticks, or degrees of its shaft: 180deg.")] = None,
+    by: Annotated[str | None, typer.Option("--by", help="From where it stands: ticks, or -5deg.")] = None,
+) -> None:
+    """Move one servo slowly, and leave torque and profile as they were."""
+    from sfms_robot.app.servo.move import move as go
+
+    _each(str(servo), on, lambda wire, seen: [go(wire, seen, to, by)], "moved")
+
+
+@app.command()
+@on_wire
+def dump(
+    on: Wiring,
+    file: Annotated[Path, typer.Argument(help="Is written; must not be there yet.")],
+    ids: Annotated[str | None, typer.Option("--ids", help="1-9,12. Default: everybody.")] = None,
+) -> None:
+    """All registers of servos into a YAML file."""
+    from sfms_robot.app.servo.dump import dump as taken
+    from sfms_robot.app.servo.dump import save_dump
+    from sfms_robot.app.servo.servo_tools import scan as look
+
+    with on.open() as wire, _bar("reading", hidden=on.json) as progress:
+        servos = [wire.find(servo) for servo in _parsed(ids)] if ids is not None else look(wire, None, progress)
+        if not servos:
+            raise BusError(f"{wire.port.name}: nobody answers")
+        save_dump(taken(wire, servos), file)
+    _show([seen.row() for seen in servos], {"file": str(file), "servos": [seen.row() for seen in servos]}, on.json)
+
+
+@app.command()
+@on_wire
+def restore(
+    on: Wiring,
+    file: Annotated[Path, typer.Argument(help="As `servo dump` wrote it.")],
+    source: Annotated[
+        int | None, typer.Option("--from", help="Id in the file. Default: each servo of the file.")
+    ] = None,
+    into: Annotated[int | None, typer.Option("--into", help="Id on the wire, with --from. Default: the same.")] = None,
+    identity: Annotated[bool, typer.Option("--identity", help="Give it id and rate of the file as well.")] = False,
+    yes: YesOption = False,
+) -> None:
+    """Lasting settings (EEPROM) of a dumped servo into one of the same model. Shows the differences and asks."""
+    from sfms_robot.app.servo.dump import load_dump
+    from sfms_robot.app.servo.dump import restore as write_back
+
+    kept = {each.id: each for each in load_dump(file).servos}
+    if source is None and into is not None:
+        raise ConfigError("servo restore: --into needs --from, the id in the file")
+    if source is not None and source not in kept:
+        raise ConfigError.at(str(file), "--from", source, "is not in the file", kept)
+    pairs = {into if into is not None else servo: kept[servo] for servo in ([source] if source is not None else kept)}
+    confirm = confirmation(yes)
+    with on.open() as wire:
+        rows = [
+            row for servo, was in pairs.items() for row in write_back(wire, wire.find(servo), was, confirm, identity)
+        ]
+    _show(rows, {"written": rows}, on.json, None if rows else "nothing differs")
 
 
 @app.command("set-id")
