@@ -256,6 +256,60 @@ def test_an_offset_shifts_the_one_turn_that_there_is():
     assert rig.device.servo(1).state(rig.port.t)["position"] == 5000
 
 
+# --- more than one turn -----------------------------------------------------------------------------------------
+
+GEARED = {"ratio": 4.0, "limit_rad": 1.2}  # 2048 +- 3129 ticks
+
+
+@pytest.mark.parametrize("model", WITH_TURNS)
+def test_a_geared_joint_works_in_extended_position_control(model):
+    rig = Rig(model, **GEARED)
+    rig.startup.run()
+    assert rig.held("operating_mode") == 4 and rig.startup.wanted(0)["operating_mode"] == 4
+    rig.startup.switch_on(0)
+    servo, goal = rig.device.servo(1), rig.table["goal_position"]
+    assert servo.write(goal.address, goal.to_bytes(5000), rig.port.t) == 0
+    assert servo.state(rig.port.t + 60.0)["position"] == pytest.approx(5000, abs=2)
+
+
+@given(ticks=st.integers(-1081, 5177))
+def test_torque_comes_on_only_where_the_lost_count_of_turns_leaves_one_place(ticks):
+    """After power-up a servo reads its place within one turn: of all places it may be at, none other is in range."""
+    read = ticks % 4096
+    rig = Rig("xl330-m288", {"start_ticks": read}, **GEARED)
+    places = [read + turn * 4096 for turn in (-2, -1, 0, 1, 2)]
+    if [each for each in places if -1081 <= each <= 5177] == [read] == [ticks]:
+        rig.startup.run()
+        assert rig.startup.switch_on(0) == ticks
+    else:
+        with pytest.raises(ServoError, match="turns is lost.*by hand to where it will read 1082..3014"):
+            rig.startup.run()
+        assert not rig.device.servo(1).state(rig.port.t)["torque"]
+
+
+def test_a_geared_joint_that_kept_its_torque_kept_its_count():
+    rig = Rig("xl330-m288", **GEARED)
+    rig.startup.run()
+    rig.startup.switch_on(0)
+    servo, goal = rig.device.servo(1), rig.table["goal_position"]
+    servo.write(goal.address, goal.to_bytes(5000), rig.port.t)
+    servo.advance(60.0)
+    rig.port.t = 60.0
+    assert rig.startup.run() == {0: 0}
+    assert finish(rig.startup.bring_back(0, reboot=False)) == pytest.approx(5000, abs=2)
+
+
+def test_a_geared_joint_whose_supply_failed_far_out_stays_without_torque():
+    rig = Rig("xl330-m288", {"start_ticks": 2000}, **GEARED)
+    rig.startup.run()
+    servo = rig.device.servo(1)
+    servo.turn(5150, rig.port.t)
+    servo.reboot(rig.port.t)
+    rig.port.t += 1.0
+    with pytest.raises(ServoError, match="present_position is 1054.*count of turns"):
+        finish(rig.startup.bring_back(0, reboot=False))
+
+
 # --- settings ---------------------------------------------------------------------------------------------------
 
 
