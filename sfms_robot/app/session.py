@@ -106,7 +106,7 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
         hanging = np.array([joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)])
         ticks = int(_calibration({name: joint}).to_ticks(hanging)[0])
         baud = head.buses[joint.bus].baud
-        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=dict(joint.stored))
+        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
         by_bus.setdefault(joint.bus, []).append(servo)
     return by_bus
 
@@ -165,8 +165,7 @@ def _build_one(
     maps = _maps(joints)
     check_safety(head, joints, maps)
     servos = [
-        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key), dict(j.stored))
-        for key, j in joints.items()
+        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
     ]
     if config.family in BOARDS:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 ODD = ("roll", "yaw", "y")
 MOST_NODES = 2000
-NOT_SHARED = ("id", "note", "drive", "mirror_of", "mirror_sense", "stored")  # what a twin does not take over
+NOT_SHARED = ("id", "note", "drive", "mirror_of", "mirror_sense")  # what a twin does not take over
 
 
 def expanded(raw: Any) -> Any:

@@ -16,7 +16,6 @@ from sfms_robot.config.life import Life
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
 
 FaultPolicy = Literal["hold", "limp", "reduce", "reboot_and_ease_in"]
-STORED = ("homing_offset", "multi_turn_offset", "drive_mode")  # EEPROM registers that a joint's zero depends on
 MEASURED_FAULTS = ("input voltage", "overheating")  # those a threshold may be given for
 
 
@@ -65,6 +64,7 @@ class Safety(Model):
         strain: a pose that takes force for long heats the servo and makes it sing. Off by default.
         stop: at the end of a run, once at rest: torque off, or kept.
         registers: raw values written before torque comes on, such as gains.
+        stored: raw values that have to be stored in the servo; compared before torque comes on, never written.
     """
 
     current_limit_mA: Positive | None = None
@@ -74,6 +74,7 @@ class Safety(Model):
     strain: LoadRule | None = None
     stop: Literal["release", "hold"] = "release"
     registers: dict[Name, int] = Field(default_factory=dict)
+    stored: dict[Name, int] = Field(default_factory=dict)
 
     def merged(self, other: Safety | None) -> Safety:
         """This, and over it what `other` gives explicitly."""
@@ -117,9 +118,6 @@ class Joint(Model):
 
     With `mirror_of` the joint takes over whatever it does not give itself from its twin on the other side, with the
     drive (and for `mirror_sense: opposite` the range) turned round; `sign` then differs when the sense is the same.
-
-    `stored`: EEPROM registers of the servo, raw, that zero and direction were written for, such as its homing offset;
-    a servo that holds others is refused before its torque comes on.
     """
 
     bus: Name
@@ -138,7 +136,6 @@ class Joint(Model):
     mirror_of: Name | None = None
     mirror_sense: Literal["same", "opposite"] = "same"
     safety: Safety | None = None  # over that of the head
-    stored: dict[Name, int] = Field(default_factory=dict)
     note: str = ""
 
     @model_validator(mode="after")
@@ -149,9 +146,6 @@ class Joint(Model):
             raise ValueError(f"rest_deg {self.rest_deg:g} is outside {self.min_deg:g}..{self.max_deg:g}")
         if self.mirror_of is not None and self.drive is not None:
             raise ValueError(f"has a drive and is mirror_of {self.mirror_of!r}: one of them")
-        for name in self.stored:
-            if name not in STORED:
-                raise ValueError(f"stored.{name} does not move or turn the joint's angles ({', '.join(STORED)})")
         return self
 
     @property

@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 from sfms_robot.config.base import Model, Name, find, load
 from sfms_robot.config.drives import problems
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Head, Joint
+from sfms_robot.config.head import Head, Joint, Safety
 from sfms_robot.config.mapping import Expression
 from sfms_robot.errors import ConfigError
 
@@ -218,5 +218,7 @@ def calibrated(joint: Joint, found: Measured) -> Joint:
     low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
     ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
     known = {"homing_offset": found.homing_offset, "drive_mode": found.drive_mode}
-    stored = {**joint.stored, **{name: value for name, value in known.items() if value is not None}}
-    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, "stored": stored, **ends})
+    safety = joint.safety or Safety()
+    stored = {**safety.stored, **{name: value for name, value in known.items() if value is not None}}
+    safety = safety.model_copy(update={"stored": stored})
+    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, "safety": safety, **ends})

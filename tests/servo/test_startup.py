@@ -43,7 +43,7 @@ class Rig:
         self.device = device_of(self.table, *rows)
         self.port = LossyPort(self.device)
         servos = [
-            BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety or Safety(), stored or {})
+            BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety or Safety(stored=stored or {}))
             for i in wanted or range(1, 1 + max(1, len(rows)))
         ]
         kind = Dynamixel2Startup if self.table.protocol == 2 else Protocol1Startup

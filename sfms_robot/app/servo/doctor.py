@@ -180,7 +180,7 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
     for name, low, high in zip(joints, ranges.low_ticks, ranges.high_ticks, strict=True):
         joint = joints[name]
         bounded = head.safety_of(name).current_limit_mA is not None
-        needs = JointNeeds(int(low), int(high), joint.stored, ids - {joint.id}, bounded)
+        needs = JointNeeds(int(low), int(high), head.safety_of(name).stored, ids - {joint.id}, bounded)
         found[joint.id] = Wanted(name, joint.model, maps[joint.model].model_number, masked, thresholds, needs)
     return found
 
