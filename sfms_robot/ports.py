@@ -56,11 +56,8 @@ class PlanFeed(Protocol):
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Plans that became visible by `now_s`, oldest first. Never blocks."""
 
-    def step_times_ms(self) -> Sequence[float]:
-        """Duration of every listener step so far; empty in virtual time."""
-
-    def unheard(self) -> int:
-        """Frames left out so far because the listener could not keep up."""
+    def statistics(self) -> Mapping[str, Any]:
+        """`state` in words, `restarts`, `skipped_frames` (the listener could not keep up), `step_ms` p50 and p99."""
 
     def close(self) -> None: ...
 

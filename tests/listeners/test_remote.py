@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
-from sfms_robot.listeners.remote import MOST_WAITING, Inbox, listen
+from sfms_robot.listeners.process import MOST_WAITING, Inbox, listen
 
 
 def frames(count):

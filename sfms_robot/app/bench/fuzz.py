@@ -117,7 +117,7 @@ class NoisyPort:
 def fuzz_one(family: str, count: int = BYTES, seed: int = 0) -> Fuzzed:
     """`count` bytes at the bus of one family, and then calm."""
     head, clock = head_of(family), VirtualClock()
-    with launch(heads.emulated(head)["main"], virtual=True) as chain:
+    with launch(wiring.emulated(head)["main"], virtual=True) as chain:
         noise = Noise(random.Random(seed))
         rig = Rig(head, chain, clock, _bus(head, chain, clock, noise))
         try:
