@@ -114,16 +114,8 @@ class RunLog:
     def planned(self, plan: Plan) -> None:
         self._waiting.append(plan)
 
-    def wrote(
-        self,
-        tick: TickTime,
-        wire_s: float,
-        reach_s: float,
-        goals_rad: Doubles,
-        asked_rad: Doubles,
-        motion: Floats,
-    ) -> None:
-        """The tick is on the wire at `wire_s`; it played the timeline up to `reach_s`."""
+    def commanded(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles, motion: Floats) -> None:
+        """What the limiter gave for this tick, sent or not: `goals_rad` (J,) of `asked_rad` (J,), for a face (58,)."""
         self.listened_s = tick.time_s
         self._tick(tick, goals_rad, asked_rad)
         for name, value in (
@@ -131,6 +123,9 @@ class RunLog:
         ):  # fmt: skip
             if name in self._counters:
                 self._counters[name].add(float(value))
+
+    def wrote(self, wire_s: float, reach_s: float) -> None:
+        """The command is on the wire at `wire_s`; it played the timeline up to `reach_s`."""
         while self._waiting and self._waiting[0].times_s[0] <= reach_s:
             made_at_s = self._waiting.popleft().made_at_s
             self.frame_to_wire_ms.add(max(0.0, wire_s - made_at_s) * 1e3)

@@ -100,10 +100,9 @@ def drive(
                     break
                 state = _heard(parts, observers, log, tick.time_s, state)
                 state, command = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
+                log.commanded(tick, command.goals_rad, command.asked_rad, command.motion)
                 parts.bus.write(command.goals_rad, tick.time_s)
-                log.wrote(
-                    tick, clock.now_s() - start_s, command.reach_s, command.goals_rad, command.asked_rad, command.motion
-                )
+                log.wrote(clock.now_s() - start_s, command.reach_s)
                 readings = parts.bus.poll(tick.time_s)
                 state = _rejoined(parts, log, readings, state, tick.time_s)
                 observers.tick(Tick(tick.time_s, command.motion, command.goals_rad, readings))

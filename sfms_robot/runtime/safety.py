@@ -54,8 +54,8 @@ def come_to_rest(
         arrived = False
         try:
             goals_rad, state = limiter.step(reference, state)
-            bus.write(goals_rad, tick.time_s)
             log.ease(tick, goals_rad, reference[0])
+            bus.write(goals_rad, tick.time_s)
             bus.poll(tick.time_s)
             arrived, failed = bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD)), 0
         except Exception as error:  # whatever it is, the other buses are still to be eased
