@@ -216,8 +216,8 @@ class HobbyBus(WireBus[SlowWire]):
         Raises ValueError, with nothing sent, before `enable`, for a goal that is not finite, or one out of range.
         While the port is gone nothing is sent and nothing is raised.
         """
-        self._check(goals_rad, bool(self._enabled))
-        self._ticks = self._conversion.to_ticks(goals_rad)
+        self._check(bool(self._enabled))
+        self._ticks = self._goals.ticks(goals_rad, np.array(self._enabled, np.intp))
         self._pending = True
         try:
             self._counts["deferred"] += not self._flush()
