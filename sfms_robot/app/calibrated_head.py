@@ -17,7 +17,8 @@ from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort, stable_name
+from sfms_robot.servo.discovery import stable_name
+from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
 from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)

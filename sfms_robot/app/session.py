@@ -24,8 +24,11 @@ from sfms_robot.motion.timeline import PlanTimeline
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.retarget.head import HeadRetargeter
 from sfms_robot.servo.composite import CompositeBus
+from sfms_robot.servo.discovery import list_ports, stable_name
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort, stable_name
+from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.port_choice import AUTO, choose_ports, parse_ports
+from sfms_robot.servo.serial_io import Rs485
 
 SIM = "sim"
 SIM_READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
@@ -132,15 +135,8 @@ def on_boards(head: Head) -> list[str]:
 
 
 def devices(head: Head, port: str) -> dict[str, str]:
-    """`--port DEVICE` or `NAME=DEVICE[,NAME=DEVICE]` -> device per named bus. Raises ConfigError."""
-    names = list(head.buses)
-    parts = dict(part.split("=", 1) for part in port.split(",") if "=" in part)
-    if not parts and len(names) == 1:
-        return {names[0]: port}
-    if set(parts) != set(names):
-        wanted = ",".join(f"{name}=DEVICE" for name in names)
-        raise ConfigError(f"--port {port!r}: head {head.name!r} needs one device per bus (sim, {wanted})")
-    return parts
+    """What `--port` says -> device per named bus. Raises ConfigError, and PortError for `auto` without an adapter."""
+    return choose_ports(head.buses, list_ports()) if port == AUTO else parse_ports(head.buses, port)
 
 
 def build_bus(head: Head, opened: Opened, clock: Clock, confirmed: bool = False) -> Bus:
@@ -177,7 +173,7 @@ def _build_one(
         name,
         servos,
         _calibration(joints),
-        _port(where, config.baud, clock),
+        _port(where, config.baud, clock, config.rs485),
         config.baud,
         deadline_s,
         config=config,
@@ -186,9 +182,9 @@ def _build_one(
     return bus
 
 
-def _port(where: Chain | str, baud: int, clock: Clock) -> Callable[[], Port]:
+def _port(where: Chain | str, baud: int, clock: Clock, rs485: Rs485 | None) -> Callable[[], Port]:
     if isinstance(where, str):
-        return partial(SerialPort, stable_name(where), baud, clock)
+        return partial(SerialPort, stable_name(where), baud, clock, rs485)
     if where.virtual:
         return partial(VirtualTimePort, where.device, where.control, baud, clock)
     return partial(SerialPort, where.device, baud, clock)
