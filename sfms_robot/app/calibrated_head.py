@@ -70,7 +70,7 @@ def identify(
         if bus.family in BOARDS:
             servos |= {j: Identity(id=head.joints[j].id, model=head.joints[j].model) for j in mine}
         elif mine:
-            port = port_of(where[name], bus.baud, clock)()
+            port = port_of(where[name], bus, clock)()
             try:
                 for joint in mine:
                     servos[joint] = _identity(port, _WIRE_FAMILY[bus.family], bus.baud, head.joints[joint], clock)

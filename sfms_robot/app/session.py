@@ -239,7 +239,7 @@ def _build_one(
         name,
         servos,
         calibration_of(joints),
-        port_of(where, config.baud, clock),
+        port_of(where, config, clock),
         config.baud,
         deadline_s,
         config=config,

@@ -9,13 +9,16 @@ from typing import Final
 
 import numpy as np
 
+from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map
 from sfms_robot.config.emulate import load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort, stable_name
+from sfms_robot.servo.discovery import list_ports, stable_name
+from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.port_choice import AUTO, choose_ports, parse_ports
 
 SIM: Final = "sim"
 HANGING: Final = 0.3  # where an emulated joint stands at power-up: this share of the way from rest to its lower end
@@ -24,24 +27,17 @@ Opened = Mapping[str, Chain | str]  # per named bus: an emulated chain, or a ser
 
 
 def devices(head: Head, port: str) -> dict[str, str]:
-    """`--port DEVICE` or `NAME=DEVICE[,NAME=DEVICE]` -> device per named bus. Raises ConfigError."""
-    names = list(head.buses)
-    parts = dict(part.split("=", 1) for part in port.split(",") if "=" in part)
-    if not parts and len(names) == 1:
-        return {names[0]: port}
-    if set(parts) != set(names):
-        wanted = ",".join(f"{name}=DEVICE" for name in names)
-        raise ConfigError(f"--port {port!r}: head {head.name!r} needs one device per bus (sim, {wanted})")
-    return parts
+    """What `--port` says -> device per named bus. Raises ConfigError, and PortError for `auto` without an adapter."""
+    return choose_ports(head.buses, list_ports()) if port == AUTO else parse_ports(head.buses, port)
 
 
-def port_of(where: Chain | str, baud: int, clock: Clock) -> Callable[[], Port]:
+def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Port]:
     """Opens the port of a bus, also again after its device was unplugged. Raises PortError."""
     if isinstance(where, str):
-        return partial(SerialPort, stable_name(where), baud, clock)
+        return partial(SerialPort, stable_name(where), bus.baud, clock, bus.rs485)
     if where.virtual:
-        return partial(VirtualTimePort, where.device, where.control, baud, clock)
-    return partial(SerialPort, where.device, baud, clock)
+        return partial(VirtualTimePort, where.device, where.control, bus.baud, clock)
+    return partial(SerialPort, where.device, bus.baud, clock)
 
 
 def firmware_maps(joints: dict[str, Joint]) -> dict[str, FirmwareMap]:
