@@ -16,8 +16,8 @@ from typing import Final
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import TickConversion
-from sfms_robot.servo.boards.board import Ask, Health, pulses_beyond
-from sfms_robot.servo.boards.pulse_bus import HobbyBus
+from sfms_robot.servo.boards.board_protocol import Ask, Health, pulses_beyond
+from sfms_robot.servo.boards.pulse_bus import PulseBus
 from sfms_robot.servo.codecs import maestro
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -30,7 +30,7 @@ _MICRO: Final = 6  # channels of the one board without "set multiple targets"
 
 
 class _Maestro:
-    """`hobby.Dialect` of a Maestro."""
+    """`hobby.BoardProtocol` of a Maestro."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -77,8 +77,8 @@ def _runs(channels: Sequence[int]) -> list[list[int]]:
     return runs
 
 
-class MaestroBus(HobbyBus):
-    """One Maestro with the compact protocol, as `ports.Bus`; see `hobby.HobbyBus` for what is true of it."""
+class MaestroBus(PulseBus):
+    """One Maestro with the compact protocol, as `ports.Bus`; see `hobby.PulseBus` for what is true of it."""
 
     def __init__(
         self,

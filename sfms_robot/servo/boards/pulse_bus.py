@@ -27,8 +27,8 @@ from sfms_robot.config import Bus as BusConfig
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import StopPolicy, TickConversion
-from sfms_robot.servo.boards.board import Dialect, Health, board_of, pulses_beyond
-from sfms_robot.servo.boards.rate_limit import SlowWire
+from sfms_robot.servo.boards.board_protocol import BoardProtocol, Health, board_of, pulses_beyond
+from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -46,7 +46,7 @@ _NO_ANSWER: Final = "no answer"
 _TORQUE_LOST: Final = "torque lost"
 
 
-class HobbyBus(WireBus[SlowWire]):
+class PulseBus(WireBus[RateLimitedPort]):
     """One board, as `ports.Bus`.
 
     Args:
@@ -71,7 +71,7 @@ class HobbyBus(WireBus[SlowWire]):
         baud: int,
         read_deadline_s: float,
         *,
-        dialect: Dialect,
+        dialect: BoardProtocol,
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
         config: BusConfig | None = None,
@@ -129,16 +129,16 @@ class HobbyBus(WireBus[SlowWire]):
         self._forget_silence()
         self._link = wire
 
-    def _open(self) -> SlowWire:
-        return SlowWire(self._open_port(), self._baud, self._read_deadline_s)
+    def _open(self) -> RateLimitedPort:
+        return RateLimitedPort(self._open_port(), self._baud, self._read_deadline_s)
 
-    def _absent(self, wire: SlowWire) -> BusError:
+    def _absent(self, wire: RateLimitedPort) -> BusError:
         return BusError(f"bus {self.name!r} on {wire.port.name} at {self._baud} baud: no {self.model} answers")
 
-    def _there(self, wire: SlowWire) -> bool:
+    def _there(self, wire: RateLimitedPort) -> bool:
         return any(self._found(wire, lost) for _ in range(_TRIES) for lost in (False, True))
 
-    def _found(self, wire: SlowWire, lost: bool) -> bool:
+    def _found(self, wire: RateLimitedPort, lost: bool) -> bool:
         answer = wire.ask(self._dialect.question(lost), self._dialect.answer_length)
         return answer is not None and self._dialect.health(answer) is not None
 
@@ -228,7 +228,7 @@ class HobbyBus(WireBus[SlowWire]):
         """No positions; faults of the board."""
         return {joint: Reading(None, float("inf"), self._faults.get(index)) for index, joint in enumerate(self.joints)}
 
-    def _ask(self, wire: SlowWire, now_s: float) -> bool:
+    def _ask(self, wire: RateLimitedPort, now_s: float) -> bool:
         """Ask for faults once a second when the wire is free; whether there was an answer to that."""
         heard = False
         if self._ask_at_s is None:
@@ -272,7 +272,7 @@ class HobbyBus(WireBus[SlowWire]):
         self._counts["writes"] += 1
         return True
 
-    def _send(self, wire: SlowWire, ticks: Mapping[int, int]) -> None:
+    def _send(self, wire: RateLimitedPort, ticks: Mapping[int, int]) -> None:
         interval_s = max(wire.port.now_s(), wire.busy_until_s) - self._sent_at_s if self._sent else 0.0
         self._sent_at_s = wire.send(self._dialect.goals(ticks, interval_s))
         self._sent.update(ticks)
@@ -283,7 +283,7 @@ class HobbyBus(WireBus[SlowWire]):
         self._unanswered = _SILENT_AFTER
         self._blame(range(len(self.joints)), _NO_ANSWER)
 
-    def _returned(self, wire: SlowWire, now_s: float) -> None:
+    def _returned(self, wire: RateLimitedPort, now_s: float) -> None:
         self._ask_at_s = now_s  # the board is asked before it gets any goal
 
     # --- the board ----------------------------------------------------------------------------------------------
@@ -292,7 +292,7 @@ class HobbyBus(WireBus[SlowWire]):
     def _silent(self) -> bool:
         return self._unanswered >= _SILENT_AFTER
 
-    def _judge(self, wire: SlowWire, answer: bytes, now_s: float) -> bool:
+    def _judge(self, wire: RateLimitedPort, answer: bytes, now_s: float) -> bool:
         """Take an answer to the question how it is, empty when there was none; whether it is one."""
         health = self._dialect.health(answer) if answer else None
         if health is not None:
@@ -305,7 +305,7 @@ class HobbyBus(WireBus[SlowWire]):
             self._blame(range(len(self.joints)), _NO_ANSWER)
         return False
 
-    def _answered(self, wire: SlowWire, health: Health, now_s: float) -> None:
+    def _answered(self, wire: RateLimitedPort, health: Health, now_s: float) -> None:
         lost, self._unanswered = self._silent, 0
         self._faults = {index: text for index, text in self._faults.items() if text == _TORQUE_LOST}
         if lost:
@@ -318,7 +318,7 @@ class HobbyBus(WireBus[SlowWire]):
             self._counts["errors"] += not health.lasting
             self._blame(range(len(self.joints)), health.faults, shown=health.lasting)
 
-    def _resume(self, wire: SlowWire, now_s: float) -> None:
+    def _resume(self, wire: RateLimitedPort, now_s: float) -> None:
         """After a silence: channels that the board has switched off meanwhile come on one at a time, if it tells."""
         self._sent = {}
         lit = self._dialect.pulses(wire.ask, self._channels)

@@ -11,7 +11,7 @@ from sfms_robot.servo.port import Port
 _CHUNK = 4096
 
 
-class SlowWire:
+class RateLimitedPort:
     """One open port; the wire owns it.
 
     Args:

@@ -12,8 +12,8 @@ from typing import Final
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import TickConversion
-from sfms_robot.servo.boards.board import Ask, Health
-from sfms_robot.servo.boards.pulse_bus import HobbyBus
+from sfms_robot.servo.boards.board_protocol import Ask, Health
+from sfms_robot.servo.boards.pulse_bus import PulseBus
 from sfms_robot.servo.codecs import ssc32
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -24,7 +24,7 @@ _LONGEST_LINE_S: Final = 0.5
 
 
 class _Ssc32:
-    """`hobby.Dialect` of an SSC-32, which has no error word: it answers, or it does not."""
+    """`hobby.BoardProtocol` of an SSC-32, which has no error word: it answers, or it does not."""
 
     answer_length = 1
 
@@ -47,8 +47,8 @@ class _Ssc32:
         return ssc32.outputs_low(channels)
 
 
-class Ssc32Bus(HobbyBus):
-    """One SSC-32, as `ports.Bus`; see `hobby.HobbyBus` for what is true of it."""
+class Ssc32Bus(PulseBus):
+    """One SSC-32, as `ports.Bus`; see `hobby.PulseBus` for what is true of it."""
 
     def __init__(
         self,

@@ -24,7 +24,7 @@ class Health(NamedTuple):
     went_home: bool = False  # it has switched its channels off, or to wherever its home is
 
 
-class Dialect(Protocol):
+class BoardProtocol(Protocol):
     """How one kind of board is spoken to. Pure but for `pulses`, which is handed the wire."""
 
     @property

@@ -7,7 +7,7 @@ import pytest
 from device_port import DevicePort, Time
 
 from sfms_robot.config import Safety, load_firmware_map
-from sfms_robot.emulator.boards import MaestroBoard, Ssc32Board
+from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.servo.boards.maestro_bus import MaestroBus
 from sfms_robot.servo.boards.ssc32_bus import Ssc32Bus

@@ -1,6 +1,6 @@
 from device_port import DevicePort, Time
 
-from sfms_robot.servo.boards.rate_limit import SlowWire
+from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 
 
 class Echo:
@@ -17,7 +17,7 @@ class Echo:
 def wire_of(device, baud=9600, patience_s=0.02):
     clock = Time()
     port = DevicePort(device, baud, clock)
-    return SlowWire(port, baud, patience_s), port, clock
+    return RateLimitedPort(port, baud, patience_s), port, clock
 
 
 def test_wire_is_busy_until_its_bytes_have_left():
