@@ -1,4 +1,4 @@
-"""Whatever is raised, wherever, at whichever tick: the head comes to rest and torque goes off. Looked at on the wire."""
+"""Whatever is raised, wherever, at whichever tick: the head comes to rest and torque goes off, seen on the wire."""
 
 from collections.abc import Iterator
 from typing import Any

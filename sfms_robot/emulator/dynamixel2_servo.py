@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from itertools import groupby
 from typing import Any, Final
 
-from sfms_robot.emulator.drive import POSITION, TORQUE_ON_BY_GOAL, Gearing, drive_of
-from sfms_robot.emulator.live import LiveBlock
-from sfms_robot.emulator.memory import Memory
-from sfms_robot.emulator.plant import Drive, Plant
+from sfms_robot.emulator.operating_modes import POSITION, TORQUE_ON_BY_GOAL, TickFrames, motor_command
+from sfms_robot.emulator.plant import MotorCommand, Plant
+from sfms_robot.emulator.present_values import PresentValues
+from sfms_robot.emulator.register_file import RegisterFile
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Field, Table
 
@@ -29,7 +29,7 @@ _TURNS_CLEARED: Final = b"\x01\x44\x58\x4c\x22"  # parameters of `clear`
 FAULT_BITS: Final = {"voltage": 0, "overheating": 2, "overload": 5}  # of the X series; others say it in the map
 
 
-class Servo:
+class Dynamixel2Servo:
     """A servo that answers instructions. All times are seconds of the chain's clock.
 
     Attributes:
@@ -52,15 +52,15 @@ class Servo:
         self.fault_status = 0
         self.firmware = firmware
         self.supply_v = _usual_supply(table) if supply_v is None else supply_v
-        self._memory = Memory(table)
+        self._memory = RegisterFile(table)
         self._get, self._put = self._memory.get, self._memory.put
         self._registered = b""
         self._heard_at_s = 0.0
         self._deaf_until_s = 0.0
         self._powered = True
         self._tripped = False
-        self._drive: Drive | None = None
-        self._live = LiveBlock(table)
+        self._drive: MotorCommand | None = None
+        self._live = PresentValues(table)
         self._bits = _fault_bits(table)
         self._reset(keep={}, areas=(True, False))
         self._put("id", servo_id)
@@ -68,7 +68,7 @@ class Servo:
         for name, value in (registers or {}).items():
             self._put(name, value)
         self.plant = Plant(0.0)
-        self.plant.position = self.plant.reference = Gearing(self._memory).shaft(float(start_ticks))
+        self.plant.position = self.plant.reference = TickFrames(self._memory).shaft(float(start_ticks))
         self._put("goal_position", table.center_ticks)
         self._settings()
         self._watch_supply()
@@ -279,7 +279,7 @@ class Servo:
 
     def _written(self, names: set[str]) -> None:
         if "operating_mode" in names:
-            self._gearing = Gearing(self._memory)
+            self._gearing = TickFrames(self._memory)
             for name in ("profile_velocity", "profile_acceleration", "goal_velocity", "goal_pwm", "goal_current"):
                 self._put(name, 0)
             self._put("goal_position", round(self._gearing.told(self.plant.position)))
@@ -302,7 +302,7 @@ class Servo:
         self.return_delay_s: float = get("return_delay_time") * _DELAY_TICK_S
         self.torque: int = get("torque_enable")
         self.watchdog: int = get("bus_watchdog")
-        self._gearing = Gearing(self._memory)
+        self._gearing = TickFrames(self._memory)
         self.mode: int = self._gearing.mode
         self._by_time = bool(get("drive_mode") & 0x04)
         ends = [get(name) for name in ("min_position_limit", "cw_angle_limit") if name in self.table.fields]
@@ -312,7 +312,7 @@ class Servo:
         self._hottest_c: float = float(get("temperature_limit", 255))
         self._drive = None
         if self.torque:
-            self._drive = drive_of(self._memory, self._gearing, self.plant.reference, self.table.top_speed_ticks_s)
+            self._drive = motor_command(self._memory, self._gearing, self.plant.reference, self.table.top_speed_ticks_s)
 
     def _live_values(self, now_s: float) -> tuple[int, ...]:
         plant, table, sign = self.plant, self.table, self._gearing.sign

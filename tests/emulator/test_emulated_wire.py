@@ -3,11 +3,11 @@
 import pytest
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.chain import ServoChain
+from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
+from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
-from sfms_robot.emulator.protocol1 import Frame1Device
-from sfms_robot.emulator.servo import Servo
-from sfms_robot.emulator.wire import Wire
+from sfms_robot.emulator.protocol1_chain import Protocol1Chain
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs import protocol1 as frame1
@@ -19,9 +19,9 @@ TABLE = Table.of(load_firmware_map("xl330-m288"))
 POSITIONS = (132).to_bytes(2, "little") + (4).to_bytes(2, "little")
 
 
-def wire_of(*ids: int, timing="instant", faults=(), seed=0) -> Wire:
-    servos = [Servo(i, TABLE, BAUD, 2000 + i, 53, {"return_delay_time": 50}) for i in ids]
-    return Wire([ServoChain(servos)], timing, [parse_fault(text) for text in faults], seed)
+def wire_of(*ids: int, timing="instant", faults=(), seed=0) -> EmulatedWire:
+    servos = [Dynamixel2Servo(i, TABLE, BAUD, 2000 + i, 53, {"return_delay_time": 50}) for i in ids]
+    return EmulatedWire([Dynamixel2Chain(servos)], timing, [parse_fault(text) for text in faults], seed)
 
 
 def sync_read(*ids: int) -> bytes:
@@ -136,8 +136,8 @@ def test_unplugged_wire_hears_nothing_but_counts():
 def test_two_protocols_share_one_wire():
     table = Table.of(load_firmware_map("ax-12a"))
     row = {"id": 20, "model": "ax-12a", "baud": BAUD, "start_ticks": 512, "firmware": 24}
-    old = Frame1Device.from_rows([row], {"ax-12a": table})
-    wire = Wire([ServoChain([Servo(1, TABLE, BAUD, 2001, 53)]), old])
+    old = Protocol1Chain.from_rows([row], {"ax-12a": table})
+    wire = EmulatedWire([Dynamixel2Chain([Dynamixel2Servo(1, TABLE, BAUD, 2001, 53)]), old])
     for _ in range(3):
         wire.receive(encode_instruction(1, dxl2.PING), BAUD, 0.0)
         assert ids_in(wire.take(0.0)) == [1]

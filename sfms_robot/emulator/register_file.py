@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from sfms_robot.servo.registers import Field, Table
 
 
-class Memory:
+class RegisterFile:
     """Values by register name; raw bytes by address. Reading an absent register gives its default."""
 
     def __init__(self, table: Table) -> None:

@@ -18,7 +18,7 @@ _CODES: Final = {(1, "no"): "B", (2, "no"): "H", (4, "no"): "I",
                  (1, "twos_complement"): "b", (2, "twos_complement"): "h", (4, "twos_complement"): "i"}  # fmt: skip
 
 
-class LiveBlock:
+class PresentValues:
     """Where the live registers of a model lie. Every X-series table holds them in one block: one struct fills it."""
 
     def __init__(self, table: Table) -> None:

@@ -34,7 +34,7 @@ class Out(NamedTuple):
     late: bool
 
 
-class Wire:
+class EmulatedWire:
     """Devices, faults and the line between. Times are seconds of the emulator's clock.
 
     Attributes:

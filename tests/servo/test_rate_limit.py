@@ -1,6 +1,6 @@
 from device_port import DevicePort, Time
 
-from sfms_robot.servo.boards.rate_limit import SlowWire
+from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 
 
 class Echo:
@@ -17,7 +17,7 @@ class Echo:
 def wire_of(device, baud=9600, patience_s=0.02):
     clock = Time()
     port = DevicePort(device, baud, clock)
-    return SlowWire(port, baud, patience_s), port, clock
+    return RateLimitedPort(port, baud, patience_s), port, clock
 
 
 def test_wire_is_busy_until_its_bytes_have_left():
@@ -33,26 +33,26 @@ def test_wire_is_busy_until_its_bytes_have_left():
 
 def test_answer_is_taken_when_it_is_whole_and_nobody_waits_for_it():
     wire, port, clock = wire_of(Echo())
-    wire.question(b"?", 2)
-    assert wire.listening and wire.heard() is None
+    wire.request(b"?", 2)
+    assert wire.awaiting and wire.answer() is None
     port.inbox += b"a"
-    assert wire.heard() is None
+    assert wire.answer() is None
     port.inbox += b"b"
-    assert wire.heard() == b"ab" and not wire.listening
+    assert wire.answer() == b"ab" and not wire.awaiting
     assert all(deadline_s == clock.t for deadline_s in port.waits)
 
 
 def test_answer_that_is_late_or_too_long_is_none():
     wire, port, clock = wire_of(Echo())
-    wire.question(b"?", 2)
+    wire.request(b"?", 2)
     clock.t = 1.0
-    assert wire.heard() == b""
-    wire.question(b"?", 2)
+    assert wire.answer() == b""
+    wire.request(b"?", 2)
     port.inbox += b"abc"
-    assert wire.heard() == b""
+    assert wire.answer() == b""
 
 
 def test_what_was_there_before_the_question_is_no_answer():
     wire, port, _ = wire_of(Echo())
     port.inbox += b"ab"
-    assert wire.ask(b"?", 2) is None
+    assert wire.exchange(b"?", 2) is None

@@ -14,7 +14,7 @@ _TERMIOS2: Final = struct.Struct("=4IB19s2I")
 _OUTPUT_RATE: Final = -1
 
 
-class Terminal:
+class PseudoTerminal:
     """An open pty. `link` is a symbolic link to it, replaced when it is opened and removed when it is closed."""
 
     def __init__(self, link: str) -> None:

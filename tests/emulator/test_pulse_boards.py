@@ -3,7 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.boards import MaestroBoard, Ssc32Board
+from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.codecs.ssc32 import Move
 from sfms_robot.servo.registers import Table

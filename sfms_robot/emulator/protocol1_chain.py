@@ -10,19 +10,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from sfms_robot.emulator.protocol1_servo import Frame1Servo
-from sfms_robot.servo.codecs import dxl1, feetech
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.emulator.protocol1_servo import Protocol1Servo
+from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
 from sfms_robot.servo.registers import Table
 
 _GAP_S: Final = 0.05  # an unfinished frame older than this is forgotten
 
 
-class Frame1Device:
+class Protocol1Chain:
     """All servos of one wire that speak this frame."""
 
-    def __init__(self, servos: Sequence[Frame1Servo], chain_break: bool = True) -> None:
+    def __init__(self, servos: Sequence[Protocol1Servo], chain_break: bool = True) -> None:
         self.servos = list(servos)
         self.chain_break = chain_break
         self._buffer = bytearray()
@@ -31,10 +30,10 @@ class Frame1Device:
     @classmethod
     def from_rows(
         cls, rows: Sequence[Mapping[str, Any]], tables: Mapping[str, Table], chain_break: bool = True
-    ) -> Frame1Device:
+    ) -> Protocol1Chain:
         """From plain rows (see `launch.EmulatedServo`) and the models' tables."""
         servos = [
-            Frame1Servo(
+            Protocol1Servo(
                 row["id"],
                 tables[row["model"]],
                 row["baud"],
@@ -47,7 +46,7 @@ class Frame1Device:
         ]
         return cls(servos, chain_break)
 
-    def servo(self, servo_id: int) -> Frame1Servo | None:
+    def servo(self, servo_id: int) -> Protocol1Servo | None:
         return next((servo for servo in self.servos if servo.id == servo_id), None)
 
     def kill(self, servo_id: int) -> None:
@@ -80,16 +79,16 @@ class Frame1Device:
             out += self._answers(frame, listening, now_s)
         return out
 
-    def _named(self, servo_id: int) -> Frame1Servo:
+    def _named(self, servo_id: int) -> Protocol1Servo:
         servo = self.servo(servo_id)
         if servo is None:
             raise KeyError(f"no servo with id {servo_id} on this wire")
         return servo
 
-    def _answers(self, frame: Frame, listening: Sequence[Frame1Servo], now_s: float) -> Iterator[bytes]:
+    def _answers(self, frame: Frame, listening: Sequence[Protocol1Servo], now_s: float) -> Iterator[bytes]:
         code, params = frame.code, frame.params
         try:
-            if code == frame1.SYNC_WRITE:
+            if code == protocol1.SYNC_WRITE:
                 address, parts = dxl1.sync_write_parts(params)
                 for servo_id, data in parts:
                     for servo in _of(listening, servo_id):
@@ -108,7 +107,7 @@ class Frame1Device:
             elif frame.servo == BROADCAST:
                 for servo in sorted(listening, key=lambda servo: servo.id):
                     answer = _single(servo, code, params, now_s)
-                    if code == frame1.PING and servo.table.family == "feetech" and answer is not None:
+                    if code == protocol1.PING and servo.table.family == "feetech" and answer is not None:
                         yield answer
             else:
                 for servo in list(_of(listening, frame.servo)):
@@ -119,7 +118,7 @@ class Frame1Device:
             return  # parameters are missing: no servo knows what was meant
 
     def _group(
-        self, requests: Sequence[tuple[int, int, int]], readers: Sequence[Frame1Servo], now_s: float
+        self, requests: Sequence[tuple[int, int, int]], readers: Sequence[Protocol1Servo], now_s: float
     ) -> Iterator[bytes]:
         for servo_id, address, length in requests:
             servo = next(_of(readers, servo_id), None)
@@ -129,29 +128,29 @@ class Frame1Device:
                 return
 
 
-def _of(servos: Sequence[Frame1Servo], servo_id: int) -> Iterator[Frame1Servo]:
+def _of(servos: Sequence[Protocol1Servo], servo_id: int) -> Iterator[Protocol1Servo]:
     """All with this id: two that share one both answer."""
     return (servo for servo in servos if servo.id == servo_id)
 
 
-def _single(servo: Frame1Servo, code: int, params: bytes, now_s: float) -> bytes | None:
+def _single(servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> bytes | None:
     """What one servo answers to an instruction of its own, or None."""
     is_feetech = servo.table.family == "feetech"
     asked = servo.id  # it answers under this one also when the request changes it
     error, data, answers = 0, b"", servo.answers_writes
-    if code == frame1.PING:
+    if code == protocol1.PING:
         answers = True
         servo.advance(now_s)
-    elif code == frame1.READ:
+    elif code == protocol1.READ:
         (error, data), answers = servo.read(params[0], params[1], now_s), servo.answers_reads
         answers = answers and not (is_feetech and not data)
-    elif code == frame1.WRITE:
+    elif code == protocol1.WRITE:
         error = servo.write(params[0], params[1:], now_s)
-    elif code == frame1.REG_WRITE:
+    elif code == protocol1.REG_WRITE:
         error = servo.register(params[0], params[1:])
-    elif code == frame1.ACTION:
+    elif code == protocol1.ACTION:
         error = servo.action(now_s)
-    elif code == frame1.FACTORY_RESET:
+    elif code == protocol1.FACTORY_RESET:
         servo.factory_reset(now_s)
     elif code == feetech.CALIBRATE_OFFSET and servo.is_sync_reader:
         torque = servo.table["torque_enable"]
@@ -161,5 +160,5 @@ def _single(servo: Frame1Servo, code: int, params: bytes, now_s: float) -> bytes
     return encode(asked, error | servo.fault_status, data) if answers else None
 
 
-def _status(servo: Frame1Servo, error: int, data: bytes) -> bytes:
+def _status(servo: Protocol1Servo, error: int, data: bytes) -> bytes:
     return encode(servo.id, error | servo.fault_status, data)

@@ -38,9 +38,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from sfms_robot.emulator.device import Device
+from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
-from sfms_robot.emulator.terminal import Terminal
-from sfms_robot.emulator.wire import Wire
+from sfms_robot.emulator.pseudo_terminal import PseudoTerminal
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.registers import Table
 
@@ -48,11 +48,11 @@ _CHUNK: Final = 4096
 _PATIENCE_S: Final = 1.0  # for bytes that a client said it had written
 _IDLE_S: Final = 0.25  # the longest that motors are left alone in real time
 _DEVICES: Final = {  # (family, protocol) -> class; imported only when something of it is plugged in
-    ("dynamixel", 2): "sfms_robot.emulator.chain:ServoChain",
-    ("dynamixel", 1): "sfms_robot.emulator.protocol1:Frame1Device",
-    ("feetech", 1): "sfms_robot.emulator.protocol1:Frame1Device",
-    ("maestro", None): "sfms_robot.emulator.boards:MaestroBoard",
-    ("ssc32", None): "sfms_robot.emulator.boards:Ssc32Board",
+    ("dynamixel", 2): "sfms_robot.emulator.dynamixel2_chain:Dynamixel2Chain",
+    ("dynamixel", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
+    ("feetech", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
+    ("maestro", None): "sfms_robot.emulator.pulse_boards:MaestroBoard",
+    ("ssc32", None): "sfms_robot.emulator.pulse_boards:Ssc32Board",
 }
 
 
@@ -69,10 +69,10 @@ class _Client:
 class Server:
     """Moves bytes between the terminal, the control socket and the wire."""
 
-    def __init__(self, wire: Wire, virtual: bool, folder: str, link: str) -> None:
+    def __init__(self, wire: EmulatedWire, virtual: bool, folder: str, link: str) -> None:
         self._wire = wire
         self._virtual = virtual
-        self._terminal: Terminal | None = Terminal(link)
+        self._terminal: PseudoTerminal | None = PseudoTerminal(link)
         self._link = link
         self.control = os.path.join(folder, "control")
         self._listener = socket.socket(socket.AF_UNIX)
@@ -131,7 +131,7 @@ class Server:
             self._terminal.close()
             self._terminal = None
         elif not self._wire.hung and self._terminal is None:
-            self._terminal = Terminal(self._link)
+            self._terminal = PseudoTerminal(self._link)
 
     # --- control ------------------------------------------------------------------------------------------------
 
@@ -253,7 +253,7 @@ class Server:
             self._terminal.close()
 
 
-def _wire(description: Mapping[str, Any]) -> Wire:
+def _wire(description: Mapping[str, Any]) -> EmulatedWire:
     """Every protocol's servos are one device; every board is one."""
     tables = {name: Table.from_plain(plain) for name, plain in description["tables"].items()}
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
@@ -263,7 +263,7 @@ def _wire(description: Mapping[str, Any]) -> Wire:
         groups.setdefault((where, "" if table.channels is None else table.model), []).append(row)
     devices = [_device(where, rows, tables, description["behind_silent"]) for (where, _), rows in groups.items()]
     faults = [parse_fault(text) for text in description["faults"]]
-    return Wire(devices, description["timing"], faults, description["seed"])
+    return EmulatedWire(devices, description["timing"], faults, description["seed"])
 
 
 def _device(where: str, rows: list[dict[str, Any]], tables: Mapping[str, Table], behind_silent: str) -> Device:

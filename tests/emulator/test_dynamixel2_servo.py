@@ -5,7 +5,7 @@ import math
 import pytest
 
 from sfms_robot.config import load_firmware_map, map_files, variant
-from sfms_robot.emulator.servo import Servo
+from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Table
 
@@ -15,7 +15,7 @@ class Bench:
 
     def __init__(self, model="xl330-m288", firmware=53, start=2048, supply_v=None, **registers):
         self.table = Table.of(variant(model, firmware))
-        self.servo = Servo(1, self.table, 1_000_000, start, firmware, registers, supply_v)
+        self.servo = Dynamixel2Servo(1, self.table, 1_000_000, start, firmware, registers, supply_v)
         self.t = 0.0
 
     def put(self, **values):
@@ -44,7 +44,7 @@ PROTOCOL_2 = sorted(file.stem for file in map_files() if load_firmware_map(file.
 def test_every_shipped_model_stands_still_and_moves_when_told(model):
     table = Table.of(load_firmware_map(model))
     baud = max(table.baud_codes.values())
-    servo = Servo(1, table, baud, table.center_ticks, table.firmware[1])
+    servo = Dynamixel2Servo(1, table, baud, table.center_ticks, table.firmware[1])
     present, goal, torque = (table.role(r) for r in ("present_position", "goal_position", "torque_enable"))
     assert servo.read(0, table.size, 0.5) == (0, servo.read(0, table.size, 0.5)[1])
     assert present.from_bytes(servo.read(present.address, present.size, 1.0)[1]) == table.center_ticks

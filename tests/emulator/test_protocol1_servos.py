@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.protocol1 import Frame1Device
+from sfms_robot.emulator.protocol1_chain import Protocol1Chain
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.codecs import protocol1 as frame1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
@@ -16,7 +16,7 @@ MODELS = [
 BAUD = 1_000_000
 
 
-def device_of(*models: str, start_ticks: int | None = None, **more) -> Frame1Device:
+def device_of(*models: str, start_ticks: int | None = None, **more) -> Protocol1Chain:
     tables = {model: Table.of(load_firmware_map(model)) for model in models}
     rows = [
         {
@@ -29,7 +29,7 @@ def device_of(*models: str, start_ticks: int | None = None, **more) -> Frame1Dev
         }
         for i, model in enumerate(models)
     ]
-    return Frame1Device.from_rows(rows, tables)
+    return Protocol1Chain.from_rows(rows, tables)
 
 
 def ask(device, servo, code, params=b"", now_s=0.0, baud=BAUD) -> list[Frame]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from sfms_robot.emulator.plant import Drive, Plant
+from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.registers import Table
 
@@ -53,7 +53,7 @@ class Channel:
     def advance(self, now_s: float) -> None:
         """Move pulse and shaft on to `now_s`."""
         speed = self.speed or (_NO_LIMIT if self.acceleration else 0.0)
-        drive = Drive(self.goal, self._board.table.top_speed_ticks_s, speed, self.acceleration)
+        drive = MotorCommand(self.goal, self._board.table.top_speed_ticks_s, speed, self.acceleration)
         self.plant.advance(now_s, drive if self.on else None)
 
     def fail(self, bits: int, now_s: float) -> None:

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.chain import ServoChain
-from sfms_robot.emulator.servo import Servo
+from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
+from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_instruction, maybe_packet
 from sfms_robot.servo.registers import Table
@@ -19,8 +19,8 @@ class Host:
     """A host that talks at one baud, at a time it sets."""
 
     def __init__(self, *servos: int, baud: int = BAUD, firmware: int = 53, chain_break: bool = True):
-        each = [Servo(i, TABLE, baud, start_ticks=2000 + i, firmware=firmware) for i in servos]
-        self.chain = ServoChain(each, chain_break)
+        each = [Dynamixel2Servo(i, TABLE, baud, start_ticks=2000 + i, firmware=firmware) for i in servos]
+        self.chain = Dynamixel2Chain(each, chain_break)
         self.t = 0.0
 
     def replies(self, servo: int, instruction: int, params: bytes = b""):

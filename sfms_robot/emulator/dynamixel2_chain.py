@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple, Self
 
 from sfms_robot.emulator.device import Reply
-from sfms_robot.emulator.servo import Servo
+from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_status
 from sfms_robot.servo.registers import Table
@@ -28,19 +28,19 @@ Request = tuple[int, int, int]  # id, address, length
 class Listening(NamedTuple):
     """Who hears the host: by their own id, and by the second one that some have."""
 
-    own: dict[int, list[Servo]]
-    second: dict[int, list[Servo]]
+    own: dict[int, list[Dynamixel2Servo]]
+    second: dict[int, list[Dynamixel2Servo]]
 
-    def addressed(self, servo_id: int) -> list[Servo]:
+    def addressed(self, servo_id: int) -> list[Dynamixel2Servo]:
         """All that obey `servo_id`."""
         there = self.own.get(servo_id, [])
         return there + self.second[servo_id] if servo_id in self.second else there
 
 
-class ServoChain:
+class Dynamixel2Chain:
     """All Protocol 2.0 servos of one wire."""
 
-    def __init__(self, servos: Sequence[Servo], chain_break: bool = True) -> None:
+    def __init__(self, servos: Sequence[Dynamixel2Servo], chain_break: bool = True) -> None:
         self._servos = list(servos)
         self._chain_break = chain_break
         self._buffer = bytearray()
@@ -53,7 +53,7 @@ class ServoChain:
         """From the plain rows of a description; `tables` by model."""
         return cls(
             [
-                Servo(
+                Dynamixel2Servo(
                     row["id"],
                     tables[row["model"]],
                     row["baud"],
@@ -67,11 +67,11 @@ class ServoChain:
             chain_break,
         )
 
-    def servo(self, servo_id: int) -> Servo | None:
+    def servo(self, servo_id: int) -> Dynamixel2Servo | None:
         return next((servo for servo in self._servos if servo.id == servo_id), None)
 
     @property
-    def servos(self) -> Sequence[Servo]:
+    def servos(self) -> Sequence[Dynamixel2Servo]:
         return self._servos
 
     def advance(self, now_s: float) -> None:
@@ -101,8 +101,8 @@ class ServoChain:
 
     def _listening(self, baud: int | None, now_s: float) -> Listening:
         """Those who hear a packet; hearing one feeds their watchdog."""
-        own: dict[int, list[Servo]] = {}
-        second: dict[int, list[Servo]] = {}
+        own: dict[int, list[Dynamixel2Servo]] = {}
+        second: dict[int, list[Dynamixel2Servo]] = {}
         for servo in self._servos:
             if _same(servo.baud, baud) and servo.hears(now_s):
                 servo.feed_watchdog(now_s)
@@ -134,7 +134,7 @@ class ServoChain:
 
     def _reads(self, requests: Sequence[Request], fast: bool, listening: Listening, now_s: float) -> Iterator[Reply]:
         """Status packets in list order, up to the first id that is silent (unless the chain skips it)."""
-        parts: list[tuple[Servo, int, bytes]] = []
+        parts: list[tuple[Dynamixel2Servo, int, bytes]] = []
         for servo_id, address, length in requests:
             there = [s for s in listening.own.get(servo_id, ()) if s.return_level >= 1 and not (fast and _is_old(s))]
             if not there:
@@ -162,7 +162,7 @@ def _same(baud: int | None, host: int | None) -> bool:
     return baud is not None and host is not None and abs(baud - host) <= _BAUD_TOLERANCE * baud
 
 
-def _is_old(servo: Servo) -> bool:
+def _is_old(servo: Dynamixel2Servo) -> bool:
     return servo.firmware < _FAST_FIRMWARE or "operating_mode" not in servo.table.fields
 
 
@@ -203,7 +203,7 @@ def _collided(packets: Sequence[bytes]) -> bytes:
     return bytes(out)
 
 
-def _single(servo: Servo, code: int, params: bytes, now_s: float, broadcast: bool) -> bytes | None:
+def _single(servo: Dynamixel2Servo, code: int, params: bytes, now_s: float, broadcast: bool) -> bytes | None:
     """What one servo answers to an instruction of its own, or None."""
     error, data, level, servo_id = 0, b"", 2, servo.id  # it still answers by the id it is just losing
     if code == dxl2.PING:
@@ -240,7 +240,7 @@ def _single(servo: Servo, code: int, params: bytes, now_s: float, broadcast: boo
     return _status(servo, error, data, servo_id)
 
 
-def _status(servo: Servo, error: int, data: bytes, servo_id: int) -> bytes:
+def _status(servo: Dynamixel2Servo, error: int, data: bytes, servo_id: int) -> bytes:
     return encode_status(servo_id, error | (dxl2.ALERT if servo.fault_status else 0), data)
 
 
@@ -260,7 +260,7 @@ def _bulk_write(params: bytes, listening: Listening, now_s: float) -> None:
         start += 5 + length
 
 
-def _fast(parts: Sequence[tuple[Servo, int, bytes]], lengths: Sequence[int]) -> bytes:
+def _fast(parts: Sequence[tuple[Dynamixel2Servo, int, bytes]], lengths: Sequence[int]) -> bytes:
     """The one packet of a fast read. It is announced whole, and stops short at the first servo that is silent."""
     out = bytearray(b"\xff\xff\xfd\x00\xfe" + (1 + sum(lengths) + 4 * len(lengths)).to_bytes(2, "little"))
     out.append(dxl2.STATUS)

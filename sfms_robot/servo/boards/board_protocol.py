@@ -1,4 +1,4 @@
-"""How a board of hobby servos is spoken to, and whether a bus fits on it. `hobby` is the bus, this is what it needs."""
+"""What `pulse_bus.PulseBus` needs of one kind of board: its protocol, and whether a bus fits on it."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from sfms_robot.ports import TickConversion
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
 
-Ask = Callable[[bytes, int], bytes | None]
+Exchange = Callable[[bytes, int], bytes | None]
 """Sends a request; the answer, if exactly that many bytes came."""
 
 
-class Health(NamedTuple):
+class BoardStatus(NamedTuple):
     """What a board says of itself: faults since it was last asked, in words."""
 
     faults: str = ""
-    lasting: bool = False  # something is wrong with the board, not just with what it heard
+    lasting: bool = False  # something is wrong with the board, not just with what it received
     went_home: bool = False  # it has switched its channels off, or to wherever its home is
 
 
-class Dialect(Protocol):
-    """How one kind of board is spoken to. Pure but for `pulses`, which is handed the wire."""
+class BoardProtocol(Protocol):
+    """Bytes to and from one kind of board. Pure but for `read_pulses`, which is handed the port."""
 
     @property
-    def answer_length(self) -> int:
-        """Bytes of the answer to `question`."""
+    def status_length(self) -> int:
+        """Bytes of the answer to `status_request`."""
 
-    def question(self, lost: bool) -> bytes:
-        """Asks the board how it is; `lost`: it may have been switched off since it last answered."""
+    def status_request(self, restarted: bool) -> bytes:
+        """Asks the board for its status; `restarted`: it may have been switched off since it last answered."""
 
-    def health(self, answer: bytes) -> Health | None:
+    def decode_status(self, answer: bytes) -> BoardStatus | None:
         """None for what is no answer."""
 
-    def pulses(self, ask: Ask, channels: Sequence[int]) -> dict[int, int] | None:
+    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
         """Ticks of the pulses it sends now, 0 for none; None when it does not say."""
 
-    def goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
-        """Bytes that move channels to `ticks`; the goals before went out `interval_s` ago, 0 for the first."""
+    def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+        """Moves channels to `ticks`; the goals before went out `interval_s` ago, 0 for the first."""
 
-    def off(self, channels: Sequence[int]) -> bytes:
-        """Bytes that end the pulses."""
+    def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
+        """Ends the pulses, whatever the bytes before were; `restarted` as in `status_request`."""
 
 
 def board_of(bus: str, servos: Sequence[BusServo]) -> Table:

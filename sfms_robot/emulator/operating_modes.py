@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from sfms_robot.emulator.memory import Memory
-from sfms_robot.emulator.plant import Drive
+from sfms_robot.emulator.plant import MotorCommand
+from sfms_robot.emulator.register_file import RegisterFile
 from sfms_robot.servo.registers import Table
 
 CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16
@@ -19,10 +19,10 @@ _FULL_PWM: Final = 885.0
 _XL320_MODES: Final = {1: VELOCITY, 2: POSITION}
 
 
-class Gearing:
+class TickFrames:
     """The two frames of one servo, as its registers stand."""
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: RegisterFile) -> None:
         self.mode = mode_of(memory)
         self.sign = -1.0 if memory.get("drive_mode") & _REVERSE else 1.0
         offset = memory.get("homing_offset")
@@ -38,13 +38,13 @@ class Gearing:
         return self.sign * (told - self.offset)
 
 
-def mode_of(memory: Memory) -> int:
+def mode_of(memory: RegisterFile) -> int:
     if "operating_mode" in memory.table.fields:
         return memory.get("operating_mode")
     return _XL320_MODES.get(memory.get("control_mode"), POSITION)
 
 
-def drive_of(memory: Memory, gearing: Gearing, shaft: float, top_speed: float) -> Drive | None:
+def motor_command(memory: RegisterFile, gearing: TickFrames, shaft: float, top_speed: float) -> MotorCommand | None:
     """What a motor under torque is told, standing at `shaft`; None in a mode that is none."""
     table, get = memory.table, memory.get
     if gearing.mode in (POSITION, EXTENDED, CURRENT_POSITION):
@@ -53,21 +53,21 @@ def drive_of(memory: Memory, gearing: Gearing, shaft: float, top_speed: float) -
         torque = 1.0
         if gearing.mode == CURRENT_POSITION:
             torque = min(1.0, abs(get("goal_current")) / max(1, get("current_limit", 1)))
-        return Drive(goal, top_speed, speed, acceleration, torque)
+        return MotorCommand(goal, top_speed, speed, acceleration, torque)
     if gearing.mode == VELOCITY:
         name = "goal_velocity" if "goal_velocity" in table.fields else "moving_speed"
         wanted = gearing.sign * _ticks_s(table, name, get(name))
         acceleration = _profile(memory, 0.0)[1]
-        return Drive(min(max(wanted, -top_speed), top_speed), top_speed, 0.0, acceleration, by_speed=True)
+        return MotorCommand(min(max(wanted, -top_speed), top_speed), top_speed, 0.0, acceleration, by_speed=True)
     if gearing.mode == PWM:
-        return Drive(gearing.sign * top_speed * get("goal_pwm") / _FULL_PWM, top_speed, by_speed=True)
+        return MotorCommand(gearing.sign * top_speed * get("goal_pwm") / _FULL_PWM, top_speed, by_speed=True)
     if gearing.mode == CURRENT:
         share = get("goal_current") / max(1, get("current_limit", 1))
-        return Drive(gearing.sign * top_speed * share, top_speed, torque=min(1.0, abs(share)), by_speed=True)
+        return MotorCommand(gearing.sign * top_speed * share, top_speed, torque=min(1.0, abs(share)), by_speed=True)
     return None
 
 
-def _profile(memory: Memory, distance: float) -> tuple[float, float]:
+def _profile(memory: RegisterFile, distance: float) -> tuple[float, float]:
     """Profile velocity and acceleration in ticks and seconds; 0 = no limit."""
     table, get = memory.table, memory.get
     if "profile_velocity" not in table.fields:
