@@ -30,7 +30,7 @@ from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.care import Care, Told
 from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.roster import Roster
-from sfms_robot.servo.chain.startup import Contact
+from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.policy import Absences, BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field, Table
@@ -105,15 +105,15 @@ class ChainBus(WireBus[L], Generic[L, S]):
     def _state(self) -> S: ...
 
     @abstractmethod
-    def _shake(self, link: L, tries: int = 3) -> Contact[L]: ...
+    def _shake(self, link: L, tries: int = 3) -> Startup[L]: ...
 
     @property
     @abstractmethod
     def _listed(self) -> Roster: ...
 
     @abstractmethod
-    def _met(self, link: L, bits: Sequence[int]) -> None:
-        """Everybody is identified and prepared; latched faults in bus order."""
+    def _met(self, link: L, bits: Mapping[int, int]) -> None:
+        """Who answers is identified and prepared; latched faults by index."""
 
     @abstractmethod
     def _listen(self, link: L, now_s: float) -> bool:
@@ -130,7 +130,7 @@ class ChainBus(WireBus[L], Generic[L, S]):
         link = self._open()
         try:
             bits = self._shake(link).run()
-            self._read_deadline_s = link.adapt(self._servos[0].id, *self._telemetry.position)
+            self._read_deadline_s = link.adapt(self._servos[min(bits)].id, *self._telemetry.position)
             self._care.switched_off()
             self._care.attach(link, self._shake(link, tries=1))
             self._met(link, bits)
