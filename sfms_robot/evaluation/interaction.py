@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.states import STATE, UNKNOWN
-from sfms_robot.evaluation.stage import Played
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
 from sfms_robot.listeners.arig import sound
 from sfms_robot.signals.events import near
@@ -141,8 +140,8 @@ def border_ratio(motions: Sequence[Floats], period: int, first: int = 1, skip: i
     return float(np.concatenate(at).mean()) / inside if inside else float("nan")
 
 
-def listening_again(played: Sequence[Played], dyads: Sequence[Dyad]) -> float:
-    """Share of the jaw's mean opening that is left a second after the agent's own voice has stopped."""
+def listening_again(played: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
+    """Of motions (N, 58): share of the jaw's mean opening left a second after the agent's own voice has stopped."""
     speaking, after = [], []
     for one, dyad in zip(played, dyads, strict=True):
         if dyad.agent_audio is None:
@@ -150,8 +149,8 @@ def listening_again(played: Sequence[Played], dyads: Sequence[Dyad]) -> float:
         active = sound.track(dyad.agent_audio)[1]
         spans = np.flatnonzero(active)[:, None] * FRAME_S + np.array([0.0, FRAME_S])
         recent = near(spans, len(active), 1 / FRAME_S, 1.0)
-        speaking.append(one.motion[active, JAW])
-        after.append(one.motion[~recent, JAW])
+        speaking.append(one[active, JAW])
+        after.append(one[~recent, JAW])
     said = np.concatenate(speaking) if speaking else np.zeros(0)
     quiet = np.concatenate(after) if after else np.zeros(0)
     return float(quiet.mean() / said.mean()) if len(said) and len(quiet) and said.mean() > 0 else float("nan")

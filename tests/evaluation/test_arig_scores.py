@@ -7,7 +7,7 @@ from tiny_arig_training import HZ, dyad, settings
 from sfms_robot.corpora.states import STATE
 from sfms_robot.evaluation import interaction as scores
 from sfms_robot.evaluation.paper import arig as tables
-from sfms_robot.evaluation.stage import Played, play, speaker_frames
+from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import ArigListener
@@ -103,11 +103,10 @@ def test_jumps_at_borders_are_seen_and_jumps_elsewhere_are_not():
 
 def test_a_jaw_that_stays_open_after_speech_is_seen():
     one = dyad("a", "speaking", 0)
-    played = Played(one.listener, one.states)
-    assert np.isnan(scores.listening_again([played], [one]))  # it never stays silent for more than a second
+    assert np.isnan(scores.listening_again([one.listener], [one]))  # it never stays silent for more than a second
     silent = dyad("b", "listening", 1)
-    still = Played(jaw(np.full(300, 0.2)), silent.states)
-    assert scores.listening_again([played, still], [one, silent]) == pytest.approx(0.5, abs=0.05)
+    still = jaw(np.full(300, 0.2))
+    assert scores.listening_again([one.listener, still], [one, silent]) == pytest.approx(0.5, abs=0.05)
 
 
 # --- played ---------------------------------------------------------------------------------------------------------
@@ -115,7 +114,7 @@ def test_a_jaw_that_stays_open_after_speech_is_seen():
 
 def test_the_agents_sound_comes_one_frame_early():
     one = dyad("a", "interaction", 0)
-    frames = speaker_frames(one)
+    frames = frames_of_dyad(one)
     for index in (0, 30, len(frames) - 2):
         said = one.agent_audio[(index + 1) * FRAME_SAMPLES : (index + 2) * FRAME_SAMPLES]
         assert np.array_equal(frames[index].agent_audio, said)
@@ -126,9 +125,9 @@ def test_the_agents_sound_comes_one_frame_early():
 def test_what_is_played_has_a_frame_and_a_state_for_every_frame():
     listener = settings().listener
     one = dyad("a", "interaction", 0)
-    played = play(ArigListener(listener, ArigModel(listener)), one, seed=1)
-    assert played.motion.shape == one.listener.shape and np.isfinite(played.motion).all()
-    assert played.states[0] == -1 and (played.states[1:] >= 0).all()
+    played = rollout(ArigListener(listener, ArigModel(listener)), frames_of_dyad(one), [1])
+    assert played.motion[0].shape == one.listener.shape and np.isfinite(played.motion).all()
+    assert played.states[0, 0] == -1 and (played.states[0, 1:] >= 0).all()
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------

@@ -17,8 +17,8 @@ from sfms_robot.evaluation.paper.model import TableModel
 from sfms_robot.evaluation.paper.recipes import recipes
 from sfms_robot.evaluation.paper.score import Score, Windows, score
 from sfms_robot.evaluation.paper.train import train
+from sfms_robot.learning.corpus import first_frames
 from sfms_robot.learning.job import Run
-from sfms_robot.learning.sfms.corpus import first_frames
 from sfms_robot.learning.sfms.tokenizer import amplified
 from sfms_robot.listeners.sfms.placement import place_exact
 

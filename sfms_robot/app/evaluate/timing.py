@@ -28,7 +28,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import nod_table
 from sfms_robot.evaluation import timing as evaluation
-from sfms_robot.learning.rollout import roll_out_many
+from sfms_robot.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.ports import Listener
 
@@ -137,7 +137,7 @@ def _play(folder: Path, part: _Part) -> tuple[evaluation.Scene, evaluation.Answe
     rng = np.random.default_rng([part.seed, part.number])
     scene = evaluation.scene(part.person, part.minutes, voices, motions, rng)
     first = 1000 * (part.seed + part.number)
-    played = roll_out_many(_listener(folder), scene.speaker, range(first, first + part.seeds))
+    played = rollout(_listener(folder), scene.speaker, range(first, first + part.seeds)).motion
     return replace(scene, speaker=()), evaluation.observe(played)
 
 

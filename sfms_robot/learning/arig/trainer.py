@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
-from sfms_robot.learning.arig.corpus import SCENES, Corpus, fit_scales, gather, open_scenes
+from sfms_robot.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
 from sfms_robot.learning.arig.losses import Parts, Pupil, augment, loss_parts, previous_states
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
@@ -56,11 +56,11 @@ def train_arig(
 
 
 def arig_job(
-    settings: config.ArigTraining, pupil: Pupil, corpus: Corpus, held_out: Corpus, device: torch.device
+    settings: config.ArigTraining, pupil: Pupil, corpus: ArigCorpus, held_out: ArigCorpus, device: torch.device
 ) -> Job:
     """The training as the loop takes it, on a model whose scales are set; moves it to `device`."""
     phase = settings.training
-    starts = corpus.starts(phase.window_frames)
+    starts = corpus.starts_by_scene(phase.window_frames)
     for stage in phase.stages:
         weights_of(stage, starts)
     fingerprint = corpus.fingerprint()
@@ -69,10 +69,10 @@ def arig_job(
 
     def loss_of(step: int, generator: torch.Generator) -> Tensor:
         chosen = draw(starts, weights_of(phase.stage(step), starts), phase.batch, generator)
-        dyad, states = corpus.cut(chosen.to(device), phase.window_frames)
+        dyad = cut(corpus, chosen.to(device), phase.window_frames)
         told, truth = augment(dyad, pupil.model, phase, generator)
-        previous = previous_states(states, phase.state_noise, generator)
-        return loss_parts(pupil, told, states, truth, phase.draws, generator, previous).total(phase)
+        previous = previous_states(dyad.states, phase.state_noise, generator)
+        return loss_parts(pupil, told, dyad.states, truth, phase.draws, generator, previous).total(phase)
 
     return Job(
         name="arig",
@@ -110,16 +110,16 @@ def draw(starts: Mapping[str, Tensor], weights: Tensor, count: int, generator: t
 
 
 @torch.no_grad()
-def held_out_parts(pupil: Pupil, corpus: Corpus, phase: config.ArigPhase) -> Parts:
+def held_out_parts(pupil: Pupil, corpus: ArigCorpus, phase: config.ArigPhase) -> Parts:
     """Losses on windows drawn with a fixed seed as the last stage draws them, without augmentation."""
     pupil.eval()
     generator = torch.Generator().manual_seed(0)
-    starts = corpus.starts(phase.window_frames)
+    starts = corpus.starts_by_scene(phase.window_frames)
     chosen = draw(starts, weights_of(phase.stages[-1], starts), HELD_OUT_WINDOWS, generator)
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
-        dyad, states = corpus.cut(some.to(corpus.states.device), phase.window_frames)
-        previous = previous_states(states, phase.state_noise, generator)
-        found.append(loss_parts(pupil, dyad, states, dyad.agent_motion, phase.draws, generator, previous))
+        dyad = cut(corpus, some.to(corpus.frames.states.device), phase.window_frames)
+        previous = previous_states(dyad.states, phase.state_noise, generator)
+        found.append(loss_parts(pupil, dyad, dyad.states, dyad.agent_motion, phase.draws, generator, previous))
     mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
     return Parts(**mean)
