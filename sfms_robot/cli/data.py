@@ -25,7 +25,7 @@ def compose(
     json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object."),
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
-    from sfms_robot.app.train.learn import compose_dyads
+    from sfms_robot.app.evaluate.listener_evaluation import compose_dyads
 
     figures = compose_dyads(data, out, minutes, seed)
     if json:
@@ -47,7 +47,7 @@ def check(
     json: bool = typer.Option(False, "--json", help="Print everything found as one JSON object."),
 ) -> None:
     """Read a whole data set once: what is there, and everything that is wrong with it."""
-    from sfms_robot.app.train.data_check import check_data
+    from sfms_robot.app.train.datasets import check_data
 
     report = check_data(folder, layout, order.value if order else None, window)
     if json:

@@ -54,13 +54,13 @@ def tokenizer(
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
     if table is None:
-        from sfms_robot.app.train.learn import evaluate_tokenizer
+        from sfms_robot.app.evaluate.listener_evaluation import evaluate_tokenizer
 
         if data is None:
             raise typer.BadParameter("--data is needed without --table")
         _print(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
-    from sfms_robot.app.evaluate.tables import TableOptions, evaluate_table
+    from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
 
     options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
     result = interruptible(lambda: evaluate_table(options))
@@ -89,7 +89,7 @@ def listener_(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.app.train.learn import evaluate_listener, listener_table
+    from sfms_robot.app.evaluate.listener_evaluation import evaluate_listener, listener_table
 
     if table is None:
         _print(evaluate_listener(listener, data, seed, order.value if order else None), json)
@@ -97,7 +97,7 @@ def listener_(
     if table.value.startswith("arig"):
         if order is not None:
             raise typer.BadParameter("--order is for --table 1 and 2, or none")
-        from sfms_robot.app.evaluate.arig import AblationOptions, arig_table
+        from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
         _print(interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations)), json)
@@ -131,7 +131,7 @@ def timing(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
-    from sfms_robot.app.evaluate import timing as command
+    from sfms_robot.app.evaluate import meetings as command
 
     if fit_table is not None:
         _print(command.fit_table(data, fit_table), json)
@@ -149,7 +149,7 @@ def interaction(
     json: bool = JSON,
 ) -> None:
     """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
-    from sfms_robot.app.evaluate.arig import evaluate_interaction
+    from sfms_robot.app.evaluate.arig_evaluation import evaluate_interaction
 
     result = evaluate_interaction(listener, data, clips, seed)
     if json:

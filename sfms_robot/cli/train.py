@@ -58,7 +58,7 @@ def tokenizer(
     json: bool = JSON,
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
-    from sfms_robot.app.train.training import TrainOptions, train_tokenizer
+    from sfms_robot.app.train.train_runs import TrainOptions, train_tokenizer
 
     placed = placement.value if placement else None
     options = TrainOptions(
@@ -81,7 +81,7 @@ def listener(
     json: bool = JSON,
 ) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
-    from sfms_robot.app.train.training import TrainOptions, train_listener
+    from sfms_robot.app.train.train_runs import TrainOptions, train_listener
 
     options = TrainOptions(
         config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None, overwrite

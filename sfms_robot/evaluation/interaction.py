@@ -13,7 +13,7 @@ from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.states import STATE, UNKNOWN
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
-from sfms_robot.listeners.arig import sound
+from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.signals.events import near
 
 LAGS: Final = 12  # frames either way in which the jaw is looked for
@@ -53,7 +53,9 @@ class VoiceRule:
 def heard_voices(dyad: Dyad) -> Bools:
     """(N, 2) speech of agent and user as the listener itself hears it: the agent's now, the user's a frame late."""
     silent = np.zeros(len(dyad.listener), bool)
-    agent, user = (silent if track is None else sound.track(track)[1] for track in (dyad.agent_audio, dyad.audio))
+    agent, user = (
+        silent if track is None else audio_frontend.track(track)[1] for track in (dyad.agent_audio, dyad.audio)
+    )
     return np.stack([agent, np.r_[False, user[:-1]]], axis=-1)
 
 
@@ -146,7 +148,7 @@ def listening_again(played: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
     for one, dyad in zip(played, dyads, strict=True):
         if dyad.agent_audio is None:
             continue
-        active = sound.track(dyad.agent_audio)[1]
+        active = audio_frontend.track(dyad.agent_audio)[1]
         spans = np.flatnonzero(active)[:, None] * FRAME_S + np.array([0.0, FRAME_S])
         recent = near(spans, len(active), 1 / FRAME_S, 1.0)
         speaking.append(one[active, JAW])

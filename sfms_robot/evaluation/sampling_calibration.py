@@ -25,7 +25,7 @@ from sfms_robot.evaluation.rollout import OfflineRollout, offline_rollout
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Floats
 from sfms_robot.learning.corpus import in_space
 from sfms_robot.learning.sfms.features import gather
-from sfms_robot.learning.sfms.predictor_training import corrected
+from sfms_robot.learning.sfms.predictor_trainer import corrected
 from sfms_robot.learning.sfms.tokens import tokenise
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel

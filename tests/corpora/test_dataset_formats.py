@@ -17,7 +17,7 @@ from sfms_robot.corpora.external import l2l, react
 from sfms_robot.corpora.formats import LAYOUTS, detect, looks_like, open_dataset, open_for, split_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.learning.sfms.features import gather
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import Hearing
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.l2l import l2l_bilateral
 from sfms_robot.signals.spaces import rest_of

@@ -6,7 +6,7 @@ from tiny_arig_training import HZ, dyad, settings
 
 from sfms_robot.corpora.states import STATE
 from sfms_robot.evaluation import interaction as scores
-from sfms_robot.evaluation.paper import arig as tables
+from sfms_robot.evaluation.paper import arig_tables as tables
 from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
 from sfms_robot.listeners.arig.model import ArigModel

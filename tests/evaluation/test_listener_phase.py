@@ -12,7 +12,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.rollout import frames_of_dyad
 from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_hearing, gather
-from sfms_robot.learning.sfms.predictor_training import augment, keyframe_scores
+from sfms_robot.learning.sfms.predictor_trainer import augment, keyframe_scores
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 

@@ -10,7 +10,7 @@ from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Clip, Dataset
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.paper.listener_clips import collect, shared_space, spread
-from sfms_robot.evaluation.paper.listeners import TABLE_1, TABLE_2, Clips, cut, table
+from sfms_robot.evaluation.paper.listener_tables import TABLE_1, TABLE_2, Clips, cut, table
 from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
 from sfms_robot.listeners.sfms.model import SfmsModel

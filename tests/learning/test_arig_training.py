@@ -18,9 +18,9 @@ from sfms_robot.learning.arig.losses import Pupil, augment, loss_parts, previous
 from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
+from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.sound import MEL_WIDTH, WIDTHS
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import LN_PER_DB
 

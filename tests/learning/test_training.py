@@ -18,8 +18,8 @@ from sfms_robot.evaluation.sampling_calibration import calibrate
 from sfms_robot.frames import BLENDSHAPES, CHANNELS, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.learning.corpus import windows
 from sfms_robot.learning.job import Run
-from sfms_robot.learning.sfms import predictor_training as listener
-from sfms_robot.learning.sfms import tokenizer
+from sfms_robot.learning.sfms import predictor_trainer as listener
+from sfms_robot.learning.sfms import tokenizer_trainer as tokenizer
 from sfms_robot.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather
 from sfms_robot.learning.sfms.tokens import place_all
 from sfms_robot.listeners import checkpoint, sfms

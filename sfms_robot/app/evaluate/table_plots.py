@@ -10,10 +10,10 @@ import numpy as np
 
 from sfms_robot.app.evaluate import trajectory_plots
 from sfms_robot.app.evaluate.plot_style import INK, RULE, SERIES, new_figure, plain, save
-from sfms_robot.evaluation.paper import history
-from sfms_robot.evaluation.paper.model import TableModel
-from sfms_robot.evaluation.paper.score import Windows
-from sfms_robot.evaluation.paper.tables import Table
+from sfms_robot.evaluation.paper import score_history as history
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
+from sfms_robot.evaluation.paper.restoration import Windows
+from sfms_robot.evaluation.paper.tokenizer_tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

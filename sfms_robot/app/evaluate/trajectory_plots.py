@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from sfms_robot.app.evaluate.plot_style import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain
-from sfms_robot.evaluation.paper.history import Look
-from sfms_robot.evaluation.paper.model import TableModel
-from sfms_robot.evaluation.paper.score import Windows
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
+from sfms_robot.evaluation.paper.restoration import Windows
+from sfms_robot.evaluation.paper.score_history import Look
 from sfms_robot.frames import CHANNELS, FRAME_S, Floats
 
 if TYPE_CHECKING:

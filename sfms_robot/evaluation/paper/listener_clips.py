@@ -12,7 +12,7 @@ import torch
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Dataset, usable
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.paper.listeners import FRAMES, NEEDED_FRAMES, Clips, cut
+from sfms_robot.evaluation.paper.listener_tables import FRAMES, NEEDED_FRAMES, Clips, cut
 from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.frames import FRAME_HZ, Doubles
 from sfms_robot.learning.corpus import in_space

@@ -21,7 +21,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning import corpus as dyads
 from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales
-from sfms_robot.listeners.arig import sound
+from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.space import MotionSpace
@@ -98,15 +98,15 @@ def _heard(dyad: Conversation, track: str, width: int) -> tuple[Tensor, Tensor, 
     if track == "user" and audio is not None and not audio.any():
         audio = None
     shipped = dyad.features.get("wav2vec2" if track == "user" else "agent_wav2vec2")
-    if width != sound.WIDTHS["mel"] and shipped is not None:
+    if width != audio_frontend.WIDTHS["mel"] and shipped is not None:
         rows = _beside_phase(shipped, audio)
         voiced = np.zeros(frames, bool) if audio is None else np.array(phase.hear(levels_db(audio)))
-    elif width != sound.WIDTHS["mel"] and audio is not None:
+    elif width != audio_frontend.WIDTHS["mel"] and audio is not None:
         raise ConfigError(f"{dyad.name}: sound = wav2vec2 needs the feature wav2vec2, agent_wav2vec2 with the data")
     elif audio is not None and dyad.fps == FRAME_HZ:
-        rows, voiced = sound.track(audio)
+        rows, voiced = audio_frontend.track(audio)
     elif track == "user" and dyad.mel is not None:
-        rows, voiced = sound.of_mel(dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
+        rows, voiced = audio_frontend.of_mel(dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
     else:
         return torch.zeros(frames, width, dtype=torch.half), torch.zeros(frames, dtype=torch.bool), False
     return torch.from_numpy(rows).half(), torch.from_numpy(voiced), True

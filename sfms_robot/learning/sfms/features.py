@@ -15,7 +15,7 @@ from sfms_robot.corpora.clips import Dyad, at_rate
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.learning import corpus as dyads
 from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales, windows
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.space import MotionSpace

@@ -21,11 +21,11 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
-from sfms_robot.listeners.arig import fast, sound
+from sfms_robot.listeners.arig import audio_frontend, fast
+from sfms_robot.listeners.arig.audio_frontend import Ears
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.frame import Draw, Frame, repeated
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.sound import Ears
 from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.space import MotionSpace
 
@@ -104,8 +104,8 @@ class ArigListener:
         motion, silence = model.embed_motion(still), model.no_agent_sound[None]
         return Memory(
             frames=0,
-            user_ears=sound.start(),
-            agent_ears=sound.start(),
+            user_ears=audio_frontend.start(),
+            agent_ears=audio_frontend.start(),
             agent_sound=silence,
             agent_behaviour=torch.zeros(1, c, d),
             user_behaviour=torch.zeros(1, c, d),
@@ -152,8 +152,8 @@ class ArigListener:
 
     def _told(self, speaker: SpeakerFrame, memory: Memory) -> tuple[tuple[Tensor, ...], Memory]:
         """What `Frame` takes, and memory with both tracks heard."""
-        user, heard, user_ears = sound.hear(speaker.audio, memory.user_ears)
-        agent, says, agent_ears = sound.hear(sound.fit_frame(speaker.agent_audio), memory.agent_ears)
+        user, heard, user_ears = audio_frontend.hear(speaker.audio, memory.user_ears)
+        agent, says, agent_ears = audio_frontend.hear(audio_frontend.fit_frame(speaker.agent_audio), memory.agent_ears)
         face, seen = self._face(speaker)
         told = (
             torch.from_numpy(np.stack([user, agent])),

@@ -7,7 +7,7 @@ from pathlib import Path
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace

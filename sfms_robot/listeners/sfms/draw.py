@@ -24,7 +24,7 @@ from sfms_robot import config
 from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, Predictor, Trail, trails
-from sfms_robot.listeners.sfms.reach import Reach
+from sfms_robot.listeners.sfms.reachable import Reach
 from sfms_robot.signals.phase import PHRASE_KNOTS_S, SILENCE_KNOTS_S, SPEECH_KNOTS_S
 
 # 1 at the hats of `phase.features` that stand for silence up to 1.6 s: their sum falls from 1 there to 0 at 3.2 s.

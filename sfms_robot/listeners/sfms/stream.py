@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from sfms_robot import config
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, Plan, SpeakerFrame
 from sfms_robot.listeners.graphs import graph
+from sfms_robot.listeners.sfms.audio_frontend import Ears, Hearing
 from sfms_robot.listeners.sfms.draw import Sampler
-from sfms_robot.listeners.sfms.hearing import Ears, Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.space import MotionSpace

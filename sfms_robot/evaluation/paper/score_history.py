@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sfms_robot.errors import ModelError
 from sfms_robot.evaluation.baselines.dense import DenseTokenizer
-from sfms_robot.evaluation.paper.model import TableModel
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.placement import place
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks

@@ -39,7 +39,7 @@ def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dic
     """Held-out reconstruction error of a listener's tokenizer, by keyframe placement."""
     from sfms_robot.corpora.formats import open_for
     from sfms_robot.learning.sfms.features import gather
-    from sfms_robot.learning.sfms.tokenizer import reconstruction_error
+    from sfms_robot.learning.sfms.tokenizer_trainer import reconstruction_error
     from sfms_robot.listeners.sfms import load as load_sfms
 
     listener = load_sfms(find("listeners", name, "config.yaml"))
@@ -88,7 +88,7 @@ def _told(figures: Mapping[str, float]) -> dict[str, float | None]:
 
 def _keyframe_scores(listener: Listener, dyads: Sequence[clips.Dyad]) -> dict[str, float]:
     from sfms_robot.learning.sfms.features import gather
-    from sfms_robot.learning.sfms.predictor_training import keyframe_scores
+    from sfms_robot.learning.sfms.predictor_trainer import keyframe_scores
     from sfms_robot.listeners.sfms.stream import SfmsListener
 
     if not isinstance(listener, SfmsListener):
@@ -112,7 +112,7 @@ def listener_table(
     """
     from sfms_robot.corpora.formats import open_for
     from sfms_robot.evaluation.paper import listener_clips
-    from sfms_robot.evaluation.paper.listeners import table
+    from sfms_robot.evaluation.paper.listener_tables import table
     from sfms_robot.listeners.registry import load_listener
     from sfms_robot.listeners.sfms.stream import SfmsListener
 

@@ -19,7 +19,7 @@ from sfms_robot.learning.corpus import first_frames, windows
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.sfms.features import SfmsCorpus, fit_scales, gather
-from sfms_robot.learning.sfms.keyframe_scores import imitation, lively
+from sfms_robot.learning.sfms.imitation import imitation, lively
 from sfms_robot.learning.sfms.losses import masking, reconstruction
 from sfms_robot.learning.sfms.masks import batches
 from sfms_robot.listeners import checkpoint

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sfms_robot.corpora.takes import Take
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.paper.model import TableModel
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
 from sfms_robot.learning.corpus import first_frames, windows
 from sfms_robot.listeners.sfms.placement import Strategy

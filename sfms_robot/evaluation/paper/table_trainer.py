@@ -13,13 +13,13 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.corpora.takes import Take
 from sfms_robot.evaluation.baselines.dense import DenseTokenizer, baseline_loss
-from sfms_robot.evaluation.paper.history import Diary
-from sfms_robot.evaluation.paper.model import TableModel, save
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel, save
+from sfms_robot.evaluation.paper.score_history import Diary
 from sfms_robot.learning.corpus import first_frames, windows
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import checkpoint_file
-from sfms_robot.learning.sfms.tokenizer import amplified, loss_of_steps, optimizers_of
+from sfms_robot.learning.sfms.tokenizer_trainer import amplified, loss_of_steps, optimizers_of
 from sfms_robot.listeners.sfms.model import Tokenizer
 
 GAIN: Final = 0.4  # of windows while learning (`amplified`): six minutes of faces are few

@@ -20,11 +20,11 @@ from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import digest_of
 from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_hearing, gather
 from sfms_robot.learning.sfms.losses import next_tokens
-from sfms_robot.learning.sfms.losses_dtw import keyframe_dtw
-from sfms_robot.learning.sfms.tokenizer import WEIGHTS as TOKENIZER_WEIGHTS
+from sfms_robot.learning.sfms.soft_dtw import keyframe_dtw
+from sfms_robot.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
 from sfms_robot.learning.sfms.tokens import tokenise
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes

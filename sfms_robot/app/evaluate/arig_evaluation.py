@@ -13,14 +13,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from sfms_robot import config
-from sfms_robot.app.train.training import TrainOptions, run_of, train_settings
+from sfms_robot.app.train.train_runs import TrainOptions, run_of, train_settings
 from sfms_robot.config import find, parse_training
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.states import UNKNOWN
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import interaction as scores
-from sfms_robot.evaluation.paper import arig as tables
+from sfms_robot.evaluation.paper import arig_tables as tables
 from sfms_robot.evaluation.paper.listener_clips import spread
 from sfms_robot.evaluation.rollout import Rollout, rollouts
 from sfms_robot.learning.arig.features import open_scenes

@@ -23,8 +23,8 @@ from sfms_robot.evaluation.sampling_calibration import calibrate, rounds
 from sfms_robot.learning.arig.trainer import train_arig
 from sfms_robot.learning.job import Run
 from sfms_robot.learning.resume import checkpoint_file
-from sfms_robot.learning.sfms import predictor_training as listener
-from sfms_robot.learning.sfms import tokenizer
+from sfms_robot.learning.sfms import predictor_trainer as listener
+from sfms_robot.learning.sfms import tokenizer_trainer as tokenizer
 from sfms_robot.learning.watch import Watch, progress_bar, tensorboard, together
 from sfms_robot.listeners import checkpoint
 
