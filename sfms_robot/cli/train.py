@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -64,7 +63,7 @@ def tokenizer(
     options = TrainOptions(
         config, data, out, resume, device.value, steps, placed, tensorboard, order.value if order else None, overwrite
     )
-    _print(interruptible(lambda: train_tokenizer(options)), json)
+    _show(interruptible(lambda: train_tokenizer(options)), json)
 
 
 @app.command()
@@ -86,7 +85,7 @@ def listener(
     options = TrainOptions(
         config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None, overwrite
     )
-    _print(interruptible(lambda: train_listener(options)), json)
+    _show(interruptible(lambda: train_listener(options)), json)
 
 
 def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -98,11 +97,9 @@ def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         sys.exit(INTERRUPTED)
 
 
-def _print(figures: Mapping[str, Any], json: bool) -> None:
+def _show(figures: Mapping[str, Any], json: bool) -> None:
+    from sfms_robot.cli.show_learning import show
+
     if figures["resumed_at"] == figures["steps"]:
         print(f"sfms-robot: had already finished at step {figures['steps']}", file=sys.stderr)
-    if json:
-        print(json_module.dumps(figures))
-    else:
-        for key, value in figures.items():
-            print(f"{key}: {value}")
+    show(figures, json)

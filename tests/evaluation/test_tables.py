@@ -141,8 +141,6 @@ def test_every_table_needs_only_tokenizers_that_have_a_recipe() -> None:
         assert set(tokenizer_tables.needed(name)) <= set(RECIPES)
     every = {name for table in tokenizer_tables.TABLES for name in tokenizer_tables.needed(table)}
     assert every == set(RECIPES), "none is trained in vain"
-        "none is trained in vain"
-    )
 
 
 def test_the_paper_rows_of_the_tables_are_those_of_the_paper() -> None:

@@ -1,4 +1,4 @@
-"""Data and evaluation behind `data` and `evaluate`: files in, figures out."""
+"""Behind `evaluate tokenizer` and `evaluate listener`: weights and dyads in, figures out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from rich.progress import Progress
 from sfms_robot.config import find
 from sfms_robot.corpora import clips
 from sfms_robot.corpora.collection import Order
-from sfms_robot.corpora.compose import composed
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.ports import Listener
@@ -25,14 +24,6 @@ PLACEMENTS: tuple[Strategy, ...] = ("exact", "static", "static_paper", "learned"
 
 def _stderr() -> Console:
     return Console(stderr=True)
-
-
-def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str, Any]:
-    """Compose into out/train and out/validation. Returns the minutes written per split."""
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
-    with _stderr().status(f"composing {minutes:g} minutes of dyads"):
-        return dict(composed.compose_folder(data, out, seed, minutes))
 
 
 def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dict[str, Any]:
