@@ -83,7 +83,7 @@ def balanced_accuracy(table: NDArray[np.int64]) -> float:
 
 
 @dataclass(frozen=True)
-class Lips:
+class JawTracking:
     """How a jaw follows the recorded one.
 
     Attributes:
@@ -98,16 +98,16 @@ class Lips:
     spread: float
 
 
-def lips(played: Sequence[Floats], recorded: Sequence[Floats], lags: int = LAGS) -> Lips:
+def jaw_tracking(played: Sequence[Floats], recorded: Sequence[Floats], lags: int = LAGS) -> JawTracking:
     """Motions (N, 58), made and recorded; a pair that is not longer than `lags` either way does not count."""
     long = [pair for pair in zip(played, recorded, strict=True) if len(pair[0]) > 2 * lags]
     if not long:
-        return Lips(0.0, 0, 0.0, 0.0)
+        return JawTracking(0.0, 0, 0.0, 0.0)
     played, recorded = zip(*long, strict=True)
     found = {lag: _pooled(played, recorded, lag) for lag in range(-lags, lags + 1)}
     best = max(found, key=lambda lag: (found[lag], -abs(lag)))
     spreads = [np.concatenate([one[:, JAW] - one[:, JAW].mean() for one in each]).std() for each in (played, recorded)]
-    return Lips(found[0], best, found[best], float(spreads[0] / max(spreads[1], STILL)))
+    return JawTracking(found[0], best, found[best], float(spreads[0] / max(spreads[1], STILL)))
 
 
 def _pooled(played: Sequence[Floats], recorded: Sequence[Floats], lag: int) -> float:

@@ -120,7 +120,7 @@ def rollouts(
 def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) -> OfflineRollout:
     """`rollout` from arrays. Raises ConfigError when the dyad is in a space that cannot become the listener's."""
     model, past, ahead = listener.model, listener.settings.past_frames, listener.horizon
-    heard = frames_of(dyad, listener.space, listener.hearing)
+    heard = frames_of(dyad, listener.space, listener.frontend)
     frames = len(heard.motion)
     sound = model.standardise_sound(torch.cat([torch.zeros_like(heard.sound[:1]), heard.sound]).float())
     sound = torch.where(pad(heard.heard, (1, 0))[:, None, None], sound, 0.0)

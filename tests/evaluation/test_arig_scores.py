@@ -58,26 +58,28 @@ def test_a_listener_hears_the_user_one_frame_late_and_itself_at_once():
 def test_the_lag_of_a_jaw_is_found(lag):
     values = talk(600)
     recorded, late = values[20:-20], values[20 - lag : len(values) - 20 - lag]
-    found = scores.lips([jaw(0.5 * late)], [jaw(recorded)])
+    found = scores.jaw_tracking([jaw(0.5 * late)], [jaw(recorded)])
     assert found.lag_frames == lag and found.best == pytest.approx(1, abs=1e-5)
     assert found.correlation == pytest.approx(1, abs=1e-5) if lag == 0 else found.correlation < 0.9
     assert found.spread == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_still_jaw_follows_nothing():
-    found = scores.lips([jaw(np.zeros(100))], [jaw(talk(100))])
+    found = scores.jaw_tracking([jaw(np.zeros(100))], [jaw(talk(100))])
     assert found.correlation == 0 and found.spread == 0
 
 
 def test_a_clip_too_short_to_be_shifted_does_not_count():
     first, short = talk(100), talk(20)
-    assert scores.lips([jaw(first), jaw(-short)], [jaw(first), jaw(short)]) == scores.lips([jaw(first)], [jaw(first)])
-    assert scores.lips([jaw(short)], [jaw(short)]).correlation == 0
+    assert scores.jaw_tracking([jaw(first), jaw(-short)], [jaw(first), jaw(short)]) == scores.jaw_tracking(
+        [jaw(first)], [jaw(first)]
+    )
+    assert scores.jaw_tracking([jaw(short)], [jaw(short)]).correlation == 0
 
 
 def test_clips_are_each_taken_less_their_own_mean():
     first, second = talk(200), talk(200, seed=1)
-    found = scores.lips([jaw(first), jaw(second + 5)], [jaw(first), jaw(second)])
+    found = scores.jaw_tracking([jaw(first), jaw(second + 5)], [jaw(first), jaw(second)])
     assert found.correlation == pytest.approx(1, abs=1e-4)
 
 

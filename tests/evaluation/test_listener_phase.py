@@ -11,7 +11,7 @@ from sfms_robot.corpora.clips import Dyad
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.rollout import frames_of_dyad
 from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_hearing, gather
+from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
 from sfms_robot.learning.sfms.predictor_trainer import augment, keyframe_scores
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
@@ -45,7 +45,7 @@ def dyad(frames: int = 60) -> Dyad:
 
 
 def corpus_of(one: SfmsListener, *dyads: Dyad) -> SfmsCorpus:
-    return gather(dyads, 48, one.space, one.hearing)
+    return gather(dyads, 48, one.space, one.frontend)
 
 
 @pytest.mark.parametrize("changes", [{}, {"phase": False}, {"audio": "mfcc78"}])
@@ -53,7 +53,7 @@ def corpus_of(one: SfmsListener, *dyads: Dyad) -> SfmsCorpus:
 def test_the_context_of_a_window_is_what_a_stream_remembers_there(changes, start):
     one = listener(**changes)
     corpus = corpus_of(one, dyad(60), dyad(60))
-    fit_hearing(one.model, corpus)
+    fit_sound_scales(one.model, corpus)
     memory = one.start(1)
     for frame in frames_of_dyad(dyad(60))[: start + 40]:
         _, memory = one.step(frame, memory)

@@ -161,12 +161,12 @@ def test_a_broken_history_is_named(tmp_path: Path) -> None:
 def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> None:
     seen = Windows.of(faces(), 48)
     train("one", sparse("learned"), faces(), tmp_path, Run(), seen.motion[:2])
-    looks = score_history.load(tmp_path / "one")
-    assert {look.window for look in looks} == {0, 1}
-    assert looks[0].step == 0 and looks[-1].step == 2
-    for look in looks:
-        assert len(look.keyframes) == 3 and len(look.scores) == len(look.errors) == 48
-        assert np.exp(look.scores).sum() == pytest.approx(1, abs=0.01)
+    snapshots = score_history.load(tmp_path / "one")
+    assert {snapshot.window for snapshot in snapshots} == {0, 1}
+    assert snapshots[0].step == 0 and snapshots[-1].step == 2
+    for snapshot in snapshots:
+        assert len(snapshot.keyframes) == 3 and len(snapshot.scores) == len(snapshot.errors) == 48
+        assert np.exp(snapshot.scores).sum() == pytest.approx(1, abs=0.01)
 
 
 def test_amplified_windows_keep_their_shape_and_their_best_masks() -> None:

@@ -102,7 +102,9 @@ def _lips(played: Mapping[str, Sequence[Rollout]], held_out: Mapping[str, Sequen
     found: dict[str, Any] = {}
     for scene in ("speaking", "interaction"):
         if scene in held_out:
-            one = scores.lips([each.motion[0] for each in played[scene]], [dyad.listener for dyad in held_out[scene]])
+            one = scores.jaw_tracking(
+                [each.motion[0] for each in played[scene]], [dyad.listener for dyad in held_out[scene]]
+            )
             found |= {
                 f"lips_{scene}_correlation": one.correlation,
                 f"lips_{scene}_lag_frames": one.lag_frames,

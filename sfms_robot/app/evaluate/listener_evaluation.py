@@ -84,7 +84,7 @@ def _keyframe_scores(listener: Listener, dyads: Sequence[clips.Dyad]) -> dict[st
 
     if not isinstance(listener, SfmsListener):
         return {}
-    corpus = gather(dyads, listener.settings.window_frames, listener.space, listener.hearing)
+    corpus = gather(dyads, listener.settings.window_frames, listener.space, listener.frontend)
     return keyframe_scores(listener.model, corpus, listener.settings)
 
 
@@ -109,7 +109,7 @@ def listener_table(
 
     listeners = {name: load_listener(find("listeners", name, "config.yaml")) for name in names}
     space = listener_clips.shared_space(listeners)
-    heard = {one.hearing.audio for one in listeners.values() if isinstance(one, SfmsListener)}
+    heard = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
     train, held_out = (listener_clips.spread(open_for(space.name, data, split, order, heard), most) for split, most in
                        (("train", listener_clips.TRAIN_DYADS), ("validation", limit)))  # fmt: skip
     with Progress(console=_stderr()) as progress:

@@ -27,9 +27,9 @@ def draw(folder: Path, tables: Sequence[Table], models: Mapping[str, TableModel]
     for file, name in TRAJECTORIES_OF.items():
         if name in models:
             save(trajectory_plots.cases(models[name], seen), folder / file)
-    looks = history.load(trained / HISTORY_OF) if HISTORY_OF in models else []
-    if looks:
-        save(trajectory_plots.scores_over_steps(looks), folder / "scores.png")
+    snapshots = history.load(trained / HISTORY_OF) if HISTORY_OF in models else []
+    if snapshots:
+        save(trajectory_plots.scores_over_steps(snapshots), folder / "scores.png")
     for table in tables:
         if table.name == "4":
             save(_quantiles(table), folder / "quantiles.png")

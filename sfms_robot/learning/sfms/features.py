@@ -15,7 +15,7 @@ from sfms_robot.corpora.clips import Dyad, at_rate
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.learning import corpus as dyads
 from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales, windows
-from sfms_robot.listeners.sfms.audio_frontend import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.space import MotionSpace
@@ -48,19 +48,21 @@ class SfmsFrames:
 SfmsCorpus = Corpus[SfmsFrames]
 
 
-def gather(listened: Sequence[Dyad], window: int, space: MotionSpace, hearing: Hearing | None = None) -> SfmsCorpus:
+def gather(
+    listened: Sequence[Dyad], window: int, space: MotionSpace, frontend: AudioFrontend | None = None
+) -> SfmsCorpus:
     """`corpus.gather` in one motion space.
 
-    `hearing` says what is taken from the sound; None: nothing, and nobody is heard, which is enough for a tokenizer.
+    `frontend` says what is taken from the sound; None: nothing, and nobody is heard, which is enough for a tokenizer.
     """
-    return dyads.gather({"listening": listened}, window, partial(frames_of, space=space, hearing=hearing))
+    return dyads.gather({"listening": listened}, window, partial(frames_of, space=space, frontend=frontend))
 
 
-def frames_of(dyad: Dyad, space: MotionSpace, hearing: Hearing | None = None) -> SfmsFrames:
+def frames_of(dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None) -> SfmsFrames:
     """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one."""
     face = in_space(dyad, dyad.speaker, space)
     known = face.isfinite().all(-1)
-    sound, phase = _heard(dyad, hearing)
+    sound, phase = _heard(dyad, frontend)
     return SfmsFrames(
         motion=in_space(dyad, dyad.listener, space),
         face=torch.where(known[:, None], face, 0.0),
@@ -71,26 +73,26 @@ def frames_of(dyad: Dyad, space: MotionSpace, hearing: Hearing | None = None) ->
     )
 
 
-def _heard(dyad: Dyad, hearing: Hearing | None) -> tuple[Tensor, Tensor]:
+def _heard(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
     """Sound (N, R, bins) in half precision and phase (N, F): zeros without sound, which then nobody hears."""
     frames = len(dyad.listener)
-    if hearing is None:
+    if frontend is None:
         return torch.zeros(frames, 0, 0, dtype=torch.half), torch.zeros(frames, 0)
     audio = dyad.audio if dyad.audio is not None and dyad.audio.any() else None  # zeros are no voice, not a still one
-    found: Floats | None = dyad.features.get(hearing.audio)
-    if found is None and hearing.audio == "mel" and (audio is not None or dyad.mel is not None):
+    found: Floats | None = dyad.features.get(frontend.audio)
+    if found is None and frontend.audio == "mel" and (audio is not None or dyad.mel is not None):
         found = dyad.mel_rows()
     elif found is None and audio is not None:
-        found = at_rate(hearing.rows(_whole(audio)), FRAME_HZ, frames, dyad.fps)
-    phase = np.zeros((frames, hearing.phase_features), np.float32)
-    if hearing.phased and audio is not None:
+        found = at_rate(frontend.rows(_whole(audio)), FRAME_HZ, frames, dyad.fps)
+    phase = np.zeros((frames, frontend.phase_features), np.float32)
+    if frontend.phased and audio is not None:
         phase = at_rate(phases.of_audio(_whole(audio)), FRAME_HZ, frames, dyad.fps)
-    elif hearing.phased and dyad.mel is not None:
+    elif frontend.phased and dyad.mel is not None:
         rows = dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS)
         ours = at_rate(rows, dyad.fps, math.ceil(frames * FRAME_HZ / dyad.fps), FRAME_HZ)  # phases count our frames
         phase = at_rate(phases.of_mel(ours), FRAME_HZ, frames, dyad.fps)
     sound = (
-        torch.zeros(frames, *hearing.shape) if found is None else torch.from_numpy(found).view(frames, *hearing.shape)
+        torch.zeros(frames, *frontend.shape) if found is None else torch.from_numpy(found).view(frames, *frontend.shape)
     )
     return sound.half(), torch.from_numpy(phase)
 
@@ -109,7 +111,7 @@ def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) ->
     model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
 
 
-def fit_hearing(model: SfmsModel, corpus: SfmsCorpus) -> None:
+def fit_sound_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
     """Set the means and deviations of the sound; without any they stay."""
     rows = corpus.frames.sound[corpus.frames.heard]
     if len(rows):

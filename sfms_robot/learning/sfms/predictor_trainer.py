@@ -18,13 +18,13 @@ from sfms_robot.learning.corpus import windows
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import digest_of
-from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_hearing, gather
+from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
 from sfms_robot.learning.sfms.losses import next_tokens
 from sfms_robot.learning.sfms.soft_dtw import keyframe_dtw
 from sfms_robot.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
 from sfms_robot.learning.sfms.tokens import tokenise
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms.audio_frontend import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
@@ -53,13 +53,13 @@ def train_listener(
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
-    hearing = Hearing.of(listener)
-    corpus = gather(dyads, listener.window_frames, space, hearing)
-    held_out = gather(unseen, listener.window_frames, space, hearing)
+    frontend = AudioFrontend.of(listener)
+    corpus = gather(dyads, listener.window_frames, space, frontend)
+    held_out = gather(unseen, listener.window_frames, space, frontend)
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
-    fit_hearing(model, corpus)
+    fit_sound_scales(model, corpus)
     job = listener_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
