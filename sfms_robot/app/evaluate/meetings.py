@@ -33,7 +33,7 @@ from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.ports import Listener
 
 TABLE: Final = "nod_table.yaml"  # in sim/listeners
-_TABLE_COMMENT: Final = """Nods and minutes of listening by speech phase (`evaluation.nod_table`), per series of meetings.
+_TABLE_COMMENT: Final = """Nods and minutes of listening by phase of speech (`evaluation.nod_table`), by series of meetings.
 Counted in: The AMI Meeting Corpus, AMI project consortium (Carletta et al. 2005), manual annotations 1.7, CC BY 4.0,
 http://groups.inf.ed.ac.uk/ami/corpus/; annotations taken from github Hasetomo2142/ami-corpus-preprocessing, commit
 6d845bc07b21c8862afbf38f1b1f9ab3bf40c437. Made by
