@@ -75,21 +75,6 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
     screen().print(table)
 
 
-def print_listener_table(rows: Sequence[Mapping[str, Any]]) -> None:
-    """Table 1 of the paper, a part of the face at a time, or its table 2."""
-    for part in ("expression", "rotation", ""):
-        keys = (
-            [key for key in rows[0] if key.startswith(part + " ")]
-            if part
-            else [key for key in rows[0] if key[0] == "F"]
-        )
-        if keys:
-            table = Table("", "from", *(key.removeprefix(part).strip() for key in keys), title=part or None)
-            for row in rows:
-                table.add_row(row["name"], row["source"], *(_or(row.get(key), "-") for key in keys))
-            screen().print(table)
-
-
 def _or(value: object, otherwise: str) -> str:
     if value is None:
         return otherwise

@@ -12,20 +12,19 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
-from sfms_robot.corpora.clips import Dyad
-from sfms_robot.corpora.collection import Dataset, Order, usable
+from sfms_robot.corpora.collection import Order
 from sfms_robot.corpora.formats import open_for
-from sfms_robot.learning.calibrate import calibrated
+from sfms_robot.learning.corpus import windows
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import digest_of
-from sfms_robot.learning.sfms.corpus import Corpus, context, fit_hearing, gather, windows
+from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
 from sfms_robot.learning.sfms.losses import next_tokens
-from sfms_robot.learning.sfms.losses_dtw import keyframe_dtw
-from sfms_robot.learning.sfms.tokenizer import WEIGHTS as TOKENIZER_WEIGHTS
+from sfms_robot.learning.sfms.soft_dtw import keyframe_dtw
+from sfms_robot.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
 from sfms_robot.learning.sfms.tokens import tokenise
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
@@ -33,7 +32,6 @@ from sfms_robot.listeners.sfms.stream import neutral_tokens
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import LN_PER_DB
 
-CALIBRATION_DYADS = 8
 HELD_OUT_BATCHES, HELD_OUT_BATCH = 20, 64
 
 
@@ -46,6 +44,8 @@ def train_listener(
 ) -> dict[str, Any]:
     """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
 
+    How it is sampled is calibrated afterwards, by roll-outs (`evaluation.sampling_calibration`).
+
     `order`: of the channels in the files, if not the layout's own (`open_dataset`).
 
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on; the weights
@@ -53,34 +53,24 @@ def train_listener(
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
-    hearing = Hearing.of(listener)
-    corpus = gather(dyads, listener.window_frames, space, hearing)
-    held_out = gather(unseen, listener.window_frames, space, hearing)
+    frontend = AudioFrontend.of(listener)
+    corpus = gather(dyads, listener.window_frames, space, frontend)
+    held_out = gather(unseen, listener.window_frames, space, frontend)
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
-    fit_hearing(model, corpus)
+    fit_sound_scales(model, corpus)
     job = listener_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
     checkpoint.save_config(out, corrected(settings))
     checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
-    some = _some(dyads, listener.window_frames)
-    model.cpu()  # roll-outs go frame by frame, which no GPU makes faster
-    checkpoint.save_config(out, calibrated(corrected(settings), model, some, settings.predictor))
-    scores = keyframe_scores(model, held_out, listener)
+    scores = keyframe_scores(model.cpu(), held_out, listener)
     return {**asdict(outcome), "held_out_loss": last, **scores}
 
 
-def _some(dyads: Dataset, window: int) -> list[Dyad]:
-    """A few dyads of a set, spread over it, that are as long as a window; if none of those is, the first that is."""
-    chosen = [*usable(dyads[:: max(1, len(dyads) // CALIBRATION_DYADS)])][:CALIBRATION_DYADS]
-    long = [dyad for dyad in chosen if len(dyad.listener) >= window]
-    return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
-
-
 def listener_job(
-    settings: config.Training, model: SfmsModel, corpus: Corpus, held_out: Corpus, device: torch.device
+    settings: config.Training, model: SfmsModel, corpus: SfmsCorpus, held_out: SfmsCorpus, device: torch.device
 ) -> Job:
     """Phase 2 as the loop takes it, on a model whose tokenizer is trained; moves the model to `device`."""
     phase, listener = settings.predictor, settings.listener
@@ -202,7 +192,9 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
 
 
 @torch.no_grad()
-def held_out_loss(model: SfmsModel, corpus: Corpus, settings: config.Training, tokens: Tensor | None = None) -> float:
+def held_out_loss(
+    model: SfmsModel, corpus: SfmsCorpus, settings: config.Training, tokens: Tensor | None = None
+) -> float:
     """The loss without augmentation on windows drawn with a fixed seed; `tokens` (N, G) of the corpus, if at hand."""
     model.eval()
     tokens = tokenise(model, corpus) if tokens is None else tokens
@@ -215,7 +207,7 @@ def held_out_loss(model: SfmsModel, corpus: Corpus, settings: config.Training, t
 
 
 def some_windows(
-    model: SfmsModel, corpus: Corpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
+    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
 ) -> Iterator[tuple[Context, Tensor]]:
     """Batches of contexts and the tokens (B, H, G) that came next."""
     starts = corpus.starts(listener.window_frames)
@@ -226,7 +218,7 @@ def some_windows(
 
 
 @torch.no_grad()
-def keyframe_scores(model: SfmsModel, corpus: Corpus, listener: config.Sfms) -> dict[str, float]:
+def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms) -> dict[str, float]:
     """Recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
 
     All groups and future frames pooled, on windows drawn with a fixed seed.

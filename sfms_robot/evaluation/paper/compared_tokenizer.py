@@ -14,7 +14,7 @@ from sfms_robot import config
 from sfms_robot.config import load
 from sfms_robot.evaluation.baselines.dense import DenseTokenizer
 from sfms_robot.evaluation.baselines.grouped import GroupedTokenizer
-from sfms_robot.evaluation.rate import bits_per_window
+from sfms_robot.evaluation.keyframe_bits import bits_per_window
 from sfms_robot.frames import BLENDSHAPES, CHANNELS
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import Tokenizer

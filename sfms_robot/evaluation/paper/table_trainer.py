@@ -13,13 +13,13 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.corpora.takes import Take
 from sfms_robot.evaluation.baselines.dense import DenseTokenizer, baseline_loss
-from sfms_robot.evaluation.paper.history import Diary
-from sfms_robot.evaluation.paper.model import TableModel, save
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel, save
+from sfms_robot.evaluation.paper.score_history import ScoreHistory
+from sfms_robot.learning.corpus import first_frames, windows
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import checkpoint_file
-from sfms_robot.learning.sfms.corpus import first_frames, windows
-from sfms_robot.learning.sfms.tokenizer import amplified, loss_of_steps, optimizers_of
+from sfms_robot.learning.sfms.tokenizer_trainer import amplified, loss_of_steps, optimizers_of
 from sfms_robot.listeners.sfms.model import Tokenizer
 
 GAIN: Final = 0.4  # of windows while learning (`amplified`): six minutes of faces are few
@@ -38,16 +38,16 @@ def train(
     torch.manual_seed(recipe.seed)
     model = TableModel(recipe)
     model.fit_scales(torch.cat([torch.from_numpy(take.motion) for take in takes]))
-    diary = Diary(model, watched) if watched is not None and not run.resume else None
-    fit(job(name, model.to(run.device), takes, diary), folder, run)
+    history = ScoreHistory(model, watched) if watched is not None and not run.resume else None
+    fit(job(name, model.to(run.device), takes, history), folder, run)
     save(folder, model.cpu().eval())
     checkpoint_file(folder, name).unlink(missing_ok=True)
-    if diary is not None:
-        diary.save(folder)
+    if history is not None:
+        history.save(folder)
     return model
 
 
-def job(name: str, model: TableModel, takes: Sequence[Take], diary: Diary | None = None) -> Job:
+def job(name: str, model: TableModel, takes: Sequence[Take], history: ScoreHistory | None = None) -> Job:
     """The recipe of `model` as the loop takes it. Nothing is held out: the last weights are the ones compared."""
     recipe = model.recipe
     phase = recipe.training
@@ -56,8 +56,8 @@ def job(name: str, model: TableModel, takes: Sequence[Take], diary: Diary | None
     loss_of = _loss_of(model, model.standardise(motion.to(model.motion_mean.device)), lengths)
 
     def noted(step: int, generator: torch.Generator) -> Tensor:
-        if diary is not None:
-            diary.look(step, phase.steps)
+        if history is not None:
+            history.take(step, phase.steps)
         return loss_of(step, generator)
 
     return Job(

@@ -1,4 +1,4 @@
-"""Data and evaluation behind `data` and `evaluate`: files in, figures out."""
+"""Behind `evaluate tokenizer` and `evaluate listener`: weights and dyads in, figures out."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress, TaskID
+from rich.progress import Progress
 
 from sfms_robot.config import find
 from sfms_robot.corpora import clips
 from sfms_robot.corpora.collection import Order
-from sfms_robot.corpora.compose import composed
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.ports import Listener
@@ -27,19 +26,11 @@ def _stderr() -> Console:
     return Console(stderr=True)
 
 
-def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str, Any]:
-    """Compose into out/train and out/validation. Returns the minutes written per split."""
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
-    with _stderr().status(f"composing {minutes:g} minutes of dyads"):
-        return dict(composed.compose_folder(data, out, seed, minutes))
-
-
 def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dict[str, Any]:
     """Held-out reconstruction error of a listener's tokenizer, by keyframe placement."""
     from sfms_robot.corpora.formats import open_for
-    from sfms_robot.learning.sfms.corpus import gather
-    from sfms_robot.learning.sfms.tokenizer import reconstruction_error
+    from sfms_robot.learning.sfms.features import gather
+    from sfms_robot.learning.sfms.tokenizer_trainer import reconstruction_error
     from sfms_robot.listeners.sfms import load as load_sfms
 
     listener = load_sfms(find("listeners", name, "config.yaml"))
@@ -62,7 +53,8 @@ def evaluate_listener(names: Sequence[str], data: Path, seed: int, order: Order 
     from sfms_robot.corpora.collection import usable
     from sfms_robot.corpora.formats import open_for
     from sfms_robot.corpora.resampling import at_frame_rate
-    from sfms_robot.learning.rollout import evaluate_rollout
+    from sfms_robot.evaluation.behaviour import behaviour
+    from sfms_robot.evaluation.rollout import rollouts
     from sfms_robot.listeners.registry import load_listener
 
     dyads = [at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, "validation", order))]
@@ -73,10 +65,10 @@ def evaluate_listener(names: Sequence[str], data: Path, seed: int, order: Order 
         for name in names:
             listener = load_listener(find("listeners", name, "config.yaml"))
             task = progress.add_task(name, total=len(dyads))
-            done = partial(_move, progress, task)
-            ours, theirs, _ = evaluate_rollout(listener, dyads, seed, done)
-            rows.append({"name": name, **_told(asdict(ours) | _keyframe_scores(listener, dyads))})
-    rows.append({"name": "dyads", **_told(asdict(theirs))})
+            motions = [one.motion[0] for one in rollouts(listener, dyads, seed, partial(progress.advance, task))]
+            figures = asdict(behaviour(motions, dyads)) | _keyframe_scores(listener, dyads)
+            rows.append({"name": name, **_told(figures)})
+    rows.append({"name": "dyads", **_told(asdict(behaviour([dyad.listener for dyad in dyads], dyads)))})
     return {"listeners": list(names), "dyads": len(dyads), "rows": rows}
 
 
@@ -85,18 +77,14 @@ def _told(figures: Mapping[str, float]) -> dict[str, float | None]:
     return {key: value if math.isfinite(value) else None for key, value in figures.items()}
 
 
-def _move(progress: Progress, task: TaskID, done: int, of: int) -> None:
-    progress.update(task, completed=done, total=of)
-
-
 def _keyframe_scores(listener: Listener, dyads: Sequence[clips.Dyad]) -> dict[str, float]:
-    from sfms_robot.learning.sfms.corpus import gather
-    from sfms_robot.learning.sfms.predictor_training import keyframe_scores
+    from sfms_robot.learning.sfms.features import gather
+    from sfms_robot.learning.sfms.predictor_trainer import keyframe_scores
     from sfms_robot.listeners.sfms.stream import SfmsListener
 
     if not isinstance(listener, SfmsListener):
         return {}
-    corpus = gather(dyads, listener.settings.window_frames, listener.space, listener.hearing)
+    corpus = gather(dyads, listener.settings.window_frames, listener.space, listener.frontend)
     return keyframe_scores(listener.model, corpus, listener.settings)
 
 
@@ -114,19 +102,19 @@ def listener_table(
     At most `limit` dyads, spread evenly. Raises ConfigError when the listeners do not share a motion space.
     """
     from sfms_robot.corpora.formats import open_for
-    from sfms_robot.evaluation.paper import answers
-    from sfms_robot.evaluation.paper.listeners import table
+    from sfms_robot.evaluation.paper import listener_clips
+    from sfms_robot.evaluation.paper.listener_tables import table
     from sfms_robot.listeners.registry import load_listener
     from sfms_robot.listeners.sfms.stream import SfmsListener
 
     listeners = {name: load_listener(find("listeners", name, "config.yaml")) for name in names}
-    space = answers.shared_space(listeners)
-    heard = {one.hearing.audio for one in listeners.values() if isinstance(one, SfmsListener)}
-    train, held_out = (answers.spread(open_for(space.name, data, split, order, heard), most) for split, most in
-                       (("train", answers.TRAIN_DYADS), ("validation", limit)))  # fmt: skip
+    space = listener_clips.shared_space(listeners)
+    heard = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
+    train, held_out = (listener_clips.spread(open_for(space.name, data, split, order, heard), most) for split, most in
+                       (("train", listener_clips.TRAIN_DYADS), ("validation", limit)))  # fmt: skip
     with Progress(console=_stderr()) as progress:
         task = progress.add_task("listening", total=len(held_out) * len(listeners))
-        found, given = answers.collect(
+        found, given = listener_clips.collect(
             number, listeners, space, train, held_out, range(seed, seed + samples), lambda: progress.advance(task)
         )
     return table(number, found, given, samples, seed)

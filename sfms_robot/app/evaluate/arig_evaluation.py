@@ -13,17 +13,17 @@ from rich.console import Console
 from rich.progress import Progress
 
 from sfms_robot import config
-from sfms_robot.app.train.training import TrainOptions, run_of, train_settings
+from sfms_robot.app.train.train_runs import TrainOptions, run_of, train_settings
 from sfms_robot.config import find, parse_training
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.states import UNKNOWN
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import interaction as scores
-from sfms_robot.evaluation.paper import arig as tables
-from sfms_robot.evaluation.paper.answers import spread
-from sfms_robot.evaluation.stage import Played, play_all
-from sfms_robot.learning.arig.corpus import open_scenes
+from sfms_robot.evaluation.paper import arig_tables as tables
+from sfms_robot.evaluation.paper.listener_clips import spread
+from sfms_robot.evaluation.rollout import Rollout, rollouts
+from sfms_robot.learning.arig.features import open_scenes
 from sfms_robot.learning.arig.trainer import train_arig
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.registry import load_listener
@@ -52,27 +52,25 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
         raise ConfigError(f"--listener {name}: does not speak; this looks at listeners of kind arig")
     held_out = {scene: spread(dyads, clips) for scene, dyads in open_scenes(data, "validation").items()}
     played = _played(name, listener, held_out, seed)
-    both = [(one, dyad) for scene in held_out for one, dyad in zip(played[scene], held_out[scene], strict=True)]
-    every, dyads = [one for one, _ in both], [dyad for _, dyad in both]
-    ratio = scores.border_ratio([one.motion for one in every], settings.chunk_frames)
+    every = [one for scene in held_out for one in played[scene]]
+    dyads = [dyad for each in held_out.values() for dyad in each]
+    motions = [one.motion[0] for one in every]
     return {
         "listener": name,
         "dyads": {scene: len(each) for scene, each in held_out.items()},
-        "chunk_border_acceleration_ratio": ratio,
+        "chunk_border_acceleration_ratio": scores.border_ratio(motions, settings.chunk_frames),
         "dyads_border_acceleration_ratio": scores.border_ratio([one.listener for one in dyads], settings.chunk_frames),
         **_states(every, dyads, data, clips),
         **_lips(played, held_out),
-        "jaw_left_a_second_after_speech": scores.listening_again(every, dyads),
-        "people_jaw_left_a_second_after_speech": scores.listening_again(
-            [Played(dyad.listener, one.states) for one, dyad in both], dyads
-        ),
+        "jaw_left_a_second_after_speech": scores.listening_again(motions, dyads),
+        "people_jaw_left_a_second_after_speech": scores.listening_again([dyad.listener for dyad in dyads], dyads),
     }
 
 
-def _states(played: Sequence[Played], dyads: Sequence[Dyad], data: Path, clips: int | None) -> dict[str, Any]:
+def _states(played: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips: int | None) -> dict[str, Any]:
     """The listener's answers, and beside them what training labels, where there are any, make of voices alone."""
     pairs = zip(played, dyads, strict=True)
-    labelled = [(one.states, dyad, dyad.states) for one, dyad in pairs if dyad.states is not None]
+    labelled = [(one.states[0], dyad, dyad.states) for one, dyad in pairs if dyad.states is not None]
     if not labelled or (np.concatenate([said for said, _, _ in labelled]) < 0).all():
         return {}
     said = np.concatenate([said for said, _, _ in labelled])
@@ -99,12 +97,14 @@ def _by_rule(voices: scores.Bools, data: Path, clips: int | None) -> dict[str, s
     return {"majority": majority, "voice_rule": rule(voices)}
 
 
-def _lips(played: Mapping[str, Sequence[Played]], held_out: Mapping[str, Sequence[Dyad]]) -> dict[str, Any]:
+def _lips(played: Mapping[str, Sequence[Rollout]], held_out: Mapping[str, Sequence[Dyad]]) -> dict[str, Any]:
     """On filmed recordings, and on the agent's talk in interaction."""
     found: dict[str, Any] = {}
     for scene in ("speaking", "interaction"):
         if scene in held_out:
-            one = scores.lips([each.motion for each in played[scene]], [dyad.listener for dyad in held_out[scene]])
+            one = scores.jaw_tracking(
+                [each.motion[0] for each in played[scene]], [dyad.listener for dyad in held_out[scene]]
+            )
             found |= {
                 f"lips_{scene}_correlation": one.correlation,
                 f"lips_{scene}_lag_frames": one.lag_frames,
@@ -138,7 +138,7 @@ def arig_table(
     answers = {}
     for label, folder in folders.items():
         played = _played(label, load_listener(folder), {scene: held_out}, seed)[scene]
-        answers[label] = tables.cut([one.motion for one in played])
+        answers[label] = tables.cut([one.motion[0] for one in played])
     rows = (
         tables.table_2(truth, speaker, answers)
         if number == 2
@@ -177,8 +177,8 @@ def _train(settings: config.Training | config.ArigTraining, options: TrainOption
 
 def _played(
     name: str, listener: Listener, held_out: Mapping[str, Sequence[Dyad]], seed: int
-) -> dict[str, list[Played]]:
+) -> dict[str, list[Rollout]]:
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task(name, total=sum(len(each) for each in held_out.values()))
         advance = partial(progress.advance, task)
-        return {scene: play_all(listener, dyads, seed, advance) for scene, dyads in held_out.items()}
+        return {scene: rollouts(listener, dyads, seed, advance) for scene, dyads in held_out.items()}

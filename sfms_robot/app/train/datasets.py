@@ -1,4 +1,7 @@
-"""What a data set on disk holds and what is wrong with it: every clip is read once, nothing is skipped in silence."""
+"""Behind `data`: dyads composed, and what a data set on disk holds and what is wrong with it.
+
+Of a checked set every clip is read once, and nothing is skipped in silence.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from rich.progress import Progress
 from sfms_robot.corpora import formats
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import ClipError, Dataset, Layout, Order, Problem, guarded
+from sfms_robot.corpora.compose.composed import compose_folder
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SPACE_CHANNELS, Doubles
 
@@ -163,3 +167,11 @@ def _report(dataset: Dataset, tally: _Tally, features: dict[str, int]) -> dict[s
         ],
         "notes": list(dataset.notes),
     }
+
+
+def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str, Any]:
+    """Compose into out/train and out/validation. Returns the minutes written per split."""
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
+    with Console(stderr=True).status(f"composing {minutes:g} minutes of dyads"):
+        return dict(compose_folder(data, out, seed, minutes))

@@ -1,6 +1,6 @@
 """The speaker's voice as a listener takes it in: features of the sound, and the place in a phrase. Frame by frame.
 
-One path offline and streaming: `Hearing.rows` of a whole recording gives what `Hearing.step` gives frame by frame.
+One path offline and streaming: `rows` of a whole recording gives what `step` gives frame by frame.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SHAPES: Final[Mapping[Audio, tuple[int, int]]] = {
 
 
 @dataclass(frozen=True)
-class Ears:
+class AudioState:
     """What a stream of sound has to remember: samples that unfinished rows need, and the phrase so far."""
 
     sound: Floats
@@ -38,7 +38,7 @@ class Ears:
 
 
 @dataclass(frozen=True)
-class Hearing:
+class AudioFrontend:
     """How sound becomes features: `audio` names them; with `phased`, the place in a phrase as well.
 
     `model` makes the features of wav2vec2; without it they have to come with the data.
@@ -49,7 +49,7 @@ class Hearing:
     model: Wav2Vec2 | None = None
 
     @classmethod
-    def of(cls, settings: config.Sfms, folder: Path | None = None) -> Hearing:
+    def of(cls, settings: config.Sfms, folder: Path | None = None) -> AudioFrontend:
         """A relative model folder is looked for in the listener's `folder`. Raises ConfigError or ModelError."""
         if settings.wav2vec2 is None:
             return cls(settings.audio, settings.phase)
@@ -71,17 +71,17 @@ class Hearing:
     def phase_features(self) -> int:
         return phase.FEATURES if self.phased else 0
 
-    def start(self) -> Ears:
+    def start(self) -> AudioState:
         """Nothing heard yet."""
-        return Ears(self._start(), phase.start() if self.phased else None)
+        return AudioState(self._start(), phase.start() if self.phased else None)
 
-    def step(self, samples: Floats, ears: Ears) -> tuple[Floats, Floats, Ears]:
-        """Samples (640,) of one frame, or none -> rows (R, bins), phase (F,), and the ears of the next frame."""
-        rows, sound = self._rows(samples if len(samples) else np.zeros(FRAME_SAMPLES, np.float32), ears.sound)
-        if ears.phase is None:
-            return rows, np.zeros(0, np.float32), Ears(sound, None)
-        features, state = phase.step(samples, ears.phase)
-        return rows, features, Ears(sound, state)
+    def step(self, samples: Floats, audio: AudioState) -> tuple[Floats, Floats, AudioState]:
+        """Samples (640,) of one frame, or none -> rows (R, bins), phase (F,), and the audio of the next frame."""
+        rows, sound = self._rows(samples if len(samples) else np.zeros(FRAME_SAMPLES, np.float32), audio.sound)
+        if audio.phase is None:
+            return rows, np.zeros(0, np.float32), AudioState(sound, None)
+        features, state = phase.step(samples, audio.phase)
+        return rows, features, AudioState(sound, state)
 
     def rows(self, audio: Floats) -> Floats:
         """Samples (N * 640,) -> rows (N * R, bins)."""

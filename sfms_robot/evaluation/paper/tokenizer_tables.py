@@ -6,13 +6,13 @@ what can be compared is how many times one row is better than another.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sfms_robot.evaluation.paper.model import TableModel
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.evaluation.paper.recipes import KEYFRAMES
-from sfms_robot.evaluation.paper.score import Score, Windows, score
+from sfms_robot.evaluation.paper.restoration import Score, Windows, score
 from sfms_robot.listeners.sfms.placement import Strategy
 
 UNEQUAL: Final = "unequal bits"
@@ -124,3 +124,36 @@ def ratios_4(rows: Sequence[Row]) -> dict[str, float]:
         "paper_sparse_fsq_to_dense": round(0.03 / 0.73, 3),
         "paper_sparse_fsq_to_l2l": round(0.03 / 1.44, 3),
     }
+
+
+Ratios = Mapping[str, Any]
+_TABLES: Final[Mapping[str, tuple[Sequence[Spec], Callable[[Sequence[Row]], Ratios]]]] = {
+    "3": (TABLE_3, ratios_3),
+    "4": (TABLE_4, ratios_4),
+}
+TABLES: Final = tuple(_TABLES)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows, and figures that compare them, as plain data."""
+
+    name: str
+    rows: Sequence[Row]
+    ratios: Ratios
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON tells it."""
+        return {"table": int(self.name), "rows": [row.plain() for row in self.rows], "ratios": self.ratios}
+
+
+def needed(name: str) -> list[str]:
+    """Names of the tokenizers that a table compares."""
+    return list(dict.fromkeys(spec.tokenizer for spec in _TABLES[name][0]))
+
+
+def build(name: str, models: Mapping[str, TableModel], seen: Windows) -> Table:
+    """Score every tokenizer of a table on these windows."""
+    specs, ratios = _TABLES[name]
+    found = scored(specs, models, seen)
+    return Table(name, found, ratios(found))

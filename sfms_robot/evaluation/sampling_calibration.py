@@ -10,7 +10,8 @@ in silence are the recipe's: a few dyads hold far too few nods to tell when they
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,26 +19,67 @@ from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
+from sfms_robot.corpora.collection import Dataset, Order, usable
+from sfms_robot.corpora.formats import open_for
+from sfms_robot.evaluation.rollout import OfflineRollout, offline_rollout
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Floats
-from sfms_robot.learning.answers import Answers, answers, heard_by
-from sfms_robot.learning.sfms.corpus import gather
+from sfms_robot.learning.corpus import in_space
+from sfms_robot.learning.sfms.features import gather
+from sfms_robot.learning.sfms.predictor_trainer import corrected
 from sfms_robot.learning.sfms.tokens import tokenise
+from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
-from sfms_robot.signals import events as timing
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals import events
 
+DYADS = 8  # that are listened to
 LARGEST_STEP = 1.0  # of a bias, per round
 STREAMS = 4  # of every dyad, side by side
 PITCH = ("pitch", "rotation_x", "head_x")  # what a nod moves, in any motion space
 
+Progress = Callable[[], object]
+
+
+def calibrate(
+    training: config.Training, data: Path, out: Path, order: Order | None = None, each: Progress = lambda: None
+) -> None:
+    """Fit how the listener trained in `out` is sampled, on some training dyads, and write `out`/config.yaml anew.
+
+    Blocks for minutes; `each()` is called after every round of roll-outs, `rounds(training)` times.
+    """
+    settings, space = training.listener, MotionSpace.of(training.listener)
+    model = SfmsModel(settings)
+    checkpoint.load_weights(out / checkpoint.WEIGHTS, model)
+    some = _some(open_for(space.name, data, "train", order, [settings.audio]), settings.window_frames)
+    checkpoint.save_config(out, calibrated(corrected(training), model, some, training.predictor, each=each))
+
+
+def rounds(training: config.Training) -> int:
+    """Rounds of roll-outs that `calibrate` takes."""
+    return training.predictor.calibration_rounds + len(training.predictor.nod_nuclei)
+
+
+def _some(dyads: Dataset, window: int) -> list[Dyad]:
+    """A few dyads of a set, spread over it, that are as long as a window; if none of those is, the first that is."""
+    chosen = [*usable(dyads[:: max(1, len(dyads) // DYADS)])][:DYADS]
+    long = [dyad for dyad in chosen if len(dyad.listener) >= window]
+    return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
+
 
 def calibrated(
-    settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], training: config.PredictorTraining, seed: int = 1
+    settings: config.Sfms,
+    model: SfmsModel,
+    dyads: Sequence[Dyad],
+    training: config.PredictorTraining,
+    seed: int = 1,
+    each: Progress = lambda: None,
 ) -> config.Sfms:
     """`settings` with biases and nucleus fitted on `dyads`. The model is left in evaluation mode."""
     for _ in range(training.calibration_rounds):
         settings = placing(settings, model, dyads, seed)
-    return nodding(settings, model, dyads, training.nod_nuclei, seed) if training.nod_nuclei else settings
+        each()
+    return nodding(settings, model, dyads, training.nod_nuclei, seed, each) if training.nod_nuclei else settings
 
 
 def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: int) -> config.Sfms:
@@ -54,17 +96,24 @@ def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed
 
 
 def nodding(
-    settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], nuclei: Sequence[float], seed: int
+    settings: config.Sfms,
+    model: SfmsModel,
+    dyads: Sequence[Dyad],
+    nuclei: Sequence[float],
+    seed: int,
+    each: Progress = lambda: None,
 ) -> config.Sfms:
     """The nucleus of `nuclei`, for the group that pitches the head, with which nods are as many as in the data."""
     people = SfmsListener(settings, model)
-    wanted = nods_per_minute([_shown(people, heard_by(people, dyad).motion[None]) for dyad in dyads], dyads)
+    theirs = [_shown(people, in_space(dyad, dyad.listener, people.space)[None]) for dyad in dyads]
+    wanted = nods_per_minute(theirs, dyads)
     tried = [_with_nucleus(settings, nucleus) for nucleus in nuclei]
     away = []
-    for one in tried:
-        listener = SfmsListener(one, model)
-        shown = [_shown(listener, answer.motion) for answer in _rolled_out(listener, dyads, seed)]
+    for attempt in tried:
+        listener = SfmsListener(attempt, model)
+        shown = [_shown(listener, one.motion) for one in _rolled_out(listener, dyads, seed)]
         away.append(abs(math.log((nods_per_minute(shown, dyads) + 0.1) / (wanted + 0.1))))
+        each()
     return tried[int(np.argmin(away))]
 
 
@@ -74,7 +123,7 @@ def nods_per_minute(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
     for motion, dyad in zip(motions, dyads, strict=True):
         for one in motion:
             starts = [
-                int(start * FRAME_HZ) for start, _, _ in timing.find_nods(one[:, CHANNEL_INDEX["pitch"]], FRAME_HZ)
+                int(start * FRAME_HZ) for start, _, _ in events.find_nods(one[:, CHANNEL_INDEX["pitch"]], FRAME_HZ)
             ]
             onsets += int(dyad.listening[starts].sum())
             minutes += float(dyad.listening.sum()) / FRAME_HZ / 60
@@ -89,9 +138,9 @@ def _with_nucleus(settings: config.Sfms, nucleus: float) -> config.Sfms:
     return settings.model_copy(update={"groups": groups})
 
 
-def _rolled_out(listener: SfmsListener, dyads: Sequence[Dyad], seed: int) -> list[Answers]:
+def _rolled_out(listener: SfmsListener, dyads: Sequence[Dyad], seed: int) -> list[OfflineRollout]:
     return [
-        answers(listener, heard_by(listener, dyad), range(seed + STREAMS * index, seed + STREAMS * (index + 1)))
+        offline_rollout(listener, dyad, range(seed + STREAMS * index, seed + STREAMS * (index + 1)))
         for index, dyad in enumerate(dyads)
     ]
 

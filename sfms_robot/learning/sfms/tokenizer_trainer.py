@@ -15,10 +15,11 @@ from sfms_robot import config
 from sfms_robot.corpora.collection import Order
 from sfms_robot.corpora.formats import open_for
 from sfms_robot.frames import FRAME_HZ
+from sfms_robot.learning.corpus import first_frames, windows
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
-from sfms_robot.learning.sfms.corpus import Corpus, first_frames, fit_scales, gather, windows
-from sfms_robot.learning.sfms.keyframe_scores import imitation, lively
+from sfms_robot.learning.sfms.features import SfmsCorpus, fit_scales, gather
+from sfms_robot.learning.sfms.imitation import imitation, lively
 from sfms_robot.learning.sfms.losses import masking, reconstruction
 from sfms_robot.learning.sfms.masks import batches
 from sfms_robot.listeners import checkpoint
@@ -69,14 +70,14 @@ def train_tokenizer(
 
 
 def tokenizer_job(
-    settings: config.Training, model: SfmsModel, corpus: Corpus, held_out: Corpus, device: torch.device
+    settings: config.Training, model: SfmsModel, corpus: SfmsCorpus, held_out: SfmsCorpus, device: torch.device
 ) -> Job:
     """Phase 1 as the loop takes it; moves the model to `device`."""
     phase, tokenizer = settings.tokenizer, model.tokenizer
     fingerprint = corpus.fingerprint()
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
-    motion = model.standardise(corpus.motion)
+    motion = model.standardise(corpus.frames.motion)
     return Job(
         name="tokenizer",
         model=model,
@@ -190,13 +191,13 @@ def learned_loss(
     return motion + phase.mask_loss * torch.stack([masking(relaxed, target) for _, relaxed in draws]).mean()
 
 
-def held_out_windows(model: SfmsModel, corpus: Corpus) -> Tensor:
+def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Consecutive windows (W, T, C), standardised."""
     window = model.tokenizer.window
-    return windows(model.standardise(corpus.motion), first_frames(corpus.lengths, window, window), window)
+    return windows(model.standardise(corpus.frames.motion), first_frames(corpus.lengths, window, window), window)
 
 
-def _held_out(model: SfmsModel, corpus: Corpus) -> Callable[[], float]:
+def _held_out(model: SfmsModel, corpus: SfmsCorpus) -> Callable[[], float]:
     """Error to watch: with the masks that training uses, placed once, since conditional scores take their time."""
     tokenizer = model.tokenizer
     if not isinstance(tokenizer.score, ConditionalScore):
@@ -218,7 +219,7 @@ def window_errors(tokenizer: Tokenizer, motion: Tensor, mask: Tensor) -> Tensor:
 
 @torch.no_grad()
 def reconstruction_error(
-    model: SfmsModel, corpus: Corpus, strategy: Strategy | None = None, keyframes: Sequence[int] | None = None
+    model: SfmsModel, corpus: SfmsCorpus, strategy: Strategy | None = None, keyframes: Sequence[int] | None = None
 ) -> float:
     """Mean squared error on consecutive windows, in standardised units; another placement may be asked for."""
     tokenizer = model.tokenizer

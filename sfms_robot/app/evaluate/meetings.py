@@ -28,12 +28,12 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import nod_table
 from sfms_robot.evaluation import timing as evaluation
-from sfms_robot.learning.rollout import roll_out_many
+from sfms_robot.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.ports import Listener
 
 TABLE: Final = "nod_table.yaml"  # in sim/listeners
-_TABLE_COMMENT: Final = """Nods and minutes of listening by speech phase (`learning.nod_table`), per series of meetings.
+_TABLE_COMMENT: Final = """Nods and minutes of listening by phase of speech (`evaluation.nod_table`), by series of meetings.
 Counted in: The AMI Meeting Corpus, AMI project consortium (Carletta et al. 2005), manual annotations 1.7, CC BY 4.0,
 http://groups.inf.ed.ac.uk/ami/corpus/; annotations taken from github Hasetomo2142/ami-corpus-preprocessing, commit
 6d845bc07b21c8862afbf38f1b1f9ab3bf40c437. Made by
@@ -137,7 +137,7 @@ def _play(folder: Path, part: _Part) -> tuple[evaluation.Scene, evaluation.Answe
     rng = np.random.default_rng([part.seed, part.number])
     scene = evaluation.scene(part.person, part.minutes, voices, motions, rng)
     first = 1000 * (part.seed + part.number)
-    played = roll_out_many(_listener(folder), scene.speaker, range(first, first + part.seeds))
+    played = rollout(_listener(folder), scene.speaker, range(first, first + part.seeds)).motion
     return replace(scene, speaker=()), evaluation.observe(played)
 
 

@@ -20,7 +20,7 @@ WIDTHS: Final = {"mel": MEL_WIDTH + phase.FEATURES, "wav2vec2": 768 + phase.FEAT
 
 
 @dataclass(frozen=True)
-class Ears:
+class AudioState:
     """What a stream remembers of one track: samples that unfinished mel rows need, and the phrase."""
 
     past: Floats
@@ -32,13 +32,13 @@ class Ears:
         return self.phase.ear.active
 
 
-def start() -> Ears:
+def start() -> AudioState:
     """Silence so far."""
-    return Ears(mel.start(), phase.start())
+    return AudioState(mel.start(), phase.start())
 
 
-def hear(samples: Floats | None, ears: Ears) -> tuple[Floats, bool, Ears]:
-    """One frame: (640,) samples, or none when nothing can be heard -> features (533,), present, and the next ears.
+def hear(samples: Floats | None, before: AudioState) -> tuple[Floats, bool, AudioState]:
+    """One frame: (640,) samples, or none when nothing can be heard -> features (533,), present, and the next state.
 
     Samples that are not finite are silence. Raises ValueError for another length.
     """
@@ -48,9 +48,9 @@ def hear(samples: Floats | None, ears: Ears) -> tuple[Floats, bool, Ears]:
     if len(samples) != FRAME_SAMPLES:
         raise ValueError(f"a frame at 16000 Hz has {FRAME_SAMPLES} samples or none, got {len(samples)}")
     clean = _finite(samples)
-    rows, past = mel.log_mel(clean, ears.past)
-    spoken, state = phase.step(clean, ears.phase)
-    return np.concatenate([rows.reshape(-1), spoken]), present, Ears(past, state)
+    rows, past = mel.log_mel(clean, before.past)
+    spoken, state = phase.step(clean, before.phase)
+    return np.concatenate([rows.reshape(-1), spoken]), present, AudioState(past, state)
 
 
 def track(samples: Floats) -> tuple[Floats, NDArray[np.bool_]]:

@@ -12,11 +12,11 @@ import torch
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Dataset, usable
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.paper.listeners import FRAMES, NEEDED_FRAMES, Clips, cut
+from sfms_robot.evaluation.paper.listener_tables import FRAMES, NEEDED_FRAMES, Clips, cut
+from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.frames import FRAME_HZ, Doubles
-from sfms_robot.learning.answers import answers, heard_by
-from sfms_robot.learning.rollout import roll_out_many, speaker_frames
-from sfms_robot.learning.sfms.corpus import gather
+from sfms_robot.learning.corpus import in_space
+from sfms_robot.learning.sfms.features import frames_of
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.ports import Listener
@@ -62,8 +62,8 @@ def collect(
     A listener hears a dyad from its beginning; clips are cut out of what it did. `each()` is called after every dyad of
     every listener. Raises ConfigError when the dyads are too short for the table's metrics.
     """
-    learned = [np.asarray(gather([dyad], 1, space).motion) for dyad in train]
-    heard = [gather([dyad], 1, space) for dyad in held_out]
+    learned = [np.asarray(in_space(dyad, dyad.listener, space)) for dyad in train]
+    heard = [frames_of(dyad, space) for dyad in held_out]
     longest = max(len(one.motion) for one in heard)
     frames = min(FRAMES[number], longest, max(len(one) for one in learned))
     if frames < NEEDED_FRAMES[number]:
@@ -86,7 +86,7 @@ def collect(
 def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int]) -> Doubles:
     """(S, N, D) in the space."""
     if isinstance(listener, SfmsListener):
-        return np.asarray(answers(listener, heard_by(listener, dyad), seeds).motion)
+        return np.asarray(offline_rollout(listener, dyad, seeds).motion)
     if dyad.space != "arkit58":
         raise ConfigError(
             f"dyad {dyad.name} is in {dyad.space}: a listener of another kind than sfms takes faces alone"
@@ -95,5 +95,4 @@ def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequenc
         raise ConfigError(
             f"dyad {dyad.name} has {dyad.fps:g} frames a second: such a listener is streamed at {FRAME_HZ}"
         )
-    shown = roll_out_many(listener, speaker_frames(dyad), seeds)
-    return np.stack([space.encode(one) for one in shown])
+    return np.stack([space.encode(one) for one in rollout(listener, frames_of_dyad(dyad), seeds).motion])

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.evaluation import metrics
-from sfms_robot.evaluation.paper.listeners import centres_of
+from sfms_robot.evaluation.paper.listener_tables import centres_of
 from sfms_robot.frames import POSE, SHAPES, Doubles, Floats
 
 CLIP_FRAMES: Final = 250

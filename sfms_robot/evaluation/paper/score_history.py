@@ -12,17 +12,17 @@ from torch import Tensor
 
 from sfms_robot.errors import ModelError
 from sfms_robot.evaluation.baselines.dense import DenseTokenizer
-from sfms_robot.evaluation.paper.model import TableModel
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.placement import place
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks
 
 FILE: Final = "history.json"
-LOOKS: Final = (0.0, 0.03, 0.1, 0.3, 1.0)  # shares of the steps
+SNAPSHOTS_AT: Final = (0.0, 0.03, 0.1, 0.3, 1.0)  # shares of the steps
 
 
 @dataclass(frozen=True)
-class Look:
+class Snapshot:
     """One window at one step, seen through one channel group.
 
     Attributes:
@@ -39,21 +39,21 @@ class Look:
     errors: list[float]
 
 
-class Diary:
+class ScoreHistory:
     """Writes down what the model does with some windows (W, T, C) in our units, one busy group of each."""
 
     def __init__(self, model: TableModel, watched: Tensor) -> None:
         self.model = model
         self.watched = watched
-        self.looks: list[Look] = []
+        self.snapshots: list[Snapshot] = []
 
     @torch.no_grad()
-    def look(self, step: int, steps: int) -> None:
-        """Look before this step, when one of `LOOKS` has come."""
+    def take(self, step: int, steps: int) -> None:
+        """Take snapshots before this step, when one of `SNAPSHOTS_AT` has come."""
         tokenizer = self.model.tokenizer
         device = self.model.motion_mean.device
         watched = self.model.standardise(self.watched.to(device))
-        due = {min(steps - 1, round(share * steps)) for share in LOOKS}
+        due = {min(steps - 1, round(share * steps)) for share in SNAPSHOTS_AT}
         if step not in due or isinstance(tokenizer, DenseTokenizer) or tokenizer.score is None:
             return
         scores, mask = _scores(tokenizer, watched), _mask(tokenizer, watched)
@@ -63,22 +63,22 @@ class Diary:
         for window, group in enumerate(busy.tolist()):
             chosen = mask[window, :, group].nonzero()[:, 0].tolist()
             curve = scores[window, :, group].tolist()
-            self.looks.append(Look(step, window, group, curve, chosen, errors[window].tolist()))
+            self.snapshots.append(Snapshot(step, window, group, curve, chosen, errors[window].tolist()))
 
     def save(self, folder: Path) -> None:
         """Write `folder`/history.json, where there is something to tell."""
-        if self.looks:
-            rounded = [{k: _rounded(v) for k, v in asdict(look).items()} for look in self.looks]
+        if self.snapshots:
+            rounded = [{k: _rounded(v) for k, v in asdict(snapshot).items()} for snapshot in self.snapshots]
             (folder / FILE).write_text(json.dumps(rounded), encoding="utf-8")
 
 
-def load(folder: Path) -> list[Look]:
-    """The looks of a folder; none where nobody looked. Raises ModelError."""
+def load(folder: Path) -> list[Snapshot]:
+    """The snapshots of a folder; none where none were taken. Raises ModelError."""
     file = folder / FILE
     if not file.is_file():
         return []
     try:
-        return [Look(**look) for look in json.loads(file.read_text(encoding="utf-8"))]
+        return [Snapshot(**snapshot) for snapshot in json.loads(file.read_text(encoding="utf-8"))]
     except (ValueError, TypeError) as error:
         raise ModelError(f"{file}: not the history of a tokenizer: {error}") from error
 

@@ -16,11 +16,11 @@ from sfms_robot.corpora import takes
 from sfms_robot.corpora.takes import Take
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.paper import model as models
-from sfms_robot.evaluation.paper.model import TableModel
+from sfms_robot.evaluation.paper import compared_tokenizer as models
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.evaluation.paper.recipes import SIZES, SizeName
-from sfms_robot.evaluation.paper.score import Windows
-from sfms_robot.evaluation.paper.tables import TABLES, Table, build, needed
+from sfms_robot.evaluation.paper.restoration import Windows
+from sfms_robot.evaluation.paper.tokenizer_tables import TABLES, Table, build, needed
 
 ALL: Final = "all"
 RECORDED: Final = "takes.npz"

@@ -7,20 +7,24 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from rich.console import Console
+from rich.progress import Progress
 
 from sfms_robot import config
 from sfms_robot.config import load_training, parse_training
 from sfms_robot.corpora.collection import Order
 from sfms_robot.errors import ConfigError
+from sfms_robot.evaluation.sampling_calibration import calibrate, rounds
 from sfms_robot.learning.arig.trainer import train_arig
 from sfms_robot.learning.job import Run
 from sfms_robot.learning.resume import checkpoint_file
-from sfms_robot.learning.sfms import predictor_training as listener
-from sfms_robot.learning.sfms import tokenizer
+from sfms_robot.learning.sfms import predictor_trainer as listener
+from sfms_robot.learning.sfms import tokenizer_trainer as tokenizer
 from sfms_robot.learning.watch import Watch, progress_bar, tensorboard, together
 from sfms_robot.listeners import checkpoint
 
@@ -68,7 +72,15 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
         began_s = time.monotonic()
         if isinstance(settings, config.ArigTraining):
             return _timed(train_arig(settings, options.data, options.out, run), began_s)
-        return _timed(listener.train_listener(settings, options.data, options.out, run, options.order), began_s)
+        figures = listener.train_listener(settings, options.data, options.out, run, options.order)
+        _calibrate(settings, options)
+        return _timed(figures, began_s)
+
+
+def _calibrate(settings: config.Training, options: TrainOptions) -> None:
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task("calibrating by roll-outs", total=rounds(settings))
+        calibrate(settings, options.data, options.out, options.order, partial(progress.advance, task))
 
 
 def _spare(options: TrainOptions, weights: str, job: str) -> None:
