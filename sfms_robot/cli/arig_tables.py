@@ -7,8 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from sfms_robot.cli.screen import screen
-from sfms_robot.cli.tables import print_rows
+from sfms_robot.cli.show import print_rows, screen
 
 
 def print_interaction(result: Mapping[str, Any]) -> None:

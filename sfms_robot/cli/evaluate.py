@@ -106,7 +106,7 @@ def listener_(
     if json:
         print(json_module.dumps(result))
     else:
-        from sfms_robot.cli.tables import print_listener_table
+        from sfms_robot.cli.show import print_listener_table
 
         print_listener_table(result["rows"])
         typer.echo(
@@ -176,6 +176,6 @@ def _print(result: Mapping[str, Any], json: bool) -> None:
     if json:
         print(json_module.dumps(result))
     else:
-        from sfms_robot.cli.tables import print_rows
+        from sfms_robot.cli.show import print_rows
 
         print_rows(result["rows"])

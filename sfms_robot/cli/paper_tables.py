@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sfms_robot.cli.screen import screen
+from sfms_robot.cli.show import screen
 
 TITLES = {
     "3": "Table III: where keyframes go",
