@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.signal import find_peaks
 
-from sfms_robot.app.replay.recording import RunRecording
+from sfms_robot.app.replay.run_file import RunRecording
 from sfms_robot.errors import ConfigError, MissingExtra
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_S, Doubles, Floats
 
