@@ -47,7 +47,7 @@ def bench(
     if json:
         print(json_module.dumps(result))
     else:
-        from sfms_robot.cli.tables import print_bench
+        from sfms_robot.cli.show import print_bench
 
         print_bench(result)
 
@@ -58,7 +58,7 @@ def _trial(name: Bench, minutes: float, json: bool) -> None:
     from dataclasses import asdict
 
     from sfms_robot.app.bench import campaign, fuzz
-    from sfms_robot.cli.tables import print_rows
+    from sfms_robot.cli.show import print_rows
 
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
 

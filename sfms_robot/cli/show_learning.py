@@ -9,8 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sfms_robot.cli.screen import screen
-from sfms_robot.cli.tables import print_rows
+from sfms_robot.cli.show import print_rows, screen
 
 _SHOWN = 3  # names of a problem; --json has them all
 

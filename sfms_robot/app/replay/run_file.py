@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import struct
-from collections.abc import Iterator, Mapping
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,7 @@ class RunRecording:
         about: what the run wrote about itself (head, listener, seed, ...).
         joints: (J,) names.
         times_s: (N,) of the ticks. motion: (N, 58) the face asked for.
-        goals_rad, present_rad: (N, J); present is NaN where no servo answered.
+        goals_rad, present_rad: (N, J) float32; present is NaN where no servo answered.
         faults: (N, J) a named fault is there.
         heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
         energy_db: (M,). speaker: (M, 58) NaN where no face was seen.
@@ -44,8 +46,8 @@ class RunRecording:
     joints: tuple[str, ...]
     times_s: Doubles
     motion: Floats
-    goals_rad: Doubles
-    present_rad: Doubles
+    goals_rad: Floats
+    present_rad: Floats
     faults: NDArray[np.bool_]
     heard_s: Doubles
     audio: Floats
@@ -98,27 +100,22 @@ def read_recording(folder: Path | str) -> RunRecording:
     if not file.is_file():
         what = f"has no {RUN_FILE}" if Path(folder).is_dir() else "is no folder"
         raise ConfigError(f"{folder}: {what}: not what `sfms-robot run --record DIR` wrote")
-    about: dict[str, str] = {}
-    bodies: dict[str, list[Any]] = {"/speaker": [], "/plan": [], "/face": [], "/joints": []}
-    whole = False
+    found = _Found()
     try:
         for kind, value in _records(file):
-            if kind == "about":
-                about = value
-            elif kind == "end":
-                whole = True
-            elif kind in bodies:
-                bodies[kind].append(value)
+            found.take(kind, value)
     except (EndOfFile, struct.error) as error:
-        if not bodies["/joints"]:
+        if not found.ticks:
             raise ConfigError(f"{file}: holds no tick: the file is cut off") from error
     except McapError as error:
         raise ConfigError(f"{file}: not a recorded run: {error}") from error
     except Exception as error:  # a broken chunk: each compressor has errors of its own
         raise ConfigError(f"{file}: damaged: {error}") from error
-    if not bodies["/joints"]:
-        raise ConfigError(f"{file}: holds no tick: " + ("the run never began" if whole else "the file is cut off"))
-    return _arrays(about, bodies, whole)
+    if not found.ticks:
+        raise ConfigError(
+            f"{file}: holds no tick: " + ("the run never began" if found.whole else "the file is cut off")
+        )
+    return found.recording()
 
 
 def summary(recording: RunRecording) -> dict[str, Any]:
@@ -150,38 +147,78 @@ def _records(file: Path) -> Iterator[tuple[str, Any]]:
                 yield "end", None
 
 
-def _arrays(about: Mapping[str, str], bodies: Mapping[str, list[Any]], whole: bool) -> RunRecording:
-    ticks = min(len(bodies["/face"]), len(bodies["/joints"]))  # a cut may fall between the two
-    faces, moved, heard = bodies["/face"][:ticks], bodies["/joints"][:ticks], bodies["/speaker"]
-    joints = tuple(json.loads(about["joints"]))
-    return RunRecording(
-        about,
-        joints,
-        np.array([body["time_s"] for body in moved], dtype=np.float64),
-        np.array([_by_channel(body) for body in faces], dtype=np.float32),
-        _joint_values(moved, joints, "goal_rad"),
-        _joint_values(moved, joints, "present_rad"),
-        np.array([[body["joints"][name]["fault"] is not None for name in joints] for body in moved], dtype=np.bool_),
-        np.array([body["time_s"] for body in heard], dtype=np.float64),
-        np.concatenate([np.zeros(0, dtype=np.float32), *map(_samples, heard)]),
-        np.array([body["energy_db"] for body in heard], dtype=np.float64),
-        np.array([_by_channel(body["face"]) for body in heard], dtype=np.float32).reshape(-1, MOTION_DIM),
-        len(bodies["/plan"]),
-        whole,
-    )
+class _Found:
+    """What was read so far, number by number: messages as they come take twenty times as much."""
+
+    def __init__(self) -> None:
+        self.about: dict[str, str] = {}
+        self.whole = False
+        self._joints: tuple[str, ...] = ()
+        self._plans = 0
+        self._times_s, self._heard_s, self._energy_db = (array("d") for _ in range(3))
+        self._motion, self._goals_rad, self._present_rad, self._speaker = (array("f") for _ in range(4))
+        self._faults, self._pcm16 = bytearray(), bytearray()
+
+    @property
+    def ticks(self) -> int:
+        """Whole ones: a cut may fall between the face and the joints of one."""
+        return min(len(self._times_s), len(self._motion) // MOTION_DIM)
+
+    def take(self, kind: str, value: Any) -> None:
+        """One record of `_records`."""
+        if kind == "about":
+            self.about = value
+            self._joints = tuple(json.loads(value["joints"]))
+        elif kind == "end":
+            self.whole = True
+        elif kind == "/plan":
+            self._plans += 1
+        elif kind == "/face":
+            self._motion.extend(_by_channel(value))
+        elif kind == "/joints":
+            self._tick(value["time_s"], [value["joints"][name] for name in self._joints])
+        elif kind == "/speaker":
+            self._heard_s.append(value["time_s"])
+            self._energy_db.append(value["energy_db"])
+            self._speaker.extend(_by_channel(value["face"]))
+            self._pcm16 += _samples(value)
+
+    def _tick(self, time_s: float, joints: Sequence[Mapping[str, Any]]) -> None:
+        self._times_s.append(time_s)
+        self._goals_rad.extend(joint["goal_rad"] for joint in joints)
+        self._present_rad.extend(_or_nan(joint["present_rad"]) for joint in joints)
+        self._faults += bytes(joint["fault"] is not None for joint in joints)
+
+    def recording(self) -> RunRecording:
+        count, ticks = len(self._joints), self.ticks
+        by_joint = [np.array(values, dtype=np.float32) for values in (self._goals_rad, self._present_rad)]
+        goals_rad, present_rad = (values.reshape(-1, count)[:ticks] for values in by_joint)
+        return RunRecording(
+            self.about,
+            self._joints,
+            np.array(self._times_s)[:ticks],
+            np.array(self._motion, dtype=np.float32).reshape(-1, MOTION_DIM)[:ticks],
+            goals_rad,
+            present_rad,
+            np.frombuffer(self._faults, dtype=np.bool_).reshape(-1, count)[:ticks],
+            np.array(self._heard_s),
+            np.frombuffer(self._pcm16, dtype="<i2").astype(np.float32) / np.float32(32767),
+            np.array(self._energy_db),
+            np.array(self._speaker, dtype=np.float32).reshape(-1, MOTION_DIM),
+            self._plans,
+            self.whole,
+        )
 
 
-def _by_channel(body: Mapping[str, float | None] | None) -> list[float | None]:
-    return [None if body is None else body[name] for name in CHANNELS]
+def _by_channel(body: Mapping[str, float | None] | None) -> list[float]:
+    return [math.nan if body is None else _or_nan(body[name]) for name in CHANNELS]
 
 
-def _joint_values(moved: list[Any], joints: tuple[str, ...], key: str) -> Doubles:
-    return np.array([[body["joints"][name][key] for name in joints] for body in moved], dtype=np.float64)
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
-def _samples(body: Mapping[str, Any]) -> Floats:
+def _samples(body: Mapping[str, Any]) -> bytes:
     """The samples of one frame, always 640 of them, so that they stay in step with the clock."""
-    out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-    pcm = np.frombuffer(base64.b64decode(body["audio_pcm16"]), dtype="<i2")[:FRAME_SAMPLES]
-    out[: len(pcm)] = pcm / np.float32(32767)
-    return out
+    size = 2 * FRAME_SAMPLES
+    return base64.b64decode(body["audio_pcm16"])[:size].ljust(size, b"\0")

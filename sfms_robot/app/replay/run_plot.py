@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.signal import find_peaks
 
-from sfms_robot.app.replay.recording import RunRecording
+from sfms_robot.app.replay.run_file import RunRecording
 from sfms_robot.errors import ConfigError, MissingExtra
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_S, Doubles, Floats
 
@@ -24,6 +24,7 @@ _PHRASE, _VOICE, _INK, _FAINT = "#f4e9d2", "#a8772c", "#2a2d34", "#7d828c"
 _COLORS: Final = ("#1f6f9c", "#c8553d", "#5b8c5a", "#8b6bb1", "#c29a2e", "#3f8f8b")
 _NOD_RAD: Final = np.radians(2.0)
 _NECK_JOINTS: Final = 3
+_COMING_IN_S: Final = 1.0  # from where the joints stood when torque came on: not what the panel of the neck is about
 _LEAST_SCALE_DEG: Final = 1.0  # a joint that hardly moves stays pale
 
 # Lane of the face panel: name, channels added, channels taken off.
@@ -177,7 +178,10 @@ def _neck(axes: Axes, recording: RunRecording, joints: Sequence[int]) -> None:
         goal_deg, present_deg = (np.degrees(a[:, joint]) for a in (recording.goals_rad, recording.present_rad))
         axes.plot(recording.times_s, goal_deg, color=color, lw=2.6, alpha=0.75, label=recording.joints[joint])
         axes.plot(recording.times_s, present_deg, color=_INK, lw=0.8)
-    axes.margins(y=0.12)
+    if joints and (shown := recording.times_s > _COMING_IN_S).any():
+        shown_deg = np.degrees(recording.goals_rad[shown][:, list(joints)])
+        room_deg = max(0.12 * float(np.ptp(shown_deg)), _LEAST_SCALE_DEG)
+        axes.set_ylim(float(shown_deg.min()) - room_deg, float(shown_deg.max()) + room_deg)
     axes.axhline(0, color=_FAINT, lw=0.6)
     if joints:
         _legend(axes)

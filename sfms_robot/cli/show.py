@@ -1,14 +1,29 @@
-"""What people see after a command: tables by rich. Imported only when something is printed."""
+"""What people see after a command: tables by rich. Imported only when something is printed.
+
+A pipe gets whole rows: tables are as wide as the terminal, and as wide as they are where nobody looks.
+"""
 
 from __future__ import annotations
 
+import json as json_module
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
-from sfms_robot.cli.screen import screen
+_UNBROKEN = 1_000  # columns: wider than any table
+
+
+def screen(**options: Any) -> Console:
+    """Standard output. What reads a pipe finds no row cut or broken up."""
+    console = Console(**options)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = _UNBROKEN
+    return console
 
 
 def print_run(report: Mapping[str, Any], record: Path | None) -> None:
@@ -79,3 +94,23 @@ def _or(value: object, otherwise: str) -> str:
     if value is None:
         return otherwise
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def print_list(key: str, rows: Sequence[Mapping[str, Any]], json: bool) -> None:
+    """One line per row: its name, what is true of it, its description. As JSON: all of it, under `key`."""
+    if json:
+        print(json_module.dumps({"version": 1, key: rows}))
+        return
+    console = screen(highlight=False)
+    for row in rows:
+        facts = [_fact(name, value) for name, value in row.items() if name not in ("name", "description")]
+        text = "  ".join(filter(None, (", ".join(filter(None, facts)), row.get("description"))))
+        console.print(Text.assemble((str(row["name"]), "bold"), "  ", text), soft_wrap=True)
+    if not rows:
+        console.print(f"no {key}", style="dim")
+
+
+def _fact(name: str, value: object) -> str:
+    if not value:
+        return ""
+    return name if value is True else f"{name} {_or(value, '')}"

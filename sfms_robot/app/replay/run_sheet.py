@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sfms_robot.app.replay.recording import RunRecording
+from sfms_robot.app.replay.run_file import RunRecording
 from sfms_robot.face.contact_sheet import Instant, render_sheet
 
 
