@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 
 READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
 _STOP_PATIENCE_S: Final = 0.02
+_NOBODY: Final = np.zeros(0, np.intp)
 
 
 class State(Told, Protocol):
@@ -216,19 +217,20 @@ class ChainBus(WireBus[L], Generic[L, S]):
         While the port is gone nothing is sent and nothing is raised.
         """
         care = self._care
-        self._check(goals_rad, bool(care.wanted))
-        ticks = self._goals.ticks(goals_rad)
-        link = self._link
-        if link is None:
-            return
-        for index in [i for i in care.rejoining if care.near(i, int(ticks[i]))]:
-            del care.rejoining[index]
-            self._stale = True
+        self._check(bool(care.wanted))
+        if care.rejoining:
+            near = self._goals.ticks(goals_rad, _NOBODY)
+            for index in [i for i in care.rejoining if care.near(i, int(near[i]))]:
+                if self._goals.allows(index, goals_rad[index]):
+                    del care.rejoining[index]
+                    self._stale = True
         if self._stale:
             chosen = [i for i in sorted(care.wanted) if i not in care.away and i not in care.rejoining]
             self._places = np.array(chosen, np.intp)
             self._stale = False
-        if not len(self._places):
+        link = self._link
+        ticks = self._goals.ticks(goals_rad, _NOBODY if link is None else self._places)
+        if link is None or not len(self._places):
             return
         self._counts["writes"] += 1
         try:
