@@ -1,5 +1,7 @@
 """A head whose yaw is geared so far down that its servo makes more than one turn, from its file to the wire."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,9 @@ GEAR = "ratio: 3.0\n    min_deg: -80\n    max_deg: 80"  # 2048 +- 2731 ticks
 def geared(tmp_path, gear=GEAR, model="xm430-w350"):
     text = (data_dir("configs") / "heads" / "interbotix_wxxms" / "head.yaml").read_text(encoding="utf-8")
     text = text.replace("min_deg: -179.9\n    max_deg: 179.9", gear, 1).replace("xm430-w350", model)
+    text = re.sub(r"    safety: .*\n", "", text).replace(
+        "zero_ticks: 2048", f"zero_ticks: {load_firmware_map(model).center_ticks}"
+    )
     folder = tmp_path / "geared"
     folder.mkdir()
     (folder / "head.yaml").write_text(text, encoding="utf-8")
