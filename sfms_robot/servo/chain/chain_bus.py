@@ -19,6 +19,7 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
@@ -34,9 +35,10 @@ from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.member import FaultReporter, Member, State, members_of
 from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
 from sfms_robot.servo.chain.schedule import TURN_S
-from sfms_robot.servo.chain.startup import Startup
+from sfms_robot.servo.chain.startup import PATIENCE_S, Startup
 from sfms_robot.servo.chain.status_poll import StatusPoll
 from sfms_robot.servo.chain.telemetry import Telemetry
+from sfms_robot.servo.chain.verified_write import finish
 from sfms_robot.servo.policy import BusServo, torque_register
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field, Table
@@ -191,10 +193,9 @@ class ChainBus(WireBus[L], Generic[L]):
                 log.warning("%s (id %d) does not answer; it comes in when it does", joint, servo.id)
                 continue
             self._forget_member(index)
-            if member.identified:
-                self._telemetry.ticks[index] = startup.switch_on(index)
-            else:
-                self._telemetry.ticks[index] = startup.start_anew(index)
+            with link.patient(PATIENCE_S):
+                steps = startup.torque_on(index) if member.identified else startup.bring_back(index, reboot=False)
+                self._telemetry.ticks[index] = finish(steps)
             member.enabled()
             held.append(self._hold(index))
             link.rest(self._config.stagger_ms / 1e3)
@@ -260,7 +261,7 @@ class ChainBus(WireBus[L], Generic[L]):
             if not rest or link.port.now_s() >= until_s:
                 break
             ids = [self._servos[i].id for i in rest]
-            got = self._attempt(lambda ids=ids: self._poll.read_all(link, (field.address, field.size), ids, until_s))
+            got = self._attempt(partial(self._poll.read_all, link, (field.address, field.size), ids, until_s))
             if got is None:
                 break  # the port is gone
             off = field.to_bytes(0)

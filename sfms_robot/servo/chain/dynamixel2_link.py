@@ -26,6 +26,7 @@ from sfms_robot.servo.port import Port
 _REQUESTS_KEPT: Final = 512
 _WRITES_KEPT: Final = 16  # each has a table of 0.5 KiB per byte of data
 _PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
+_LENGTHS: Final = 4  # of a read of several servos, one byte apart
 _HEADER: Final = b"\xff\xff\xfd"
 _SYNC_DATA: Final = 12  # where the first id of a sync write stands
 
@@ -57,6 +58,7 @@ class Dxl2Link(RegisterLink):
         self._requests: dict[tuple[object, ...], bytes] = {}
         self._writes: dict[tuple[int, int, tuple[int, ...]], _SyncWrite] = {}
         self._sent = 0
+        self._extra = 0  # bytes that reads of several servos ask for beside what is wanted
 
     # --- one servo ----------------------------------------------------------------------------------------------
 
@@ -100,6 +102,12 @@ class Dxl2Link(RegisterLink):
         self._send(dxl2.encode_instruction(servo, dxl2.WRITE, address.to_bytes(2, "little") + data))
         return self._answer(servo, 0)
 
+    def refusal(self, answer: Answer) -> str:
+        """Bits 0..6 of the error byte are an error number; bit 7 only says that register 70 is worth a look."""
+        if not answer.error & ~dxl2.ALERT:
+            return ""
+        return dxl2.error_text(answer.error) + (", and reports a hardware error" if answer.error & dxl2.ALERT else "")
+
     def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """As `write`, but kept by the servo until `action`."""
         self._send(dxl2.encode_instruction(servo, dxl2.REG_WRITE, address.to_bytes(2, "little") + data))
@@ -130,11 +138,13 @@ class Dxl2Link(RegisterLink):
 
     def sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Answer]:
         """Answers by id, of those that answered."""
-        self._send(self._read_request(address, length, servos, fast=False))
-        return self._answers(servos, length)
+        longer = length + self._extra
+        self._send(self._read_request(address, longer, servos, fast=False))
+        return self._trimmed(self._answers(servos, longer), length, len(servos))
 
     def fast_sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Answer]:
         """As `sync_read`, but all answer in one packet, which stops where somebody is silent."""
+        wanted, length = length, length + self._extra
         self._send(self._read_request(address, length, servos, fast=True))
         size = 8 + len(servos) * (length + 4)
         buffer, start = bytearray(), -1
@@ -158,9 +168,18 @@ class Dxl2Link(RegisterLink):
                 answers[servo] = Answer(error, data)
         if len(answers) < len(servos):
             self._waited(min(allowance_s, self.port.now_s() - asked_s))
-        return answers
+        return self._trimmed(answers, wanted, len(servos))
 
     # --- inside -------------------------------------------------------------------------------------------------
+
+    def _trimmed(self, answers: dict[int, Answer], length: int, asked: int) -> dict[int, Answer]:
+        """Data of `length` bytes. After a silence the next request asks for another length, so that what comes late
+        is told from its answer: a status packet does not say what it answers."""
+        if self._extra:
+            answers = {servo: Answer(error, data[:length]) for servo, (error, data) in answers.items()}
+        if len(answers) < asked:
+            self._extra = (self._extra + 1) % _LENGTHS
+        return answers
 
     def _read_request(self, address: int, length: int, servos: Sequence[int], fast: bool) -> bytes:
         return self._request(

@@ -71,7 +71,8 @@ _COMING: Final = frozenset({State.RETURNING, State.REBOOTING})
 class Restart(Protocol):
     """The part of `Startup` that a member needs."""
 
-    can_reboot: bool
+    @property
+    def can_reboot(self) -> bool: ...
 
     def bring_back(self, index: int, reboot: bool) -> Steps[int]: ...
 

@@ -178,6 +178,18 @@ class StatusPoll:
                 answers[servo] = answer
         return answers
 
+    def read_all(self, link: RegisterLink, where: Block, ids: Sequence[int], until_s: float) -> dict[int, Answer]:
+        """Answers of all who are there, outside of a poll: as long as it takes, but not beyond `until_s`."""
+        if self._group is not None:
+            return dict(self._group(*where, ids))
+        answers: dict[int, Answer] = {}
+        for servo in ids:
+            if link.port.now_s() >= until_s:
+                break
+            if (answer := link.read(servo, *where)) is not None:
+                answers[servo] = answer
+        return answers
+
     def _everybody(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Outcome:
         """All by one request, and those behind a silent one by a second."""
         out = Outcome()
@@ -264,7 +276,8 @@ class StatusPoll:
     def _probe(self, link: RegisterLink, now_s: float) -> bool:
         """Ask members that are not listed and have waited long enough, one by one, until one does not answer."""
         answered = False
-        waiting = [member for member in self._members if not member.presence.listed and member.presence.probe_s <= now_s]
+        absent = [member for member in self._members if not member.presence.listed]
+        waiting = [member for member in absent if member.presence.probe_s <= now_s]
         for _ in range(_PROBES):
             if not waiting or not link.affords(read_bytes(1, self._telemetry.block[1], False), alone=True):
                 return answered
@@ -283,11 +296,10 @@ class StatusPoll:
             member.answered()
             self._missing.discard(member.id)
             self._take(link, where, answer, now_s)
-            for other in self._members:
-                if not other.presence.listed:
-                    other.hurry(now_s)
-                    if other not in waiting and other is not member:
-                        waiting.append(other)
+            absent.remove(member)
+            for other in absent:
+                other.hurry(now_s)
+            waiting = list(absent)
             member.back(now_s)
             self._take_health(self.read_some(link, self._telemetry.health, [member.id]), now_s)
         return answered
