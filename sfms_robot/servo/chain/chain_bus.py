@@ -233,6 +233,8 @@ class ChainBus(WireBus[L], Generic[L]):
         link = self._link
         if link is None and self._lost_s is not None:
             link = self._open_again()  # perhaps it has just come back
+            if link is not None:
+                self._found_again(link)
         if link is None:
             return
         limp = [i for i, servo in enumerate(self._servos) if policy == "release" and servo.safety.stop == "release"]
@@ -393,6 +395,8 @@ class ChainBus(WireBus[L], Generic[L]):
             lambda where, ids: self._poll.read_some(link, where, ids),
             lambda index, field, value: self._told(index, field, value, now_s),
         )
+        for member in self._members:
+            member.off_written |= member.to_release
 
     def _told(self, index: int, field: Field, value: int, now_s: float) -> None:
         if field.name == self._telemetry.torque.name:

@@ -115,7 +115,7 @@ class DynamixelBus(ChainBus[Dxl2Link]):
     def _look_for_trips(self) -> None:
         """We were late: a servo whose watchdog has tripped ignores goals until it is brought back."""
         for index in self._armed():
-            self._writes.want(index, self._tables[index][_WATCHDOG], self._watchdog)
+            self._writes.want(index, self._tables[index][_WATCHDOG], self._watchdog, read_first=True)
 
     def _told(self, index: int, field: Field, value: int, now_s: float) -> None:
         super()._told(index, field, value, now_s)

@@ -156,6 +156,7 @@ class Member:
         job: its way back, in steps of one exchange, and when the next is due.
         rejoined: it came to hold a position in this poll.
         stands_ticks: where, while it is rejoining.
+        off_written: torque off has been sent since it was wanted.
         mismatch: registers that do not hold what was asked of them, in words.
     """
 
@@ -171,6 +172,7 @@ class Member:
         self.job_due_s = 0.0
         self.rejoined = False
         self.stands_ticks = 0
+        self.off_written = False
         self.mismatch: str | None = None
         self._faults = faults
         self._reporter = reporter
@@ -347,10 +349,12 @@ class Member:
         """Torque enable as told by the servo, against what is wanted."""
         self.torque_seen = on
         if self.state in _RELEASED:
-            if on:
+            if on and self.off_written:
                 self._say(TORQUE_ON)
             elif self._trouble == TORQUE_ON:
                 self._trouble = None
+        elif self.state is State.SILENT and not on and self.identified:
+            self._reporter.say(self.servo, TORQUE_LOST)  # it was away because it restarted
         elif self.state in _POWERED and not on:
             if self._named:
                 self._release(math.inf)  # its own protection took the torque, and said why
@@ -435,7 +439,7 @@ class Member:
 
     def _release(self, back_s: float) -> None:
         self._drop_job()
-        self.state, self._back_s = State.LIMP, back_s
+        self.state, self._back_s, self.off_written = State.LIMP, back_s, False
         if self.torque_seen:
             self.torque_seen = None
 

@@ -27,13 +27,17 @@ class RepeatedWrites:
         self._ids = list(ids)
         self._index = {servo: index for index, servo in enumerate(ids)}
         self._pending: dict[str, Requests] = {}
+        self._read_first: set[tuple[int, str]] = set()
 
     def __contains__(self, key: tuple[int, str]) -> bool:
         index, name = key
         return index in self._pending.get(name, ())
 
-    def want(self, index: int, field: Field, value: int) -> None:
+    def want(self, index: int, field: Field, value: int, *, read_first: bool = False) -> None:
+        """`read_first`: for a register whose value says what happened, which a write would hide."""
         self._pending.setdefault(field.name, {})[index] = field, value
+        if read_first:
+            self._read_first.add((index, field.name))
 
     def drop(self, index: int, name: str | None = None) -> None:
         """No longer: of one register, or of all."""
@@ -42,6 +46,7 @@ class RepeatedWrites:
 
     def clear(self) -> None:
         self._pending.clear()
+        self._read_first.clear()
 
     def step(self, link: RegisterLink, asked: Callable[[int], bool], read: ReadSome, seen: Seen) -> None:
         """A poll's share: all are written, those that `asked` allows are read back.
@@ -57,12 +62,15 @@ class RepeatedWrites:
                 del self._pending[name]
                 continue
             for field, values in _alike(requests):
-                link.sync_write(field.address, {self._ids[i]: field.to_bytes(value) for i, value in values.items()})
+                told = {self._ids[i]: field.to_bytes(v) for i, v in values.items() if (i, name) not in self._read_first}
+                if told:
+                    link.sync_write(field.address, told)
                 ids = [self._ids[i] for i in values if asked(i)][:_VERIFIED]
                 for servo, answer in (read((field.address, field.size), ids) if ids else {}).items():
                     index = self._index[servo]
                     if len(answer.data) == field.size:
                         value = field.from_bytes(answer.data)
+                        self._read_first.discard((index, name))
                         if value == values[index]:
                             requests.pop(index, None)
                         else:  # to the back: others have their turn

@@ -300,8 +300,8 @@ class StatusPoll:
             for other in absent:
                 other.hurry(now_s)
             waiting = list(absent)
-            member.back(now_s)
             self._take_health(self.read_some(link, self._telemetry.health, [member.id]), now_s)
+            member.back(now_s)
         return answered
 
     # --- what they say ------------------------------------------------------------------------------------------

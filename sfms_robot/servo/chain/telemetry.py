@@ -58,7 +58,7 @@ class Telemetry:
                     f"bus {bus!r}: {table.model} does not speak {family} protocol {protocol} and cannot be on it"
                 )
         present, self.goal, self.torque = (_needed(bus, tables, role) for role in _NEEDED)
-        self.error = common(bus, tables, "error_status")
+        self.error = common(bus, tables, "error_status") if protocol == 2 else None
         common(bus, tables, "bus_watchdog")
         self._fields = {"position": present}
         loads = [_load(table) for table in tables]
