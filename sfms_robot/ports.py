@@ -56,11 +56,8 @@ class PlanFeed(Protocol):
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Plans that became visible by `now_s`, oldest first. Never blocks."""
 
-    def step_times_ms(self) -> Sequence[float]:
-        """Duration of every listener step so far; empty in virtual time."""
-
-    def unheard(self) -> int:
-        """Frames left out so far because the listener could not keep up."""
+    def statistics(self) -> Mapping[str, Any]:
+        """`state` in words, `restarts`, `skipped_frames` (the listener could not keep up), `step_ms` p50 and p99."""
 
     def close(self) -> None: ...
 
@@ -124,8 +121,8 @@ class Bus(Protocol):
         """Send torque-off now, unconfirmed: one packet per wire, to this head's ids alone; pulses off on boards.
 
         May be called from any thread at any time after `connect`, also while another one is inside `poll`. Never
-        raises, never waits for an answer. With the policy "hold" nothing is sent. Does not refuse later goals: `stop`
-        does.
+        raises, never waits for an answer. No goal is sent from then on, until `enable`. With the policy "hold" nothing
+        happens.
         """
 
     def stop(self, policy: StopPolicy) -> None:

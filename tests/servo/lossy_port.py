@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from sfms_robot.emulator.chain import ServoChain
 from sfms_robot.emulator.protocol1 import Frame1Device
+
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.protocol1_link import Frame1Link

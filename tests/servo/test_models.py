@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from sfms_robot.servo.chain.telemetry import common
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
+from sfms_robot.servo.chain.telemetry import common
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
 

@@ -20,6 +20,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from threading import RLock
 from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
@@ -52,6 +53,8 @@ _EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
 _EXCHANGE_BYTES: Final = 160  # of the longest of them: a whole control table
 _COMPARE_S: Final = 1.0  # between two looks at the settings of one servo
 _COMPARED: Final = 40  # bytes read at once for that
+_SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
+_NOBODY: Final = np.zeros(0, np.intp)
 
 L = TypeVar("L", bound=RegisterLink)
 
@@ -102,6 +105,8 @@ class ChainBus(WireBus[L], Generic[L]):
         self._stamp_s = 0.0
         self._peak_mA = 0.0
         self._release_packet = b""
+        self._released = False  # by `torque_off`: no goal is sent until the next `enable`
+        self._sending = RLock()
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
@@ -178,10 +183,11 @@ class ChainBus(WireBus[L], Generic[L]):
         held where it stands, and its reading says `rejoined`.
 
         Blocks a few exchanges per servo, and `stagger_ms`. Raises ServoError when a servo refuses or falls silent
-        meanwhile; those before it in the list then have torque, so call `stop`.
+        meanwhile, BusError when `torque_off` comes meanwhile; others may then have torque, so call `stop`.
         """
         link = self._connected()
         startup = self._begin(link)
+        self._released = False
         held = []
         for joint in joints:
             index = self.joints.index(joint)
@@ -196,6 +202,9 @@ class ChainBus(WireBus[L], Generic[L]):
             with link.patient(PATIENCE_S):
                 steps = startup.torque_on(index) if member.identified else startup.bring_back(index, reboot=False)
                 self._telemetry.ticks[index] = finish(steps)
+            if self._released:
+                self.torque_off("release")
+                raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
             member.enabled()
             held.append(self._hold(index))
             link.rest(self._config.stagger_ms / 1e3)
@@ -212,13 +221,19 @@ class ChainBus(WireBus[L], Generic[L]):
 
         Bytes that are on their way to us may collide with it on a wire that goes both ways; `stop` says it again.
         """
-        link, packet = self._link, self._release_packet
-        if policy == "hold" or link is None or not packet:
+        if policy == "hold":
             return
+        self._released = True
+        alone = self._sending.acquire(timeout=_SENDING_S)  # a goal must not overtake it; a port that hangs may
         try:
-            link.port.write(packet)
+            link, packet = self._link, self._release_packet
+            if link is not None and packet:
+                link.port.write(packet)
         except BusError as error:
             log.warning("bus %r: %s", self.name, error)
+        finally:
+            if alone:
+                self._sending.release()
 
     def stop(self, policy: StopPolicy) -> None:
         """As `ports.Bus`: torque off first, in one packet, then watchdogs off, in another; then both are read back and
@@ -312,25 +327,34 @@ class ChainBus(WireBus[L], Generic[L]):
         Raises ValueError, with nothing sent, before `enable`, for a goal that is not finite, or one out of range.
         While the port is gone nothing is sent and nothing is raised.
         """
-        self._check(goals_rad, self._enabled)
-        ticks = self._goals.ticks(goals_rad)
-        link = self._link
-        if link is None:
-            return
-        if self._accepted(ticks):
+        self._check(self._enabled)
+        if self._accepted(goals_rad):
             self._update_places()
-        if not len(self._places):
+        link = self._link
+        places = self._places if link is not None else _NOBODY
+        ticks = self._goals.ticks(goals_rad, places)
+        if link is None or not len(places):
             return
-        self._counts["writes"] += 1
-        try:
-            self._send(link, self._places, ticks, link.port.now_s())
-        except BusError as error:
-            self._lose(error, now_s)
+        with self._sending:
+            if self._released:
+                return
+            self._counts["writes"] += 1
+            try:
+                self._send(link, places, ticks, link.port.now_s())
+            except BusError as error:
+                self._lose(error, now_s)
 
-    def _accepted(self, ticks: NDArray[np.int64]) -> bool:
+    def _accepted(self, goals_rad: Doubles) -> bool:
         """Whether a rejoining member takes goals from now on."""
         waiting = [member for member in self._members if member.state is State.REJOINING]
-        return any([member.accepts(int(ticks[member.index])) for member in waiting])
+        if not waiting:
+            return False
+        ticks = self._goals.ticks(goals_rad, _NOBODY)
+        near = [
+            self._goals.allows(member.index, goals_rad[member.index]) and member.accepts(int(ticks[member.index]))
+            for member in waiting
+        ]
+        return any(near)
 
     def _update_places(self) -> None:
         """Who gets goals; the array stays the same object while it has the same content."""
@@ -359,6 +383,9 @@ class ChainBus(WireBus[L], Generic[L]):
 
     def _ask(self, link: L, now_s: float) -> bool:
         stamp_s = self._stamp_s = link.port.now_s()
+        if self._released:
+            for member in self._members:
+                member.stopped()
         with link.within(self._poll.budget_s, self._read_deadline_s + TURN_S):
             heard = self._poll.step(link, stamp_s)
             self._command(link, stamp_s)
