@@ -29,7 +29,7 @@ def test_any_number_of_silent_servos_costs_one_read_deadline_in_a_poll(family):
     healthy_s, _ = most(rig, 30, held)
     for dead in ({14}, {1}, {28}, {3, 9, 10, 20, 28}):
         rig.port.mute = dead
-        worst_s, readings = most(rig, 300, held)
+        worst_s, readings = most(rig, 120, held)
         assert worst_s <= healthy_s + READ_DEADLINE_S + 0.001 + SLACK_S
         assert worst_s <= rig.bus.poll_budget_s + SLACK_S
         assert rig.bus.statistics()["silent"] == sorted(dead)
@@ -90,8 +90,6 @@ def test_torque_off_is_on_the_wire_before_anybody_is_asked(family):
 def test_two_mute_buses_have_torque_off_within_20_ms_and_stop_within_half_a_second(first):
     clock = Time()
     one, two = timed(first, 28, clock), timed("dynamixel2", 28, clock)
-    for i, joint in enumerate(two.bus.joints):
-        assert joint == f"joint{i + 1}"
     two.bus.joints = tuple(f"other{i}" for i in two.ids)
     bus = CompositeBus({"one": one.bus, "two": two.bus}, [*one.bus.joints, *two.bus.joints])
     bus.connect()
@@ -174,21 +172,28 @@ def pinched(rig, held):
 TELLS_CURRENT = [name for name in CHAINS if name in ("dynamixel2", "sts")]
 
 
+def loses_answers_about(rig, servo_id, role_or_name):
+    """From now on no answer of a servo to a read of one register comes through."""
+    table = rig.family.table
+    here = table.role(role_or_name) or table[role_or_name]
+
+    def lost(servo):
+        packet = rig.port.sent[-1][1]
+        address = int.from_bytes(packet[8:10], "little") if table.protocol == 2 else packet[5]
+        return servo == servo_id and address == here.address
+
+    rig.port.lose = lost
+
+
 @pytest.mark.parametrize("family", TELLS_CURRENT)
-def test_limp_servo_is_limp_though_it_answers_no_more(family):
+def test_pinched_servo_is_limp_at_once_though_nothing_it_says_of_its_torque_arrives(family):
     rig = timed(family, 4, safety=GENTLE)
     held = rig.hold()
     rig.ticks(held, 3)
-    rig.port.device.servo(2).plant.stuck = True
-    said = len(rig.bus.statistics()["faults"])
-    goals = held.copy()
-    goals[1] += 0.5
-    while len(rig.bus.statistics()["faults"]) == said and rig.clock.t < 20:
-        rig.port.lose = lambda servo: False
-        rig.tick(goals)
-        rig.port.lose = lambda servo: servo == 2  # from the moment it is judged every answer is lost
-        rig.tick(goals) if False else None
-    assert rig.torques()[1] == 0  # in the very poll in which the rule was broken
+    loses_answers_about(rig, 2, "torque_enable")
+    goals = pinched(rig, held)
+    assert rig.torques() == [1, 0, 1, 1]  # in the very poll in which the rule was broken
+    assert rig.ticks(goals, 50)["joint2"].fault is not None
 
 
 @pytest.mark.parametrize("family", TELLS_CURRENT)
@@ -218,14 +223,13 @@ def test_reduce_is_half_whatever_acknowledgements_are_lost(family):
     held = rig.hold()
     strength = "goal_current" if family == "dynamixel2" else "torque_limit"
     full = rig.register(2, strength)
-    random = np.random.default_rng(3)
-    rig.port.lose = lambda servo: random.random() < 0.3
+    loses_answers_about(rig, 2, strength)
     goals = pinched(rig, held)
     for _ in range(100):
         rig.tick(goals)
-        assert rig.register(2, strength) in (full, full // 2)
+        assert rig.register(2, strength) == full // 2
     rig.port.lose = lambda servo: False
-    rig.ticks(goals, 50)
+    rig.ticks(goals, 5)
     assert rig.register(2, strength) == full // 2
 
 
