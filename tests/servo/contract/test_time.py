@@ -37,24 +37,37 @@ def test_any_number_of_silent_servos_costs_one_read_deadline_in_a_poll(family):
 
 
 @pytest.mark.parametrize("family", CHAINS)
-@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=6, suppress_health_check=[HealthCheck.too_slow])
 @given(st.data())
 def test_no_pattern_of_loss_makes_a_poll_longer_than_its_budget(family, data):
     rig = timed(family)
     held = rig.hold()
     rig.ticks(held, 2)
     rig.polls_s.clear()
-    for _ in range(12):
+    for _ in range(6):
         rig.port.mute = data.draw(st.sets(st.integers(1, 28), max_size=28), label="mute")
         lost = data.draw(st.sets(st.integers(1, 28), max_size=28), label="answers lost")
         rig.port.lose = lost.__contains__
         rig.port.deaf = data.draw(st.integers(0, 5), label="deaf") == 0
-        rig.ticks(held, 3)
+        rig.ticks(held, 2)
     assert max(rig.polls_s) <= rig.bus.poll_budget_s + SLACK_S
+
+
+@pytest.mark.parametrize("family", CHAINS)
+def test_everybody_is_back_after_a_bad_time(family):
+    rig = timed(family, 12)
+    held = rig.hold()
+    rig.ticks(held, 2)
+    random = np.random.default_rng(5)
+    for _ in range(20):
+        rig.port.mute = set(random.integers(1, 13, 3).tolist())
+        rig.port.lose = lambda servo: random.random() < 0.2
+        rig.port.deaf = random.random() < 0.1
+        rig.ticks(held, 3)
     rig.port.mute, rig.port.lose, rig.port.deaf = set(), lambda servo: False, False
-    readings = rig.ticks(held, 400)
-    assert all(reading.age_s < 0.1 for reading in readings.values())
-    assert rig.bus.statistics()["silent"] == []
+    readings = rig.ticks(held, 250)
+    assert all(reading.age_s < 0.1 and reading.fault is None for reading in readings.values())
+    assert rig.bus.statistics()["silent"] == [] and rig.torques() == [1] * 12
 
 
 def test_28_servos_at_100_hz_and_1_mbit_keep_their_tick_with_two_bad_connections():
@@ -64,7 +77,7 @@ def test_28_servos_at_100_hz_and_1_mbit_keep_their_tick_with_two_bad_connections
     random = np.random.default_rng(1)
     rig.port.lose = lambda servo: servo in (5, 17) and random.random() < 0.3
     rig.polls_s.clear()
-    rig.ticks(held, 500)
+    rig.ticks(held, 300)
     goals_s = (14 + 28 * 5) * BYTE_S
     assert max(rig.polls_s) + goals_s <= rig.period_s
 
