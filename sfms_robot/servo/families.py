@@ -50,7 +50,10 @@ class BusFamily:
         return self.link is None
 
     @property
-    def protocol(self) -> int | None:
+    def protocol(self) -> int:
+        """Raises ConfigError for a board."""
+        if self.maps[1] is None:
+            raise ConfigError(f"{self.title}: a board speaks no servo protocol")
         return self.maps[1]
 
     def bus_class(self) -> Any:

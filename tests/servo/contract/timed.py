@@ -1,4 +1,4 @@
-"""A bus of any chain family on a port where silence costs time: the clock moves by what travels and what is waited for."""
+"""A bus of any chain family on a port where silence costs time: the clock moves by what travels and is waited for."""
 
 from __future__ import annotations
 
