@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -165,10 +166,10 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
     if parts.overlay:
         motion = parts.overlay(motion, times_s)
-    life = state.life
+    life, knobs = state.life, parts.knobs() if parts.knobs else None
     if parts.life:
-        motion, life = parts.life.step(motion, times_s, now_s, life)
-    knobs = parts.knobs() if parts.knobs else None
+        shown_pose = partial(parts.retargeter.shown_pose, knobs=knobs)
+        motion, life = parts.life.step(motion, times_s, now_s, life, shown_pose)
     angles_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
     eased = smooth((now_s + period_s - state.since_s) / EASE_S)
     ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)
