@@ -186,6 +186,9 @@ class Timeline(Protocol):
     def sample(self, times_s: Doubles, now_s: float, state: Any) -> tuple[Floats, Any]:
         """Motion (N, 58) at each of (N,) instants, and the state with what was counted."""
 
+    def lead_limit_s(self, state: Any) -> float:
+        """How far after a tick [s] `sample` may be asked for; inf where the whole future is known."""
+
 
 class Life(Protocol):
     """What the head does of itself, on top of the face that was asked for. State is a value."""

@@ -4,8 +4,8 @@
 
 One tick every 1/rate_hz s on absolute deadlines. What changes while it runs is a `State` handed from step to step. It
 is kept as soon as the limiter has decided, so whatever is raised after that, and wherever, the way to rest begins at
-the last command. The reference of a tick is the face at (tick time + lead of the joint); speed and acceleration are
-central differences, so one sample lies one tick ahead.
+the last command. The reference of a tick is the face at (tick time + lead of the joint, as far as the plan in force
+goes); speed and acceleration are central differences, so one sample lies one tick ahead.
 """
 
 from __future__ import annotations
@@ -162,7 +162,8 @@ class Command:
 
 def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tuple[State, Command]:
     """The face of this instant, each joint ahead by its lead, as goals inside the limits."""
-    times_s = np.concatenate([[now_s], now_s + parts.leads_s + period_s])
+    ahead_s = np.minimum(parts.leads_s + period_s, parts.timeline.lead_limit_s(state.timeline))
+    times_s = np.concatenate([[now_s], now_s + ahead_s])
     motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
     if parts.overlay:
         motion = parts.overlay(motion, times_s)
