@@ -33,7 +33,7 @@ from sfms_robot.app.servo.diagnosis import (
 from sfms_robot.app.servo.protocol_hint import protocol_hint
 from sfms_robot.app.servo.servo_state import State, read_all
 from sfms_robot.app.servo.servo_tools import Confirm, Progress, field_named, guard, put, scan, twins
-from sfms_robot.app.servo.servo_wire import FAMILIES, SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import launch
@@ -42,6 +42,7 @@ from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
+from sfms_robot.servo.families import current_name, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds
@@ -54,7 +55,6 @@ _NOTHING_SEEN: Final[dict[str, Any]] = {
 }  # fmt: skip
 _BOARD_S: Final = 0.2  # a board answers at once; 9600 baud and a USB adapter take the rest
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
-_TOOL_FAMILY: Final = {"dynamixel": "dynamixel2"}  # the others are called the same in a head's file
 
 OpenPort = Callable[[str, int], Port]
 
@@ -88,8 +88,8 @@ def examine(
 
     Raises ConfigError for a head, a family or a port description that cannot be used.
     """
-    if family not in FAMILIES:
-        raise ConfigError.at("doctor", "family", family, "is unknown", FAMILIES)
+    if family not in servo_families():
+        raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
         buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress, fix) for line in lines]
@@ -162,7 +162,7 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
     for name, device in where.items():
         bus = described.buses[name]
-        speaks = _TOOL_FAMILY.get(bus.family, bus.family)
+        speaks = current_name(bus.family)
         shown = SIM if port == SIM else device
         yield Line(name, device, shown, speaks, bus.baud, bus.rate_hz, _wanted(described, name), head)
 
@@ -283,7 +283,7 @@ def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[
 
 
 def _first_baud(line: Line) -> int:
-    return line.baud or FAMILIES[line.family].bauds[0]
+    return line.baud or servo_families()[line.family].bauds[0]
 
 
 def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, Seen], dict[int, Seen]]:
