@@ -45,6 +45,7 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
+from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
@@ -200,22 +201,28 @@ def build_bus(head: Head, opened: Opened, clock: Clock, *, confirmed: bool = Fal
     """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
-        joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
-        buses[name] = _build_one(head, name, joints, where, clock, confirmed)
+        joints = {key: joint for key, joint in head.joints.items() if joint.bus == name and key not in without}
+        if joints:
+            buses[name] = _build_one(head, name, joints, where, clock, confirmed)
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
+    if without:
+        buses[LEFT_OUT] = AbsentBus(_bus_servos(head, {joint: head.joints[joint] for joint in without}))
+        rates = rates and {**rates, LEFT_OUT: max(rates.values())}
     return CompositeBus(buses, list(head.joints), rates)
+
+
+def _bus_servos(head: Head, joints: Mapping[str, Joint]) -> list[BusServo]:
+    maps = firmware_maps(dict(joints))
+    return [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()]
 
 
 def _build_one(
     head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool
 ) -> Bus:
     config = head.buses[name]
-    maps = firmware_maps(joints)
-    check_safety(head, joints, maps)
-    servos = [
-        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
-    ]
+    check_safety(head, joints, firmware_maps(joints))
+    servos = _bus_servos(head, joints)
     family = family_named(config.family)
     if family.board:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])
