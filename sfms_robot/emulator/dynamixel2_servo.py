@@ -34,6 +34,7 @@ class Dynamixel2Servo:
 
     Attributes:
         dead: silent, as with its cable out; its motor keeps doing what it was told.
+        mute: it obeys, and never answers.
         plant: what turns; its ticks are those of the shaft.
     """
 
@@ -48,7 +49,7 @@ class Dynamixel2Servo:
         supply_v: float | None = None,
     ) -> None:
         self.table = table
-        self.dead = False
+        self.dead = self.mute = False
         self.fault_status = 0
         self.firmware = firmware
         self.supply_v = _usual_supply(table) if supply_v is None else supply_v
@@ -73,6 +74,11 @@ class Dynamixel2Servo:
         self._put("goal_position", table.center_ticks)
         self._settings()
         self._watch_supply()
+
+    @property
+    def return_level(self) -> int:
+        """0 answers pings, 1 reads too, 2 everything; below 0 nothing."""
+        return -1 if self.mute else self._return_level
 
     # --- instructions -------------------------------------------------------------------------------------------
 
@@ -298,7 +304,7 @@ class Dynamixel2Servo:
         second = get("secondary_id", 255)
         self.second_id: int | None = second if second <= _MAX_ID else None
         self.baud: int | None = self.table.baud_codes.get(get("baud_rate"))
-        self.return_level: int = get("status_return_level", 2)
+        self._return_level: int = get("status_return_level", 2)
         self.return_delay_s: float = get("return_delay_time") * _DELAY_TICK_S
         self.torque: int = get("torque_enable")
         self.watchdog: int = get("bus_watchdog")

@@ -42,6 +42,7 @@ KINDS: Final[dict[str, Kind]] = {
     "echo": Kind("fraction of requests", ids=False),
     "noise": Kind("fraction of requests", ids=False),
     "silent": Kind(""),
+    "mute": Kind(""),
     "stuck": Kind(""),
     "overload": Kind(""),
     "overheat": Kind(""),

@@ -34,6 +34,7 @@ class Protocol1Servo:
 
     Attributes:
         dead: True while its cable is out; its motor keeps doing what it was told.
+        mute: it obeys, and never answers.
         fault_status: bits that every answer carries.
     """
 
@@ -48,7 +49,7 @@ class Protocol1Servo:
         supply_v: float | None = None,
     ) -> None:
         self.table = table
-        self.dead = False
+        self.dead = self.mute = False
         self.fault_status = 0
         self._feetech = table.family == "feetech"
         self._file = RegisterFile(table, _WHOLE_FILE if self._feetech else None)
@@ -85,11 +86,11 @@ class Protocol1Servo:
 
     @property
     def answers_writes(self) -> bool:
-        return self._role("status_level") >= (1 if self._feetech else 2)
+        return not self.mute and self._role("status_level") >= (1 if self._feetech else 2)
 
     @property
     def answers_reads(self) -> bool:
-        return self._feetech or self._role("status_level") >= 1
+        return not self.mute and (self._feetech or self._role("status_level") >= 1)
 
     @property
     def return_delay_s(self) -> float:
@@ -148,6 +149,13 @@ class Protocol1Servo:
         self._reset_registers()
         self._stored = bytes(self._file.raw)
         self.power_cycle(now_s)
+
+    def reset_turns(self, now_s: float) -> None:
+        """Whole turns are forgotten; it stays where it is."""
+        self.advance(now_s)
+        self.plant.position %= self.table.ticks_per_revolution
+        self._put("goal_position", round(self._frame.told(self.plant.position)))
+        self._settings()
 
     # --- what happens to it -------------------------------------------------------------------------------------
 
