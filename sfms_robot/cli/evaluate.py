@@ -39,9 +39,7 @@ JSON = typer.Option(False, "--json", help="Print one JSON object.")
 @app.command()
 def tokenizer(
     listener: str = LISTENER,
-    table: str | None = typer.Option(
-        None, metavar="3|4|bits|adaptive|all", help="Of the SFMS paper; error at equal bits; one model for every k."
-    ),
+    table: str | None = typer.Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
     data: Path | None = typer.Option(
         None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
     ),

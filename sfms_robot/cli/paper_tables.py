@@ -13,8 +13,6 @@ from sfms_robot.cli.screen import screen
 TITLES = {
     "3": "Table III: where keyframes go",
     "4": "Table IV: kinds of codes",
-    "bits": "Error at equal bits (codes and places of keyframes)",
-    "adaptive": "One tokenizer for every number of keyframes",
 }
 
 
@@ -59,12 +57,3 @@ def _lines(found: Mapping[str, Any]) -> Iterator[str]:
             else f"{ratio:.3f} (1/{1 / ratio:.1f})"
         )
         yield f"{name.replace('_', ' ')}: {shown}"
-    for point in found.get("bought", []):
-        errors = ", ".join(
-            f"{kind} {'-' if point[kind] is None else format(point[kind], '.3f')}"
-            for kind in ("sparse", "dense", "grouped")
-        )
-        yield f"{point['bits']:>5} bits buy: {errors}{'' if point['sparse_is_least'] else '   sparse is NOT the least'}"
-    for point in found.get("curve", []):
-        limit = "" if point["tolerance"] is None else f", tolerance {point['tolerance']:g}"
-        yield f"nested: {point['mean_k']:.1f} keyframes{limit}: {point['bits']:,.0f} bits, MSE {point['mse']:.4f}"

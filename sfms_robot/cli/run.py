@@ -33,26 +33,32 @@ def run(
         0, min=0, max=MAX_SEED, help="Two seeds listen differently, one seed repeats (with --fast)."
     ),
     record: Path | None = typer.Option(None, help="Folder to write the run to, for `sfms-robot replay`."),
+    overwrite: bool = typer.Option(False, "--overwrite", help="Replace the recording that --record's folder holds."),
     dry_run: bool = typer.Option(False, "--dry-run", help="Open and read the servos, never switch torque on."),
     yes: bool = typer.Option(
         False, "--yes", help="Hobby servos may jump when they come on: they report no position to begin from."
     ),
     intensity: list[str] = typer.Option([], metavar="REGION=V", help="How far a region goes, 0 to 2; may be repeated."),
     style: list[str] = typer.Option([], metavar="REGION=V", help="How much of its small motions shows, 0 to 2."),
+    without: list[str] = typer.Option(
+        [], metavar="JOINT", help="Leave a joint's servo alone (broken, or not there); may be repeated."
+    ),
     json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
+    from sfms_robot.app import session
     from sfms_robot.app.listen.progress import RunProgress
-    from sfms_robot.app.listen.run import RunOptions, run_head
     from sfms_robot.cli.tables import print_dry_run, print_run
 
-    options = RunOptions(
-        head, port, listener, audio, face, agent_audio, duration, fast, seed, record, dry_run, yes,
-        tuple(intensity), tuple(style),
+    options = session.RunOptions(
+        head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
+        tuple(intensity), tuple(style), tuple(without),
     )  # fmt: skip
     try:
-        report = run_head(options, RunProgress)
-    except KeyboardInterrupt:  # before torque came on; after that an interruption is a flag, and the head comes to rest
+        report = session.run(options, RunProgress)
+    except (
+        KeyboardInterrupt
+    ):  # before torque came on; after that an interruption is a request, and the head rests first
         sys.exit(INTERRUPTED)
     if json:
         print(json_module.dumps(report))
@@ -60,5 +66,6 @@ def run(
         print_dry_run(report)
     else:
         print_run(report, record)
-    if report["exit"] == "interrupted":
-        sys.exit(INTERRUPTED)
+    if report.get("error"):
+        print(f"sfms-robot: {report['error']}", file=sys.stderr)
+    sys.exit(report.get("exit_code", 0))

@@ -24,7 +24,8 @@ class Bus(Model):
 
     `read_deadline_ms` is the silence that makes a servo silent. `fast_read`: all servos answer in one packet; "auto"
     tries it at start. `watchdog_ms` 0 leaves the servos' own watchdog off. `stagger_ms` lies between two servos whose
-    torque comes on. A bus on which nobody answers for `reconnect_s` has failed.
+    torque comes on. A bus on which nobody answers for `reconnect_s` has failed. `rs485`: who switches the direction of
+    a half-duplex RS-485 driver, the program by the RTS line (rts) or the driver (kernel); none for adapters that do.
     """
 
     family: Literal["dynamixel", "dynamixel1", "feetech", "maestro", "ssc32"]
@@ -35,6 +36,7 @@ class Bus(Model):
     watchdog_ms: Annotated[int, Field(ge=0, le=2540)] = 200
     stagger_ms: NonNegative = 5.0
     reconnect_s: Positive = 30.0
+    rs485: Literal["rts", "kernel"] | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final, cast
 
+from sfms_robot.config import find
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.ports import Listener
 
@@ -13,8 +14,9 @@ from sfms_robot.ports import Listener
 LOADERS: Final = {"sfms": "sfms_robot.listeners.sfms", "arig": "sfms_robot.listeners.arig"}
 
 
-def load_listener(folder: Path) -> Listener:
-    """The listener of a folder with config.yaml and weights. Raises ConfigError or ModelError."""
+def load_listener(name: str | Path) -> Listener:
+    """A listener by shipped name, or of a folder with config.yaml and weights. Raises ConfigError or ModelError."""
+    folder = find("listeners", str(name), "config.yaml")
     module = import_module(LOADERS[load_config(folder).kind])
     return cast(Listener, module.load(folder))
 

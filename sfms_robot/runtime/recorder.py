@@ -18,6 +18,7 @@ import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal
@@ -138,7 +139,8 @@ class Recorder:
 
     def _begin(self, about: Mapping[str, str]) -> dict[str, int]:
         self._writer.start(profile="", library="sfms-robot")
-        self._writer.add_metadata("run", {**about, "joints": json.dumps(self._joints)})
+        began = datetime.now(UTC).isoformat()
+        self._writer.add_metadata("run", {**about, "joints": json.dumps(self._joints), "started_utc": began})
         channels = {}
         for topic, properties in _SCHEMAS.items():
             schema = json.dumps({"type": "object", "properties": properties}).encode()
@@ -153,10 +155,12 @@ class Recorder:
                 self._attempt(partial(self._write, value))
 
     def _attempt(self, action: Callable[[], Any]) -> None:
+        """Whatever goes wrong with the file ends the recording, not the run, and is told in the report."""
         try:
             action()
-        except (OSError, ValueError) as error:
-            self._trouble = self._trouble or str(error)
+        except Exception as error:
+            self._trouble = self._trouble or f"{type(error).__name__}: {error}"
+            _log.error("the recording ends here: %s", self._trouble)
 
     def _write(self, value: Tick | SpeakerFrame | Plan) -> None:
         for topic, time_s, body in _messages(value, self._joints):
@@ -166,15 +170,21 @@ class Recorder:
             self._written += 1
 
 
+def check_folder(folder: Path, overwrite: bool = False) -> None:
+    """Whether a run may be recorded there. Raises ConfigError where one is already, unless it may be overwritten."""
+    if (folder / RUN_FILE).exists() and not overwrite:
+        raise ConfigError(f"--record {folder}: holds a recording already (another folder, or --overwrite)")
+
+
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
-    """DIR/report.json, whole or not at all. Raises ConfigError when the folder cannot be written to."""
+    """DIR/report.json, whole or not at all. Where it cannot be written that is said: it is printed all the same."""
     part = folder / (REPORT_FILE + ".part")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         part.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
         part.replace(folder / REPORT_FILE)
     except OSError as error:
-        raise ConfigError(f"--record {folder}: cannot be written to: {error.strerror or error}") from error
+        _log.error("--record %s: the report cannot be written: %s", folder, error.strerror or error)
 
 
 def _open(folder: Path) -> BinaryIO:

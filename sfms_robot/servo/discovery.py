@@ -1,23 +1,25 @@
 """Which serial ports there are, who may and who does use them, and how long their adapters hold bytes back.
 
-Everything is read from the file system and nothing is opened. The roots of /dev, /sys and /proc are arguments, so
-that all of it can be tried on a made-up tree.
+Nothing is opened. Which ports there are comes from pyserial's list, which knows macOS and Windows too, and from
+/dev; adapters, lasting names and holders come from /dev, /sys and /proc, whose roots are arguments, so that all of it
+can be tried on a made-up tree.
 """
 
 from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Protocol
 
 DEV: Final = Path("/dev")
 SYS: Final = Path("/sys")
 PROC: Final = Path("/proc")
 
-_PATTERNS: Final = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttySC*", "rfcomm*")
+_PATTERNS: Final = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttySC*", "ttyS*", "rfcomm*", "serial[0-9]")
+_NO_UART: Final = "0"  # /sys/class/tty/ttyS0/type, PORT_UNKNOWN: the name is there, the hardware is not
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class SerialDevice:
 
     Attributes:
         path: device file, as in /dev/ttyUSB0.
-        by_id: its name that survives replugging, as in /dev/serial/by-id/usb-FTDI_..., if there is one.
+        by_id: its name by maker and serial number, as in /dev/serial/by-id/usb-FTDI_..., if there is one.
+        by_path: its name by the socket it is plugged into, as in /dev/serial/by-path/..., if there is one.
         vendor, product: USB numbers, four hex digits each.
         serial: USB serial number.
         driver: kernel driver. Example: ftdi_sio.
@@ -36,6 +39,7 @@ class SerialDevice:
 
     path: str
     by_id: str | None = None
+    by_path: str | None = None
     vendor: str | None = None
     product: str | None = None
     serial: str | None = None
@@ -53,14 +57,55 @@ class Holder:
     command: str
 
 
-def list_ports(dev: Path = DEV, sys: Path = SYS) -> list[SerialDevice]:
-    """Serial ports that servos may hang on, by path."""
-    found = sorted(path for pattern in _PATTERNS for path in dev.glob(pattern))
-    return [describe(str(path), dev, sys) for path in found]
+class ListedPort(Protocol):
+    """What of pyserial's `ListPortInfo` is used."""
+
+    device: str
+    vid: int | None
+    pid: int | None
+    serial_number: str | None
+    description: str | None
+
+
+def pyserial_ports() -> Iterable[ListedPort]:
+    """Ports by pyserial's own list: ttyS and ttyUSB on Linux, cu. on macOS, COM on Windows."""
+    from serial.tools.list_ports import comports
+
+    ports: Iterable[ListedPort] = comports()
+    return ports
+
+
+def list_ports(
+    dev: Path = DEV, sys: Path = SYS, listed: Callable[[], Iterable[ListedPort]] = pyserial_ports
+) -> list[SerialDevice]:
+    """Serial ports that servos may hang on, by path. A built-in ttyS is left out where no hardware is behind it."""
+    paths = {os.path.realpath(path) for pattern in _PATTERNS for path in dev.glob(pattern)}
+    found = {path: describe(path, dev, sys) for path in paths}
+    for port in listed():
+        is_file = port.device.startswith("/")
+        path = os.path.realpath(port.device) if is_file else port.device
+        known = found.get(path) or (describe(path, dev, sys) if is_file else SerialDevice(path))
+        found[path] = _completed(known, port)
+    return [found[path] for path in sorted(found) if not _is_vacant(path, sys)]
+
+
+def ports_data() -> list[dict[str, Any]]:
+    """What `port list` shows: per port its facts, `name` to give to --port, `problem` and `holders`, as plain data."""
+    return [
+        {
+            "name": stable_name(port.path),
+            **asdict(port),
+            "problem": access_problem(port.path),
+            "holders": [asdict(each) for each in holders(port.path)],
+        }
+        for port in list_ports()
+    ]
 
 
 def describe(path: str, dev: Path = DEV, sys: Path = SYS) -> SerialDevice:
-    """What is known of a port; `path` may be a link to it."""
+    """What the system tells of a port; `path` may be a link to it. Little is known where there is no /sys."""
+    if os.name != "posix":
+        return SerialDevice(path)
     real = Path(os.path.realpath(path))
     name = real.name
     usb = _usb_folder(sys / "class" / "tty" / name / "device")
@@ -69,7 +114,8 @@ def describe(path: str, dev: Path = DEV, sys: Path = SYS) -> SerialDevice:
     text = _line(latency)
     return SerialDevice(
         path=str(real),
-        by_id=_by_id(real, dev),
+        by_id=_link_to(real, dev / "serial" / "by-id"),
+        by_path=_link_to(real, dev / "serial" / "by-path"),
         vendor=_line(usb / "idVendor") if usb else None,
         product=_line(usb / "idProduct") if usb else None,
         serial=_line(usb / "serial") if usb else None,
@@ -78,6 +124,47 @@ def describe(path: str, dev: Path = DEV, sys: Path = SYS) -> SerialDevice:
         latency_ms=int(text) if text is not None and text.isdigit() else None,
         latency_file=str(latency) if text is not None else None,
     )
+
+
+def stable_name(device: str, dev: Path = DEV, sys: Path = SYS) -> str:
+    """The name under which the same adapter is found again after it was unplugged, or `device` itself.
+
+    By serial number where the adapter has one of its own. Two CH340 have none, and two CP2102 both have 0001: their
+    name by-id is one and the same, and belongs to the one plugged in last. Such adapters go by their USB socket.
+    """
+    if not device.startswith((str(dev / "tty"), str(dev / "serial" / "by-id"))):
+        return device
+    port = describe(device, dev, sys)
+    unique = port.serial is not None and not _has_double(port, sys)
+    return (port.by_id if unique else port.by_path) or (port.path if not unique else device)
+
+
+def _has_double(port: SerialDevice, sys: Path) -> bool:
+    """Is another adapter with the same numbers plugged in? Several ports of one adapter have names of their own."""
+    own = _usb_folder(sys / "class" / "tty" / os.path.basename(port.path) / "device")
+    for tty in (sys / "class" / "tty").glob("*"):
+        usb = _usb_folder(tty / "device")
+        if usb is not None and usb != own:
+            numbers = tuple(_line(usb / key) for key in ("idVendor", "idProduct", "serial"))
+            if numbers == (port.vendor, port.product, port.serial):
+                return True
+    return False
+
+
+def _completed(device: SerialDevice, port: ListedPort) -> SerialDevice:
+    """With what pyserial knows where /sys does not tell: macOS and Windows have none."""
+    said = None if port.description == "n/a" else port.description or None
+    return replace(
+        device,
+        vendor=device.vendor or (None if port.vid is None else f"{port.vid:04x}"),
+        product=device.product or (None if port.pid is None else f"{port.pid:04x}"),
+        serial=device.serial or port.serial_number or None,
+        description=device.description or said,
+    )
+
+
+def _is_vacant(path: str, sys: Path) -> bool:
+    return _line(sys / "class" / "tty" / os.path.basename(path) / "type") == _NO_UART
 
 
 def holders(path: str, proc: Path = PROC) -> list[Holder]:
@@ -92,6 +179,8 @@ def holders(path: str, proc: Path = PROC) -> list[Holder]:
 
 def access_problem(path: str) -> str | None:
     """Why this user cannot use `path` as a serial port; None when nothing speaks against it."""
+    if os.name != "posix":
+        return None  # COM3 is no file that could be looked at
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -111,7 +200,7 @@ def group_of(path: str) -> str:
     """The group whose members may use the port. Example: dialout."""
     try:
         return Path(path).group()
-    except (OSError, KeyError):
+    except (OSError, KeyError, NotImplementedError):  # Windows knows no groups
         return "dialout"
 
 
@@ -121,9 +210,8 @@ def _usb_folder(device: Path) -> Path | None:
     return next((folder for folder in (real, *real.parents) if (folder / "idVendor").is_file()), None)
 
 
-def _by_id(real: Path, dev: Path) -> str | None:
-    links = sorted((dev / "serial" / "by-id").glob("*"))
-    return next((str(link) for link in links if os.path.realpath(link) == str(real)), None)
+def _link_to(real: Path, folder: Path) -> str | None:
+    return next((str(link) for link in sorted(folder.glob("*")) if os.path.realpath(link) == str(real)), None)
 
 
 def _open_files(folder: Path) -> Iterator[str]:

@@ -1,8 +1,9 @@
-"""Serial ports: the only file that touches one.
+"""Serial ports: what a bus reads from and writes to.
 
-`SerialPort` is a real port: reads block until bytes come or a deadline passes, and never spin. It is ours alone: two
-programs on one wire take each other's answers, so a port that somebody holds is refused, to root as well. Any baud
-rate the adapter can do will do, and where the driver offers it, bytes are handed over without the usual 16 ms wait.
+`SerialPort` is a real port: reads block until bytes come or a deadline passes. It is ours alone: two programs on one
+wire take each other's answers, so a port that somebody holds is refused, to root as well. Any baud rate the adapter can
+do will do, and where the driver offers it, bytes are handed over without the usual 16 ms wait. What differs between
+operating systems is in `serial_io`.
 
 `VirtualTimePort` is the same port when the servos are emulated and time is virtual. Bytes go over the same pseudo
 terminal, but before a read the port tells the emulator, on a control socket, how many bytes it has written so far
@@ -13,28 +14,32 @@ reply is and writes it. So nothing depends on scheduling, and a silence costs no
 from __future__ import annotations
 
 import errno
-import fcntl
 import logging
 import os
 import select
 import socket
-import termios
-from array import array
 from collections.abc import Sequence
-from typing import Final, Protocol
-
-import serial
+from typing import TYPE_CHECKING, Final, Protocol
 
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.discovery import Holder, describe, holders
+from sfms_robot.servo.discovery import Holder, holders
+from sfms_robot.servo.serial_io import (
+    DEVICE_ERRORS,
+    WRITE_TIMEOUT_S,
+    Rs485,
+    actual_baud,
+    make_exclusive,
+    serial_io,
+)
+
+if TYPE_CHECKING:
+    import serial
 
 log = logging.getLogger(__name__)
 
 _REPLY_TIMEOUT_S = 5.0  # real seconds; only a stopped emulator takes so long
-_WRITE_TIMEOUT_S = 0.5  # a device that takes nothing for so long is as good as gone; stopping must not wait for it
 _TERMINALS: Final = "/dev/pts/"
-_TCGETS2: Final = 0x802C542A  # of asm-generic; where it is another number the ioctl fails and nothing is checked
-_OUTPUT_SPEED: Final = 10  # c_ospeed of struct termios2, in words
+_NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs behind which servos can be
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
 
 
@@ -68,41 +73,34 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """A serial device, or a pyserial URL that has a file descriptor such as socket://host:port."""
+    """A serial device: a path, a name such as COM3, socket://HOST:PORT or rfc2217://HOST:PORT.
 
-    def __init__(self, device: str, baud: int, clock: Now) -> None:
+    `rs485` says who switches the direction of a half-duplex RS-485 driver; None: nobody has to.
+    """
+
+    def __init__(self, device: str, baud: int, clock: Now, rs485: Rs485 | None = None) -> None:
+        """Opens it. Raises PortError of one line; nothing stays open then."""
         self.name = device
         self._clock = clock
         self._serial = _open(device, baud)
-        self._fd = self._serial.fileno()
-        _low_latency(self._serial)
-        self.discard_input()
+        try:
+            self._io = serial_io(self._serial, device, rs485)
+            _low_latency(self._serial)
+            self.discard_input()
+        except BaseException:
+            self._serial.close()
+            raise
 
     def write(self, data: bytes) -> None:
-        rest = memoryview(data)
-        while rest:
-            try:
-                rest = rest[os.write(self._fd, rest) :]
-            except BlockingIOError:  # pyserial's own write would spin here
-                if not select.select([], [self._fd], [], _WRITE_TIMEOUT_S)[1]:
-                    raise BusError(f"{self.name}: takes no more bytes") from None
-            except OSError as error:
-                raise BusError(f"{self.name}: cannot be written any more: {error}") from error
+        self._io.write(data)
 
     def read(self, n: int, deadline_s: float) -> bytes:
-        try:
-            ready, _, _ = select.select([self._fd], [], [], max(0.0, deadline_s - self._clock.now_s()))
-            data = os.read(self._fd, n) if ready else b""
-        except OSError as error:
-            raise BusError(f"{self.name}: cannot be read any more: {error}") from error
-        if ready and not data:
-            raise BusError(f"{self.name}: the device is gone")
-        return data
+        return self._io.read(n, max(0.0, deadline_s - self._clock.now_s()))
 
     def discard_input(self) -> None:
         try:
             self._serial.reset_input_buffer()
-        except (OSError, termios.error) as error:
+        except DEVICE_ERRORS as error:
             raise BusError(f"{self.name}: cannot be read any more: {error}") from error
 
     def now_s(self) -> float:
@@ -113,7 +111,8 @@ class SerialPort:
             self._serial.baudrate = baud
         except (OSError, OverflowError, ValueError) as error:
             raise PortError(f"{self.name}: does not take {baud} baud: {error}") from error
-        _check_baud(self._serial, self.name)
+        if not _is_url(self.name):
+            _check_baud(self._serial, self.name)
 
     def close(self) -> None:
         self._serial.close()
@@ -220,26 +219,39 @@ class VirtualTimePort:
 
 def _open(device: str, baud: int) -> serial.Serial:
     """Raises PortError of one line: missing, not permitted, held by somebody else, not a serial device."""
+    scheme = device.partition("://")[0] if _is_url(device) else ""
+    if scheme and scheme not in _NETWORKED:
+        choices = "a device such as /dev/ttyUSB0 or COM3, socket://HOST:PORT, rfc2217://HOST:PORT"
+        raise PortError(f"{device}: no servos can be behind {scheme}:// ({choices})")
+    import serial
+
     try:
-        port = serial.serial_for_url(device, baudrate=baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True)
+        port = serial.serial_for_url(device, baudrate=baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
     except (OSError, OverflowError, ValueError) as error:
         raise PortError(f"{device}: {_reason(device, error)}") from error
     try:
-        _claim(port, device)
-        _check_baud(port, device)
+        if scheme == "socket":
+            _without_delay(port)
+        elif not scheme:
+            _claim(port, device)
+            _check_baud(port, device)
     except BaseException:
         port.close()
         raise
     return port
 
 
+def _without_delay(port: serial.Serial) -> None:
+    """TCP_NODELAY. With Nagle's algorithm the goals of a tick wait until the last answer is acknowledged: 40 ms."""
+    with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
 def _claim(port: serial.Serial, device: str) -> None:
     """Nobody else may open it from now on; nobody else may have it open already. pyserial's lock is only advice."""
-    if _is_url(device):
-        return  # a socket has no other users
     if os.path.realpath(device).startswith(_TERMINALS):
         return  # an emulator holds the near end of its pseudo terminal open, and with it the lock of a dead host
-    fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+    make_exclusive(port)
     others = holders(device)
     if others:
         raise PortError(f"{device}: is held by another program ({_named(others)})")
@@ -247,15 +259,8 @@ def _claim(port: serial.Serial, device: str) -> None:
 
 def _check_baud(port: serial.Serial, device: str) -> None:
     """Drivers take the nearest rate they can do, and say which one only when asked."""
-    if _is_url(device):
-        return
-    settings = array("I", [0] * 64)
-    try:
-        fcntl.ioctl(port.fileno(), _TCGETS2, settings, True)
-    except OSError:
-        return  # this driver does not tell
-    actual = settings[_OUTPUT_SPEED]
-    if actual and abs(actual - port.baudrate) > _BAUD_TOLERANCE * port.baudrate:
+    actual = actual_baud(port)
+    if actual is not None and abs(actual - port.baudrate) > _BAUD_TOLERANCE * port.baudrate:
         raise PortError(f"{device}: the adapter cannot do {port.baudrate} baud (the nearest it has is {actual})")
 
 
@@ -267,12 +272,12 @@ def _is_url(device: str) -> bool:
 def _low_latency(port: serial.Serial) -> None:
     try:
         port.set_low_latency_mode(True)
-    except (AttributeError, OSError, ValueError) as error:
+    except (AttributeError, NotImplementedError, OSError, ValueError) as error:
         log.debug("%s: no low latency mode: %s", port.name, error)
 
 
 def _reason(device: str, error: Exception) -> str:
-    if not _is_url(device):
+    if not _is_url(device) and os.name == "posix":
         if not os.path.exists(device):
             return "no such device"
         if os.path.isdir(device):
@@ -287,8 +292,3 @@ def _reason(device: str, error: Exception) -> str:
 
 def _named(others: Sequence[Holder]) -> str:
     return ", ".join(f"pid {each.pid}: {each.command}" for each in others)
-
-
-def stable_name(device: str) -> str:
-    """The name under which the same adapter is found again after it was unplugged, or `device` itself."""
-    return (describe(device).by_id or device) if device.startswith("/dev/tty") else device

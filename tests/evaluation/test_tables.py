@@ -1,6 +1,5 @@
 """Tables of tokenizers: takes, folders, scores, rows, what they need and what they say."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,14 @@ from sfms_robot.corpora import takes
 from sfms_robot.corpora.takes import Take
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, ModelError
-from sfms_robot.evaluation.paper import bits, history, model, rows, tables
+from sfms_robot.evaluation.paper import history, model, rows, tables
 from sfms_robot.evaluation.paper.model import TableModel
 from sfms_robot.evaluation.paper.recipes import recipes
 from sfms_robot.evaluation.paper.score import Score, Windows, score
-from sfms_robot.evaluation.paper.train import amplified, first_frames, train
+from sfms_robot.evaluation.paper.train import train
 from sfms_robot.learning.job import Run
+from sfms_robot.learning.sfms.corpus import first_frames
+from sfms_robot.learning.sfms.tokenizer import amplified
 from sfms_robot.listeners.sfms.placement import place_exact
 
 RECIPES = recipes(steps=3)
@@ -88,7 +89,7 @@ def test_first_frames_of_short_takes_are_none() -> None:
 
 
 @pytest.mark.parametrize(
-    "recipe", [sparse(), sparse("nested"), sparse("learned_paper"), dense()], ids=lambda r: r.model.kind
+    "recipe", [sparse(), sparse("learned"), sparse("learned_paper"), dense()], ids=lambda r: r.model.kind
 )
 def test_any_recipe_trains_is_kept_and_scores_the_same_again(recipe: config.Recipe, tmp_path: Path) -> None:
     seen = Windows.of(faces(seed=2), 48)
@@ -149,19 +150,6 @@ def test_the_paper_rows_of_the_tables_are_those_of_the_paper() -> None:
     assert four["L2L (VQ-256)"] / four["Sparse-FSQ-256"] == 48
 
 
-def _row(family: str, of_bits: float, mse: float) -> rows.Row:
-    spec = rows.Spec(family, family, note=family)
-    return rows.Row(spec, 1, of_bits, Score(("a",), np.array([[mse]]), 0.0, 0.0))
-
-
-def test_what_bits_buy_is_the_least_error_of_all_that_is_affordable() -> None:
-    found = [_row("sparse", 150, 0.5), _row("sparse", 700, 0.2), _row("dense", 480, 0.3), _row("grouped", 50, 0.4)]
-    at = {point["bits"]: point for point in bits.bought(found)}
-    assert at[200] == {"bits": 200, "sparse": 0.5, "dense": None, "grouped": 0.4, "sparse_is_least": False}
-    assert at[800]["sparse"] == 0.2 and at[800]["sparse_is_least"]
-    assert bits.least_error([replace(found[0], bits=201)], "sparse", 200) is None
-
-
 def test_a_broken_history_is_named(tmp_path: Path) -> None:
     assert history.load(tmp_path) == []
     (tmp_path / history.FILE).write_text('[{"stride": 1}]')
@@ -182,7 +170,7 @@ def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> 
 
 def test_amplified_windows_keep_their_shape_and_their_best_masks() -> None:
     batch = torch.randn(4, 48, 3, generator=torch.Generator().manual_seed(1))
-    louder = amplified(batch, torch.Generator().manual_seed(2))
+    louder = amplified(batch, 0.4, torch.Generator().manual_seed(2))
     gain = louder / batch
     assert torch.allclose(gain, gain[:, :1, :1].expand_as(gain), rtol=1e-4)
     assert float(gain.min()) > 0 and float(gain.std()) > 0.05

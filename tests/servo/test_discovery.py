@@ -1,11 +1,13 @@
 """Ports, adapters and holders, read from made-up /dev, /sys and /proc trees."""
 
+import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from sfms_robot.servo.discovery import Holder, access_problem, describe, holders, list_ports
+from sfms_robot.servo.discovery import Holder, access_problem, describe, holders, list_ports, ports_data, stable_name
 
 
 @pytest.fixture
@@ -40,7 +42,7 @@ def process(proc: Path, pid: int, command: str, *targets: str) -> None:
 
 
 def test_an_adapter_tells_numbers_driver_and_latency(ftdi):
-    usb, acm = sorted(list_ports(ftdi / "dev", ftdi / "sys"), key=lambda each: each.path, reverse=True)
+    usb, acm = sorted(list_ports(ftdi / "dev", ftdi / "sys", list), key=lambda each: each.path, reverse=True)
     assert usb.path.endswith("ttyUSB0") and usb.by_id.endswith("usb-FTDI_U2D2_FT123-if00-port0")
     assert (usb.vendor, usb.product, usb.serial, usb.description) == ("0403", "6014", "FT123", "U2D2")
     assert usb.driver == "ftdi_sio" and usb.latency_ms == 16 and usb.latency_file.endswith("latency_timer")
@@ -53,7 +55,7 @@ def test_a_link_is_described_as_what_it_points_to(ftdi):
 
 
 def test_a_terminal_is_no_servo_port(ftdi):
-    assert not any("tty7" in each.path for each in list_ports(ftdi / "dev", ftdi / "sys"))
+    assert not any("tty7" in each.path for each in list_ports(ftdi / "dev", ftdi / "sys", list))
 
 
 def test_holders_are_found_through_links_and_named(ftdi):
@@ -81,3 +83,89 @@ def test_what_is_no_serial_port_is_told_apart(tmp_path):
     assert "directory" in access_problem(str(tmp_path))
     assert "file" in access_problem(str(tmp_path / "file"))
     assert "no such device" in access_problem(str(tmp_path / "nothing"))
+
+
+def adapter(root: Path, tty: str, socket: str, serial: str | None, by_id: str) -> str:
+    """A USB adapter at `tty`, plugged into `socket`; the link by-id goes to whoever came last, as udev leaves it."""
+    dev, sys = root / "dev", root / "sys"
+    for folder in ("by-id", "by-path"):
+        (dev / "serial" / folder).mkdir(parents=True, exist_ok=True)
+    (dev / tty).touch()
+    (dev / "serial" / "by-id" / by_id).unlink(missing_ok=True)
+    (dev / "serial" / "by-id" / by_id).symlink_to(f"../../{tty}")
+    (dev / "serial" / "by-path" / f"pci-usb-{socket}-port0").symlink_to(f"../../{tty}")
+    usb = sys / "devices" / socket
+    (usb / tty).mkdir(parents=True)
+    facts = {"idVendor": "1a86", "idProduct": "7523", "product": "USB Serial", "serial": serial}
+    for name, text in facts.items():
+        if text is not None:
+            (usb / name).write_text(text + "\n")
+    (sys / "class" / "tty" / tty).mkdir(parents=True)
+    (sys / "class" / "tty" / tty / "device").symlink_to(usb / tty)
+    return str(dev / tty)
+
+
+def names(root: Path, *devices: str) -> list[str]:
+    return [os.path.basename(stable_name(device, root / "dev", root / "sys")) for device in devices]
+
+
+@pytest.mark.parametrize("serial", [None, "0001"])
+def test_two_adapters_that_cannot_be_told_apart_go_by_the_socket_they_are_in(tmp_path, serial):
+    one = adapter(tmp_path, "ttyUSB0", "1-1", serial, "usb-1a86_USB_Serial-if00-port0")
+    two = adapter(tmp_path, "ttyUSB1", "1-2", serial, "usb-1a86_USB_Serial-if00-port0")
+    assert names(tmp_path, one, two) == ["pci-usb-1-1-port0", "pci-usb-1-2-port0"]
+    link = str(tmp_path / "dev" / "serial" / "by-id" / "usb-1a86_USB_Serial-if00-port0")
+    assert names(tmp_path, link) == ["pci-usb-1-2-port0"]  # what it means now, not after the next power cycle
+
+
+def test_an_adapter_with_a_serial_number_of_its_own_may_move_to_another_socket(tmp_path):
+    one = adapter(tmp_path, "ttyUSB0", "1-1", "A1", "usb-1a86_A1-if00-port0")
+    two = adapter(tmp_path, "ttyUSB1", "1-2", "A2", "usb-1a86_A2-if00-port0")
+    assert names(tmp_path, one, two) == ["usb-1a86_A1-if00-port0", "usb-1a86_A2-if00-port0"]
+
+
+def test_without_a_lasting_name_the_device_stays(tmp_path):
+    (tmp_path / "dev").mkdir()
+    assert names(tmp_path, str(tmp_path / "dev" / "ttyS1"), "socket://robot:4000", "COM3") == [
+        "ttyS1",
+        "robot:4000",
+        "COM3",
+    ]
+
+
+@dataclass
+class Listed:
+    """An entry of pyserial's list."""
+
+    device: str
+    vid: int | None = None
+    pid: int | None = None
+    serial_number: str | None = None
+    description: str | None = "n/a"
+
+
+def test_pyserials_list_and_the_files_are_one_list(ftdi):
+    dev, sys = ftdi / "dev", ftdi / "sys"
+    (dev / "ttyS0").touch()
+    (dev / "ttyS4").touch()
+    (dev / "serial0").symlink_to("ttyAMA0")
+    (dev / "ttyAMA0").touch()
+    for name, kind in {"ttyS0": "0", "ttyS4": "4"}.items():  # PORT_UNKNOWN: nothing is soldered there
+        (sys / "class" / "tty" / name).mkdir(parents=True)
+        (sys / "class" / "tty" / name / "type").write_text(kind + "\n")
+    listed = [
+        Listed("COM3", 0x0403, 0x6014, "FT9", "USB Serial Port (COM3)"),
+        Listed("/dev/cu.usbserial-FT9", 0x0403, 0x6014, "FT9"),
+        Listed(str(dev / "ttyUSB0"), 0xFFFF),
+        Listed(str(dev / "ttyS0")),
+    ]
+    found = {os.path.basename(each.path): each for each in list_ports(dev, sys, lambda: listed)}
+    assert sorted(found) == ["COM3", "cu.usbserial-FT9", "ttyACM0", "ttyAMA0", "ttyS4", "ttyUSB0"]
+    assert found["ttyUSB0"].vendor == "0403" and found["ttyUSB0"].latency_ms == 16
+    assert (found["COM3"].vendor, found["COM3"].serial) == ("0403", "FT9")
+    assert found["cu.usbserial-FT9"].description is None
+
+
+def test_the_ports_of_this_computer_can_be_told_as_json():
+    for port in json.loads(json.dumps(ports_data())):
+        assert {"name", "path", "vendor", "by_path", "problem", "holders"} <= set(port)

@@ -1,5 +1,6 @@
 import fcntl
 import os
+import socket
 import tty
 from array import array
 from contextlib import contextmanager
@@ -11,7 +12,8 @@ from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.port import SerialPort, VirtualTimePort, stable_name
+from sfms_robot.servo.discovery import stable_name
+from sfms_robot.servo.port import SerialPort, VirtualTimePort
 
 
 class Frozen:
@@ -109,6 +111,36 @@ def test_device_that_takes_no_more_bytes_is_a_failure_and_no_hang():
 def test_name_of_a_device_without_a_serial_number_stays():
     assert stable_name("/dev/ttyNOSUCH") == "/dev/ttyNOSUCH"
     assert stable_name("socket://robot:4000") == "socket://robot:4000"
+
+
+@contextmanager
+def listening():
+    """A server on this computer: its socket and the URL of it."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server, f"socket://127.0.0.1:{server.getsockname()[1]}"
+
+
+def test_a_network_port_sends_at_once_what_is_written():
+    with listening() as (server, url):
+        port = SerialPort(url, 1_000_000, Frozen())
+        peer, _ = server.accept()
+        with peer, socket.socket(fileno=os.dup(port._serial.fileno())) as near:
+            assert near.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+            port.write(b"goal")
+            assert peer.recv(9) == b"goal"
+            port.set_baud(57_600)
+            peer.sendall(b"answer")
+            assert port.read(9, 60.0) == b"answer"
+        with pytest.raises(BusError, match="the device is gone"):
+            port.read(1, 60.0)
+        port.close()
+
+
+@pytest.mark.parametrize("url", ["loop://", "spy:///dev/null", "hwgrep://x", "nonsense://"])
+def test_a_url_without_servos_behind_it_is_refused_in_one_line(url):
+    with pytest.raises(PortError, match=f"^{url}: no servos can be behind .*socket://HOST:PORT") as caught:
+        SerialPort(url, 57600, Frozen())
+    assert "\n" not in str(caught.value)
 
 
 def test_missing_device_is_named():

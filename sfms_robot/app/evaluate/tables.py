@@ -91,7 +91,10 @@ def _train_missing(options: TableOptions, wanted: Sequence[str], folder: Path, r
     if not missing:
         return
     if options.models is None:
-        raise ConfigError(f"{folder}: no trained {missing[0]}: --models DIR trains what is missing and keeps it in DIR")
+        raise ConfigError(
+            f"{folder}: {len(missing)} tokenizers of this table are not there ({missing[0]}, ...): add --models DIR, "
+            "which trains what is missing, one to two minutes each, and keeps it in DIR"
+        )
     examples = Windows.of(recorded[takes.HELD_OUT], WINDOW_FRAMES).motion
     train_all(
         missing, folder, recorded[takes.TRAIN], examples,

@@ -103,7 +103,7 @@ def _servos(options: EmulateOptions) -> dict[str, list[EmulatedServo]]:
     if (options.head is None) == (options.servo is None):
         raise ConfigError("emulate needs either --head NAME or --servo MODEL:IDS[,MODEL:IDS...]")
     if options.head is not None:
-        from sfms_robot.app.session import plugged_in  # brings numpy and all that drives a head: a list needs none
+        from sfms_robot.app.wiring import plugged_in  # brings numpy and all that drives a head: a list needs none
 
         wires = plugged_in(options.head, load_head(options.head))
     else:

@@ -14,9 +14,8 @@ from torch import Tensor
 from sfms_robot.corpora.takes import Take
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.paper.model import TableModel
-from sfms_robot.evaluation.paper.train import first_frames
 from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
-from sfms_robot.learning.sfms.corpus import windows
+from sfms_robot.learning.sfms.corpus import first_frames, windows
 from sfms_robot.listeners.sfms.placement import Strategy
 
 ANGLES: Final = slice(CHANNEL_INDEX["roll"], CHANNEL_INDEX["yaw"] + 1)

@@ -18,14 +18,11 @@ from sfms_robot.evaluation.paper.model import TableModel, save
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import checkpoint_file
-from sfms_robot.learning.sfms.corpus import windows
-from sfms_robot.learning.sfms.keyframe_scores import imitation, lively
-from sfms_robot.learning.sfms.masks import bank
-from sfms_robot.learning.sfms.tokenizer import learned_loss, tokenizer_loss
+from sfms_robot.learning.sfms.corpus import first_frames, windows
+from sfms_robot.learning.sfms.tokenizer import amplified, loss_of_steps, optimizers_of
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork
 
-GAIN: Final = 0.4  # deviation of the logarithm of a window's gain
+GAIN: Final = 0.4  # of windows while learning (`amplified`): six minutes of faces are few
 
 LossOf = Callable[[int, torch.Generator], Tensor]
 
@@ -55,8 +52,8 @@ def job(name: str, model: TableModel, takes: Sequence[Take], diary: Diary | None
     recipe = model.recipe
     phase = recipe.training
     motion = torch.cat([torch.from_numpy(take.motion) for take in takes])
-    starts = first_frames([len(take.motion) for take in takes], model.window)
-    loss_of = _loss_of(model, model.standardise(motion.to(model.motion_mean.device)), starts)
+    lengths = [len(take.motion) for take in takes]
+    loss_of = _loss_of(model, model.standardise(motion.to(model.motion_mean.device)), lengths)
 
     def noted(step: int, generator: torch.Generator) -> Tensor:
         if diary is not None:
@@ -66,7 +63,7 @@ def job(name: str, model: TableModel, takes: Sequence[Take], diary: Diary | None
     return Job(
         name=name,
         model=model,
-        optimizers=_optimizers(model, phase),
+        optimizers=_optimizers(model.tokenizer, phase),
         loss_of=noted,
         held_out=None,
         frames_per_step=phase.batch * model.window,
@@ -80,65 +77,21 @@ def job(name: str, model: TableModel, takes: Sequence[Take], diary: Diary | None
     )
 
 
-def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
-    """First frames of the windows that lie in one take, takes one after another."""
-    firsts, at = [torch.empty(0, dtype=torch.int64)], 0
-    for length in lengths:
-        firsts.append(torch.arange(at, max(at, at + length - window + 1), hop))
-        at += length
-    return torch.cat(firsts)
+def _optimizers(tokenizer: Tokenizer | DenseTokenizer, phase: config.TokenizerTraining) -> list[torch.optim.Optimizer]:
+    if isinstance(tokenizer, Tokenizer):
+        return optimizers_of(tokenizer, phase)
+    return [optimizer(tokenizer.parameters(), phase.learning_rate, phase.weight_decay)]
 
 
-def amplified(batch: Tensor, generator: torch.Generator) -> Tensor:
-    """Windows (B, T, C) that move more or less than they did, all channels alike.
-
-    Six minutes of a few faces do not hold what the next face does at its widest. The best masks stay the best.
-    """
-    gain = torch.exp(GAIN * torch.randn(len(batch), 1, 1, generator=generator))
-    return batch * gain.to(batch.device)
-
-
-def _optimizers(model: TableModel, phase: config.TokenizerTraining) -> list[torch.optim.Optimizer]:
-    tokenizer = model.tokenizer
-    score = None if isinstance(tokenizer, DenseTokenizer) else tokenizer.score
-    scores = [] if score is None else list(score.parameters())
-    known = {id(p) for p in scores}
-    rest = [p for p in tokenizer.parameters() if id(p) not in known]
-    made = [optimizer(rest, phase.learning_rate, phase.weight_decay)]
-    return [*made, optimizer(scores, phase.score_learning_rate, phase.weight_decay)] if scores else made
-
-
-def _loss_of(model: TableModel, motion: Tensor, starts: Tensor) -> LossOf:
+def _loss_of(model: TableModel, motion: Tensor, lengths: Sequence[int]) -> LossOf:
     tokenizer, phase = model.tokenizer, model.recipe.training
-    if isinstance(tokenizer, Tokenizer) and not isinstance(tokenizer.score, ScoreNetwork):
-        return _placed(tokenizer, motion, starts, phase)
+    if isinstance(tokenizer, Tokenizer):
+        return loss_of_steps(tokenizer, motion, lengths, phase, GAIN)
+    starts = first_frames(lengths, model.window)
 
-    def anywhere(step: int, generator: torch.Generator) -> Tensor:
+    def everywhere(step: int, generator: torch.Generator) -> Tensor:
         chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
-        batch = amplified(windows(motion, chosen, model.window), generator)
-        if isinstance(tokenizer, DenseTokenizer):
-            return baseline_loss(tokenizer, batch, phase.commitment, generator)
-        hot, cold = phase.temperature
-        temperature = hot * (cold / hot) ** (step / max(1, phase.steps - 1))
-        return learned_loss(tokenizer, batch, temperature, phase, generator)
+        batch = amplified(windows(motion, chosen, model.window), GAIN, generator)
+        return baseline_loss(tokenizer, batch, phase.commitment, generator)
 
-    return anywhere
-
-
-def _placed(tokenizer: Tokenizer, motion: Tensor, starts: Tensor, phase: config.TokenizerTraining) -> LossOf:
-    """Codes and inpainter on masks placed beforehand; conditional scores learn them meanwhile."""
-    some = starts[:: max(1, len(starts) // (phase.steps * phase.batch))]  # no more than are ever drawn
-    masks = bank(tokenizer, motion, some, phase.keyframes_drawn)
-    most = max(*tokenizer.keyframes, *(phase.keyframes_drawn or (0,)))
-    score = tokenizer.score
-
-    def beside(step: int, generator: torch.Generator) -> Tensor:
-        chosen, mask = masks.draw(phase.batch, generator)
-        batch = amplified(windows(motion, chosen, tokenizer.window), generator)
-        loss = tokenizer_loss(tokenizer, batch, mask, phase, generator)[0]
-        if not isinstance(score, ConditionalScore):
-            return loss
-        some = lively(batch, tokenizer.member, score.curves, phase.score_tracks, generator)
-        return loss + imitation(score, some, most, phase.untold, generator)
-
-    return beside
+    return everywhere

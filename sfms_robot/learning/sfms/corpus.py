@@ -53,11 +53,7 @@ class Corpus:
 
     def starts(self, window: int) -> Tensor:
         """First frames of every window that lies in one dyad."""
-        firsts, at = [], 0
-        for length in self.lengths:
-            firsts.append(torch.arange(at, at + length - window + 1))
-            at += length
-        return torch.cat(firsts)
+        return first_frames(self.lengths, window)
 
     def to(self, device: torch.device) -> Corpus:
         """The same frames on another device."""
@@ -215,6 +211,15 @@ def _stretches(frames: int, size: int, least: int) -> list[int]:
     elif rest:
         sizes[-1] += rest
     return sizes
+
+
+def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
+    """First frames of the windows that lie in one dyad, dyads of those lengths one after another."""
+    firsts, at = [torch.empty(0, dtype=torch.int64)], 0
+    for length in lengths:
+        firsts.append(torch.arange(at, max(at, at + length - window + 1), hop))
+        at += length
+    return torch.cat(firsts)
 
 
 def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:

@@ -10,7 +10,7 @@ above evenly placed keyframes. The teacher's error is that of linear interpolati
 
 Error of linear interpolation over that of the exact masks, recorded faces, unseen takes, one set of keyframes per
 channel, k = 3, 7, 10: even keyframes 4.3, 11, 15; choices of this network 1.7, 2.0, 1.6; swept over twice 1.16, 1.23,
-1.13; nested 2.1, 2.0, 2.3 (width 32, 2 layers, 1,500 steps of 32 tracks).
+1.13 (width 32, 2 layers, 1,500 steps of 32 tracks).
 """
 
 from __future__ import annotations
@@ -22,23 +22,17 @@ from sfms_robot.listeners.sfms.exact import completion_errors
 from sfms_robot.listeners.sfms.score import ConditionalScore, Tracks, tracks
 
 FLOOR = 0.05  # added to the least error, in squared deviations of the track: below it nobody sees a difference
-FORESIGHT = 0.7  # how much less every further keyframe counts, when it is not known how many come
 SHARPNESS = 0.1  # temperature of the teacher's preferences
 CANDIDATES = 4  # tracks looked at for one that is learned from
 EXPLORED = 0.5  # share of choices that are drawn rather than the highest score
 
 
-def imitation(score: ConditionalScore, track: Tracks, most: int, untold: float, generator: torch.Generator) -> Tensor:
-    """Cross-entropy of the scores against the teacher, over all states of one choice of 1..`most` keyframes per track.
-
-    `untold`: share of tracks whose scores do not know how many keyframes are to come.
-    """
+def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torch.Generator) -> Tensor:
+    """Cross-entropy of the scores against the teacher, over all states of one choice of 1..`most` keyframes a track."""
     n = len(track.curves)
-    blind = _uniform(n, generator, track.curves.device) < untold
-    k = torch.randint(1, most + 1, (n,), generator=generator).to(blind.device)
-    k = torch.where(blind, most, k)
-    rows, chosen, remaining = states(score, track, k, blind, generator)
-    regret = regrets(track[rows], chosen, k[rows], blind[rows], most)
+    k = torch.randint(1, most + 1, (n,), generator=generator).to(track.curves.device)
+    rows, chosen, remaining = states(score, track, k, generator)
+    regret = regrets(track[rows], chosen, k[rows], most)
     wanted = torch.softmax(-regret / SHARPNESS, dim=1)
     logits = score(track[rows], chosen, remaining)
     heard = torch.log_softmax(logits, dim=1).masked_fill(chosen > 0.5, 0.0)
@@ -59,19 +53,18 @@ def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: t
 
 @torch.no_grad()
 def states(
-    score: ConditionalScore, track: Tracks, k: Tensor, blind: Tensor, generator: torch.Generator
+    score: ConditionalScore, track: Tracks, k: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Every state (track row, chosen frames (S, T), keyframes to come) that the network's own choices lead through."""
     n, t, _ = track.curves.shape
     mask = track.curves.new_zeros(n, t)
     rows, chosen, remaining = [], [], []
     for step in range(int(k.max())):
-        coming = torch.where(blind, 0, k - step)
         here = (step < k).nonzero()[:, 0]
         rows.append(here)
         chosen.append(mask[here])
-        remaining.append(coming[here])
-        logits = score(track, mask, coming.clamp(min=0))
+        remaining.append((k - step)[here])
+        logits = score(track, mask, (k - step).clamp(min=1))
         noise = -torch.log(-torch.log(_uniform((n, t), generator, mask.device).clamp(1e-7, 1 - 1e-7)))
         drawn = _uniform(n, generator, mask.device) < EXPLORED
         picked = (logits + noise * drawn[:, None]).argmax(1, keepdim=True)
@@ -80,21 +73,12 @@ def states(
 
 
 @torch.no_grad()
-def regrets(track: Tracks, chosen: Tensor, k: Tensor, blind: Tensor, most: int) -> Tensor:
-    """How much worse than the best each next frame (S, T) would be in the end, as a share of the least error.
-
-    Told, the end is k keyframes; blind, it is every number up to `most`, the nearest counting most.
-    """
+def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
+    """How much worse than the best each next frame (S, T) would be with all k keyframes, as a share of the least."""
     errors = completion_errors(track.cost, chosen, most)  # (S, most, T)
-    least = errors.amin(2, keepdim=True)
-    relative = (errors - least) / (least + FLOOR)
-    ends = torch.arange(1, most + 1, device=chosen.device)
-    further = ends - chosen.sum(1, keepdim=True) - 1  # keyframes after the next one
-    weight = torch.where(blind[:, None], FORESIGHT**further, (ends == k[:, None]).float())
-    weight = weight * (further >= 0)
-    weight = weight / weight.sum(1, keepdim=True)
-    total = torch.where(weight[..., None] > 0, relative * weight[..., None], 0.0).sum(1)
-    return total.masked_fill(chosen > 0.5, torch.inf)
+    errors = errors[torch.arange(len(k), device=k.device), k - 1]
+    least = errors.amin(1, keepdim=True)
+    return ((errors - least) / (least + FLOOR)).masked_fill(chosen > 0.5, torch.inf)
 
 
 def _uniform(shape: int | tuple[int, int], generator: torch.Generator, device: torch.device) -> Tensor:

@@ -17,7 +17,7 @@ from sfms_robot.corpora.formats import open_for
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
-from sfms_robot.learning.sfms.corpus import Corpus, fit_scales, gather, windows
+from sfms_robot.learning.sfms.corpus import Corpus, first_frames, fit_scales, gather, windows
 from sfms_robot.learning.sfms.keyframe_scores import imitation, lively
 from sfms_robot.learning.sfms.losses import masking, reconstruction
 from sfms_robot.learning.sfms.masks import batches
@@ -77,16 +77,11 @@ def tokenizer_job(
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
     motion = model.standardise(corpus.motion)
-    rest = [*tokenizer.quantizer.parameters(), *tokenizer.inpainter.parameters()]
-    optimizers = [optimizer(rest, phase.learning_rate, phase.weight_decay)]
-    if tokenizer.score is not None:  # two optimizers: the scores must not run ahead of the codes (IV-D2)
-        optimizers.append(optimizer(tokenizer.score.parameters(), phase.score_learning_rate, phase.weight_decay))
-
     return Job(
         name="tokenizer",
         model=model,
-        optimizers=optimizers,
-        loss_of=_loss_of(tokenizer, corpus, motion, phase),
+        optimizers=optimizers_of(tokenizer, phase),
+        loss_of=loss_of_steps(tokenizer, motion, corpus.lengths, phase),
         held_out=_held_out(model, held_out),
         frames_per_step=phase.batch * tokenizer.window,
         phase=phase,
@@ -100,31 +95,54 @@ def tokenizer_job(
     )
 
 
-def _loss_of(
-    tokenizer: Tokenizer, corpus: Corpus, motion: Tensor, phase: config.TokenizerTraining
+def optimizers_of(tokenizer: Tokenizer, phase: config.TokenizerTraining) -> list[torch.optim.Optimizer]:
+    """Of codes and inpainter, and of the scores where there are any: they must not run ahead of the codes (IV-D2)."""
+    rest = [*tokenizer.quantizer.parameters(), *tokenizer.inpainter.parameters()]
+    made = [optimizer(rest, phase.learning_rate, phase.weight_decay)]
+    if tokenizer.score is not None:
+        made.append(optimizer(tokenizer.score.parameters(), phase.score_learning_rate, phase.weight_decay))
+    return made
+
+
+def amplified(batch: Tensor, gain: float, generator: torch.Generator) -> Tensor:
+    """Windows (B, T, C) that move more or less than they did, all channels alike: `gain` deviates the logarithm.
+
+    A few faces do not hold what the next face does at its widest. The best masks stay the best.
+    """
+    if not gain:
+        return batch
+    return batch * torch.exp(gain * torch.randn(len(batch), 1, 1, generator=generator)).to(batch.device)
+
+
+def loss_of_steps(
+    tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], phase: config.TokenizerTraining, gain: float = 0.0
 ) -> Callable[[int, torch.Generator], Tensor]:
-    """Loss of one step, by how the tokenizer places its keyframes."""
+    """Loss of one step on motion (N, C), standardised, of dyads of those lengths, by how keyframes are placed.
+
+    `gain`: of `amplified` windows.
+    """
     if isinstance(tokenizer.score, ScoreNetwork):
-        starts = corpus.starts(tokenizer.window)
+        starts = first_frames(lengths, tokenizer.window)
 
         def jointly(step: int, generator: torch.Generator) -> Tensor:
             chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
             hot, cold = phase.temperature
             temperature = hot * (cold / hot) ** (step / max(1, phase.steps - 1))
-            return learned_loss(tokenizer, windows(motion, chosen, tokenizer.window), temperature, phase, generator)
+            batch = amplified(windows(motion, chosen, tokenizer.window), gain, generator)
+            return learned_loss(tokenizer, batch, temperature, phase, generator)
 
         return jointly
-    draw = batches(tokenizer, corpus, motion, phase.keyframes_drawn)
-    score = tokenizer.score
-    most = max(*tokenizer.keyframes, *(phase.keyframes_drawn or (0,)))
+    draw = batches(tokenizer, motion, lengths, phase.steps * phase.batch)
+    score, most = tokenizer.score, max(tokenizer.keyframes)
 
     def beside(step: int, generator: torch.Generator) -> Tensor:
         batch, mask = draw(phase.batch, generator)
+        batch = amplified(batch, gain, generator)
         loss = tokenizer_loss(tokenizer, batch, mask, phase, generator)[0]
         if score is None:
             return loss
         some = lively(batch, tokenizer.member, score.curves, phase.score_tracks, generator)
-        return loss + imitation(score, some, most, phase.untold, generator)
+        return loss + imitation(score, some, most, generator)
 
     return beside
 
@@ -175,7 +193,7 @@ def learned_loss(
 def held_out_windows(model: SfmsModel, corpus: Corpus) -> Tensor:
     """Consecutive windows (W, T, C), standardised."""
     window = model.tokenizer.window
-    return windows(model.standardise(corpus.motion), _consecutive(corpus, window), window)
+    return windows(model.standardise(corpus.motion), first_frames(corpus.lengths, window, window), window)
 
 
 def _held_out(model: SfmsModel, corpus: Corpus) -> Callable[[], float]:
@@ -207,11 +225,3 @@ def reconstruction_error(
     motion = held_out_windows(model, corpus)
     masks = [tokenizer.place(some, keyframes or tokenizer.keyframes, strategy) for some in torch.split(motion, CHUNK)]
     return float(window_errors(tokenizer, motion, torch.cat(masks)).mean())
-
-
-def _consecutive(corpus: Corpus, window: int) -> Tensor:
-    firsts, at = [], 0
-    for length in corpus.lengths:
-        firsts.append(torch.arange(at, at + length - window + 1, window))
-        at += length
-    return torch.cat(firsts)

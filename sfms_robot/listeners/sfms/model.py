@@ -87,7 +87,7 @@ def _score_network(settings: config.Sfms) -> ScoreNetwork | ConditionalScore | N
     if settings.placement == "learned_paper":
         channels, groups = len(settings.channels), len(settings.groups)
         return ScoreNetwork(channels, groups, scores.width, scores.heads, scores.layers)
-    if settings.placement in ("learned", "nested"):
+    if settings.placement == "learned":
         largest = max(len(group.channels) for group in settings.groups.values())
         return ConditionalScore(largest, scores.width, scores.heads, scores.layers)
     return None

@@ -289,8 +289,8 @@ class PulseBus(WireBus[RateLimitedPort]):
         Raises ValueError, with nothing sent, before `enable` and after torque off, for a goal that is not finite, or
         one out of range. While the port is gone nothing is sent and nothing is raised.
         """
-        self._check(goals_rad, bool(self._enabled) and self._off is None)
-        self._ticks = self._conversion.to_ticks(goals_rad)
+        self._check(bool(self._enabled) and self._off is None)
+        self._ticks = self._goals.ticks(goals_rad, np.array(self._enabled, np.intp))
         self._pending = True
         try:
             self._counts["deferred"] += not self._flush()
