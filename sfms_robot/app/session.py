@@ -403,13 +403,16 @@ def run(
         if isinstance(feed, ListenerProcess):
             feed.wait_ready()
         turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
-        watching = [*observers, *_observers(options, opened.config, duration_s, progress, stack)]
+        recorder = _recorder(options, opened.config)
+        own = [each for each in (recorder, progress(duration_s) if progress else None) if each is not None]
+        for observer in own:
+            stack.callback(observer.close)
         programme = Programme(
             source, feed, duration_s,
             life=Life(opened.config.life, options.seed),
             knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
             overlay=overlay,
-            observers=watching,
+            observers=[*observers, *own],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt or Interrupt(), signals=signals)
         report = run_report(
@@ -419,6 +422,9 @@ def run(
         )  # fmt: skip
         report["exit_code"] = drove.exit_code
         report["limitation"] = limited
+        if recorder is not None:
+            recorder.close()
+            report["recording"] = recorder.statistics()
         if options.fast:
             report["wire"] = opened.digests()
     if options.record is not None:
@@ -441,28 +447,17 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     return feed
 
 
-def _observers(
-    options: RunOptions,
-    head: Head,
-    duration_s: float | None,
-    progress: Callable[[float | None], Observer] | None,
-    stack: ExitStack,
-) -> list[Observer]:
-    observers: list[Observer] = []
-    if options.record is not None:
-        about = {
-            "head": head.name,
-            "listener": Path(options.listener).name,
-            "seed": str(options.seed),
-            "audio": Path(options.audio).name,
-        }
-        when_full: FullPolicy = "wait" if options.fast else "drop"
-        observers.append(Recorder(options.record, list(head.joints), when_full=when_full, about=about))
-    if progress is not None:
-        observers.append(progress(duration_s))
-    for observer in observers:
-        stack.callback(observer.close)
-    return observers
+def _recorder(options: RunOptions, head: Head) -> Recorder | None:
+    if options.record is None:
+        return None
+    about = {
+        "head": head.name,
+        "listener": Path(options.listener).name,
+        "seed": str(options.seed),
+        "audio": Path(options.audio).name,
+    }
+    when_full: FullPolicy = "wait" if options.fast else "drop"
+    return Recorder(options.record, list(head.joints), when_full=when_full, about=about)
 
 
 def _present(opened: OpenHead) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 import base64
 import json
 import threading
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from mcap.reader import make_reader
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.runtime.recorder import RUN_FILE, Recorder, write_report
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder, check_folder, write_report
 
 JOINTS = ("neck_yaw", "jaw")
 
@@ -105,6 +106,8 @@ def test_the_file_says_what_it_is_about(tmp_path):
     Recorder(tmp_path, JOINTS, about={"head": "face28", "seed": "3"}).close()
     with (tmp_path / RUN_FILE).open("rb") as file:
         (record,) = make_reader(file).iter_metadata()
+    began = datetime.fromisoformat(record.metadata.pop("started_utc"))
+    assert began.tzinfo is not None and abs((datetime.now(UTC) - began).total_seconds()) < 3600
     assert record.metadata == {"head": "face28", "seed": "3", "joints": '["neck_yaw", "jaw"]'}
 
 
@@ -120,8 +123,20 @@ def test_a_folder_that_cannot_be_made_is_a_configuration_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="--record .*file/run: cannot be written to"):
         Recorder(tmp_path / "file" / "run", JOINTS)
-    with pytest.raises(ConfigError, match="--record .*cannot be written to"):
-        write_report(tmp_path / "file", {})
+
+
+def test_a_report_that_cannot_be_written_is_said_and_loses_nothing(tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    write_report(tmp_path / "file", {})
+    assert "the report cannot be written" in caplog.text
+
+
+def test_a_recording_is_not_overwritten_unasked(tmp_path):
+    check_folder(tmp_path)
+    Recorder(tmp_path, JOINTS).close()
+    with pytest.raises(ConfigError, match="holds a recording already .*--overwrite"):
+        check_folder(tmp_path)
+    check_folder(tmp_path, overwrite=True)
 
 
 def test_the_report_is_json(tmp_path):
