@@ -121,8 +121,8 @@ class Bus(Protocol):
         """Send torque-off now, unconfirmed: one packet per wire, to this head's ids alone; pulses off on boards.
 
         May be called from any thread at any time after `connect`, also while another one is inside `poll`. Never
-        raises, never waits for an answer. With the policy "hold" nothing is sent. Does not refuse later goals: `stop`
-        does.
+        raises, never waits for an answer. No goal is sent from then on, until `enable`. With the policy "hold" nothing
+        happens.
         """
 
     def stop(self, policy: StopPolicy) -> None:
