@@ -211,6 +211,12 @@ def launch(
         "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
+    process, told = _started(description)
+    return Chain(process, servos, virtual, told["device"], told["control"], told["folder"])
+
+
+def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:
+    """The process, and what it says when it is ready. Raises ConfigError for what it refuses, BusError."""
     process = subprocess.Popen(
         [sys.executable, "-m", "sfms_robot.emulator.chain_process"],
         stdin=subprocess.PIPE,
@@ -230,8 +236,7 @@ def launch(
         if ready.startswith(b"refused "):
             raise ConfigError(ready.removeprefix(b"refused ").decode().strip())
         raise BusError(f"the emulated chain did not start (exit code {process.returncode})")
-    told = json.loads(ready.removeprefix(b"ready "))
-    return Chain(process, servos, virtual, told["device"], told["control"], told["folder"])
+    return process, json.loads(ready.removeprefix(b"ready "))
 
 
 def wait(chains: Sequence[Chain]) -> Chain:
