@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from sfms_robot.config.base import UNKNOWN_KEY, Name, find, one_line, read
+from sfms_robot.config.base import UNKNOWN_KEY, Name, one_line, read
 from sfms_robot.config.drives import expanded, problems
 from sfms_robot.config.firmware import load_firmware_map
 from sfms_robot.config.head import Bus, Head, Joint, LimitClass, load_head, wiring
@@ -20,6 +20,7 @@ from sfms_robot.config.kinematics import Kinematics
 from sfms_robot.config.kinematics import problems as neck_problems
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
 from sfms_robot.config.overlay import load_overlay
+from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 
 _TABLES: dict[str, Any] = {

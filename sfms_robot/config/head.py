@@ -8,12 +8,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, find, load
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, load
 from sfms_robot.config.drives import expanded, problems
 from sfms_robot.config.kinematics import Kinematics
 from sfms_robot.config.kinematics import problems as neck_problems
 from sfms_robot.config.life import Life
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
+from sfms_robot.data import find
 
 FaultPolicy = Literal["hold", "limp", "reduce", "reboot_and_ease_in"]
 MEASURED_FAULTS = ("input voltage", "overheating")  # those a threshold may be given for

@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sfms_robot.config.base import Model, find, read
+from sfms_robot.config.base import Model, read
 from sfms_robot.config.drives import NOT_SHARED
 from sfms_robot.config.head import Joint, load_head
 from sfms_robot.config.overlay import CALIBRATE, FIT, head_hash, layered, load_overlay
+from sfms_robot.data import find
 
 SHOWN: Final = (
     "bus", "id", "model", "zero_ticks", "sign", "ratio", "min_deg", "rest_deg", "max_deg", "limits", "lag_ms", "unit",

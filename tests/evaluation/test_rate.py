@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.evaluation.rate import bits_per_window, keyframe_bits
+from sfms_robot.evaluation.keyframe_bits import bits_per_window, keyframe_bits
 
 
 @given(st.integers(1, 60), st.data())

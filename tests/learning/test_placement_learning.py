@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from sfms_robot import config
-from sfms_robot.learning.sfms.keyframe_scores import imitation, lively, regrets, states
-from sfms_robot.learning.sfms.tokenizer import tokenizer_loss
+from sfms_robot.learning.sfms.imitation import imitation, lively, regrets, states
+from sfms_robot.learning.sfms.tokenizer_trainer import tokenizer_loss
 from sfms_robot.listeners.sfms.choice import choose
 from sfms_robot.listeners.sfms.exact import best_frames, completion_errors, mask_cost
 from sfms_robot.listeners.sfms.model import Tokenizer

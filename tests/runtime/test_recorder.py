@@ -10,7 +10,8 @@ from mcap.reader import make_reader
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.runtime.recorder import RUN_FILE, Recorder, check_folder, write_report
+from sfms_robot.runtime import recorder as recorder_module
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder, check_folder, parts_of, write_report
 
 JOINTS = ("neck_yaw", "jaw")
 
@@ -143,3 +144,30 @@ def test_the_report_is_json(tmp_path):
     write_report(tmp_path / "new", {"version": 1})
     assert json.loads((tmp_path / "new" / "report.json").read_text()) == {"version": 1}
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["report.json"]
+
+
+def test_a_long_recording_goes_on_in_files_that_are_each_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "PART_MESSAGES", 10)
+    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    for k in range(14):
+        recorder.tick(tick(k / 100))
+    recorder.close()
+    parts = parts_of(tmp_path)
+    assert [part.name for part in parts] == ["run.mcap", "run-0002.mcap", "run-0003.mcap"]
+    times = []
+    for part in parts:
+        with part.open("rb") as file:
+            reader = make_reader(file)
+            times += [message.log_time for _, channel, message in reader.iter_messages(topics=["/joints"])]
+            assert reader.get_summary() is not None
+    assert times == [round(k / 100 * 1e9) for k in range(14)]
+
+
+def test_a_recording_that_is_replaced_leaves_no_part_of_the_old_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "PART_MESSAGES", 2)
+    first = Recorder(tmp_path, JOINTS, when_full="wait")
+    for k in range(5):
+        first.tick(tick(k / 100))
+    first.close()
+    Recorder(tmp_path, JOINTS).close()
+    assert [part.name for part in parts_of(tmp_path)] == ["run.mcap"]

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
 from sfms_robot.signals.tracks import Track, write_track
-from sfms_robot.sources.recording import Recording, open_source, shipped_speaker, speakers
+from sfms_robot.sources.recording import Recording, open_source
+from sfms_robot.sources.speakers import shipped_speaker, speakers
 
 
 def voice(frames):

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app import session
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ConfigError
@@ -19,6 +17,7 @@ from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.ports import Bus
 from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port, VirtualTimePort
 
@@ -200,10 +199,9 @@ def bus_on(head: Head, chain: Chain, clock: VirtualClock, wrap: Callable[[Port],
     servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in head.joints.items()]
     turns = np.array([maps[joint.model].ticks_per_revolution for joint in head.joints.values()])
     open_port = partial(VirtualTimePort, chain.device, chain.control, config.baud, clock)
-    board = config.family in session.BOARDS
-    more: dict[str, Any] = {"confirmed": True} if board else {"faults": head.faults}
-    module, kind = session.FAMILIES[config.family].split(":")
-    bus: Bus = getattr(import_module(module), kind)(
+    family = family_named(config.family)
+    more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
+    bus: Bus = family.bus_class()(
         "main", servos, Calibration(head.joints, turns), lambda: wrap(open_port()), config.baud, _DEADLINE_S,
         config=config, **more,
     )  # fmt: skip

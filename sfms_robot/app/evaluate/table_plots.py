@@ -10,10 +10,10 @@ import numpy as np
 
 from sfms_robot.app.evaluate import trajectory_plots
 from sfms_robot.app.evaluate.plot_style import INK, RULE, SERIES, new_figure, plain, save
-from sfms_robot.evaluation.paper import history
-from sfms_robot.evaluation.paper.model import TableModel
-from sfms_robot.evaluation.paper.score import Windows
-from sfms_robot.evaluation.paper.tables import Table
+from sfms_robot.evaluation.paper import score_history as history
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
+from sfms_robot.evaluation.paper.restoration import Windows
+from sfms_robot.evaluation.paper.tokenizer_tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,9 +27,9 @@ def draw(folder: Path, tables: Sequence[Table], models: Mapping[str, TableModel]
     for file, name in TRAJECTORIES_OF.items():
         if name in models:
             save(trajectory_plots.cases(models[name], seen), folder / file)
-    looks = history.load(trained / HISTORY_OF) if HISTORY_OF in models else []
-    if looks:
-        save(trajectory_plots.scores_over_steps(looks), folder / "scores.png")
+    snapshots = history.load(trained / HISTORY_OF) if HISTORY_OF in models else []
+    if snapshots:
+        save(trajectory_plots.scores_over_steps(snapshots), folder / "scores.png")
     for table in tables:
         if table.name == "4":
             save(_quantiles(table), folder / "quantiles.png")

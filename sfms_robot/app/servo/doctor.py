@@ -30,13 +30,14 @@ from sfms_robot.app.servo.diagnosis import (
 )
 from sfms_robot.app.servo.servo_state import State, read_all
 from sfms_robot.app.servo.servo_tools import Progress, scan, twins
-from sfms_robot.app.servo.servo_wire import FAMILIES, SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
+from sfms_robot.servo.families import current_name, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 
@@ -44,7 +45,6 @@ FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_RATE_HZ: Final = 100.0
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
-_TOOL_FAMILY: Final = {"dynamixel": "dynamixel2"}  # the others are called the same in a head's file
 
 OpenPort = Callable[[str, int], Port]
 
@@ -69,8 +69,8 @@ def examine(
 
     Raises ConfigError for a head, a family or a port description that cannot be used.
     """
-    if family not in FAMILIES:
-        raise ConfigError.at("doctor", "family", family, "is unknown", FAMILIES)
+    if family not in servo_families():
+        raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
         buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress) for line in lines]
@@ -139,7 +139,7 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         where = devices(described, port or only_port())
     for name, device in where.items():
         bus = described.buses[name]
-        speaks = _TOOL_FAMILY.get(bus.family, bus.family)
+        speaks = current_name(bus.family)
         shown = SIM if port == SIM else device
         yield Line(name, device, shown, speaks, bus.baud, bus.rate_hz, _wanted(described, name))
 
@@ -205,7 +205,7 @@ def _look_at_board(line: Line) -> tuple[list[Finding], dict[str, Any]]:
 
 
 def _first_baud(line: Line) -> int:
-    return line.baud or FAMILIES[line.family].bauds[0]
+    return line.baud or servo_families()[line.family].bauds[0]
 
 
 def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, Seen], dict[int, Seen]]:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sfms_robot.learning.sfms.corpus import first_frames, place_all, windows
+from sfms_robot.learning.corpus import first_frames, windows
+from sfms_robot.learning.sfms.tokens import place_all
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.placement import Strategy, place
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
-from sfms_robot.listeners.sfms.hearing import SHAPES
+from sfms_robot.listeners.sfms.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms.inpainter import Inpainter
 from sfms_robot.listeners.sfms.placement import Strategy, place
 from sfms_robot.listeners.sfms.predictor import Predictor

@@ -112,6 +112,11 @@ class ChainBus(WireBus[L], Generic[L]):
     def capabilities(self) -> Mapping[str, frozenset[str]]:
         return {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
 
+    @property
+    def poll_budget_s(self) -> float:
+        """Time that a poll may take, whatever is lost: see `status_poll`."""
+        return self._poll.budget_s
+
     # --- what a family adds -------------------------------------------------------------------------------------
 
     @abstractmethod

@@ -193,7 +193,9 @@ class StatusPoll:
     def _everybody(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Outcome:
         """All by one request, and those behind a silent one by a second."""
         out = Outcome()
-        rest = list(ids)
+        # Behind a dead servo in front everybody is silent: after a quiet poll somebody else is asked first.
+        start = self.quiet_polls * (len(ids) // QUIET_POLLS or 1) % max(1, len(ids))
+        rest = [*ids[start:], *ids[:start]]
         for attempt in range(_REQUESTS):
             # A wire that was quiet in the last poll as well is asked once: most likely nobody is there.
             if not rest or (attempt > 0 and not out.answers and self.quiet_polls > 0):
