@@ -12,7 +12,7 @@ from typing import Final
 from sfms_robot.app.servo.servo_wire import Seen, Wire
 from sfms_robot.app.session import BOARDS, SIM, devices
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
-from sfms_robot.config.caution import cautious
+from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.ports import Clock
@@ -23,7 +23,6 @@ from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)
 
-_WIRE_FAMILY: Final = {"dynamixel": "dynamixel2", "dynamixel1": "dynamixel1", "feetech": "feetech"}
 _REVERSED: Final = 1  # bit of the drive mode: which way ticks run
 
 
@@ -57,7 +56,7 @@ def ready(head: Head, *, real: bool, calibrated: Collection[str] = (), refused: 
         return head
     which = "" if len(held) == len(head.joints) else f" in {', '.join(held)}"
     log.warning("head %s is not calibrated%s: 20 %% of its travel, 0.3 of its speed", head.name, which)
-    return cautious(head, held)
+    return held_back(head, held)
 
 
 def identify(
@@ -73,7 +72,7 @@ def identify(
             port = open_port(where[name], bus.baud, clock)
             try:
                 for joint in mine:
-                    servos[joint] = _identity(port, _WIRE_FAMILY[bus.family], bus.baud, head.joints[joint], clock)
+                    servos[joint] = _identity(port, bus.family, bus.baud, head.joints[joint], clock)
             finally:
                 port.close()
     return servos

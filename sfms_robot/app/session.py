@@ -34,7 +34,7 @@ SIM = "sim"
 SIM_READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
 # The class of each bus family; only those of the head are imported.
 FAMILIES = {
-    "dynamixel": "sfms_robot.servo.chain.dynamixel2_bus:DynamixelBus",
+    "dynamixel2": "sfms_robot.servo.chain.dynamixel2_bus:DynamixelBus",
     "dynamixel1": "sfms_robot.servo.chain.dynamixel1_bus:Dynamixel1Bus",
     "feetech": "sfms_robot.servo.chain.feetech_bus:FeetechBus",
     "maestro": "sfms_robot.servo.boards.maestro_bus:MaestroBus",
@@ -109,7 +109,8 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
         hanging = np.array([joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)])
         ticks = int(_calibration({name: joint}).to_ticks(hanging)[0])
         baud = head.buses[joint.bus].baud
-        by_bus.setdefault(joint.bus, []).append(EmulatedServo(joint.id, joint.model, baud, ticks))
+        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
+        by_bus.setdefault(joint.bus, []).append(servo)
     return by_bus
 
 
@@ -124,7 +125,14 @@ def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
             raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
     joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
     return {
-        bus: [replace(servo, registers=stored.of(joints[bus, servo.id]), supply_v=stored.supply_v) for servo in servos]
+        bus: [
+            replace(
+                servo,
+                registers={**servo.registers, **stored.of(joints[bus, servo.id])},
+                supply_v=stored.supply_v,
+            )
+            for servo in servos
+        ]
         for bus, servos in emulated(head).items()
     }
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.config.arig import Arig
-from sfms_robot.config.base import parse, read
+from sfms_robot.config.base import parse
 from sfms_robot.config.listener import Listener, Sfms
+from sfms_robot.config.yaml_file import read
 from sfms_robot.errors import ConfigError
 
 KINDS: Final[Mapping[str, type[Listener]]] = {"sfms": Sfms, "arig": Arig}

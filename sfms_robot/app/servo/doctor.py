@@ -44,7 +44,6 @@ FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_RATE_HZ: Final = 100.0
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
-_TOOL_FAMILY: Final = {"dynamixel": "dynamixel2"}  # the others are called the same in a head's file
 
 OpenPort = Callable[[str, int], Port]
 
@@ -139,9 +138,8 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         where = devices(described, port or only_port())
     for name, device in where.items():
         bus = described.buses[name]
-        speaks = _TOOL_FAMILY.get(bus.family, bus.family)
         shown = SIM if port == SIM else device
-        yield Line(name, device, shown, speaks, bus.baud, bus.rate_hz, _wanted(described, name))
+        yield Line(name, device, shown, bus.family, bus.baud, bus.rate_hz, _wanted(described, name))
 
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:

@@ -84,7 +84,7 @@ class ChainBus(WireBus[L], Generic[L, S]):
         config: BusConfig | None = None,
         faults: Faults | None = None,
     ) -> None:
-        self._config = config or BusConfig(family="dynamixel", baud=baud)
+        self._config = config or BusConfig(family="dynamixel2", baud=baud)
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
         self._tables = [Table.of(servo.map) for servo in servos]
         self._index = {servo.id: i for i, servo in enumerate(servos)}

@@ -58,6 +58,7 @@ class Handshake(Contact[Dxl2Link]):
         """Mode, gains, profile and limits, before torque; the latched hardware errors."""
         now = yield from self._snapshot(index)
         wanted = self._wanted(index, now)
+        self._compare(index, now | wanted)
         torque = now[self._name(index, "torque_enable")]
         for name, target in wanted.items():
             if now[name] == target:
@@ -71,6 +72,13 @@ class Handshake(Contact[Dxl2Link]):
                 now = yield from self._snapshot(index)  # another mode resets gains, profile and goals
         error = self.tables[index].role("error_status")
         return now[error.name] if error is not None else 0
+
+    def _compare(self, index: int, now: Mapping[str, int]) -> None:
+        """Refuse what is stored in the servo where the head's file says otherwise: it is for a person to change."""
+        for name, value in self._servos[index].safety.stored.items():
+            if now.get(name) != value:
+                mend = f"sfms-robot servo write {self._servos[index].id} {name} {value}"
+                raise self._error(index, f"has {name} {now.get(name)} stored, the head's file says {value} ({mend})")
 
     def torque_on(self, index: int) -> Steps[int]:
         present = self.get(index, self._name(index, "present_position"))
