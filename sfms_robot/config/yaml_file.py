@@ -82,8 +82,7 @@ def _check_depth(text: str) -> None:
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > DEEPEST:
-                raise yaml.MarkedYAMLError(
-                    problem=f"nested more than {DEEPEST} levels deep", problem_mark=event.start_mark
-                )
+                mark: Any = event.start_mark
+                raise yaml.MarkedYAMLError(None, None, f"nested more than {DEEPEST} levels deep", mark)
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1

@@ -34,7 +34,7 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, write_report
 from sfms_robot.runtime.safety import interrupt_flag, realtime_priority
-from sfms_robot.sources.recording import open_source
+from sfms_robot.sources.registry import open_source
 
 logger = logging.getLogger(__name__)
 
