@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import sys
 
@@ -56,7 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"sfms-robot: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except OSError as error:
-        if error.filename is None:  # not about a file that somebody named: ours to repair
-            raise
-        print(f"sfms-robot: {error.filename}: {error.strerror}", file=sys.stderr)
+        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise  # not about a file that somebody named: ours to repair
+        print(f"sfms-robot: {error.filename or 'a file of this command'}: {error.strerror}", file=sys.stderr)
         sys.exit(ConfigError.exit_code)
