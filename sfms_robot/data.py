@@ -6,6 +6,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
+from sfms_robot.errors import ConfigError
+
 Shipped = Literal["configs", "firmware_maps", "sim"]
 
 
@@ -26,3 +28,15 @@ def data_dir(name: Shipped) -> Path:
 def shipped_names(folder: Path, marker: str) -> list[str]:
     """Names of the folders in `folder` that hold a file called `marker`, sorted."""
     return sorted(path.parent.name for path in folder.glob(f"*/{marker}"))
+
+
+def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
+    """Folder of a shipped head or listener by name, or of anybody's by path. Raises ConfigError with the choices."""
+    root = data_dir("configs") / kind
+    for folder in (root / name, Path(name)):
+        if (folder / marker).is_file():
+            return folder
+    choices = ", ".join(shipped_names(root, marker))
+    raise ConfigError(
+        f"{kind.removesuffix('s')} {name!r} is neither a shipped name nor a folder with a {marker} ({choices})"
+    )

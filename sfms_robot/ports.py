@@ -56,11 +56,8 @@ class PlanFeed(Protocol):
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Plans that became visible by `now_s`, oldest first. Never blocks."""
 
-    def step_times_ms(self) -> Sequence[float]:
-        """Duration of every listener step so far; empty in virtual time."""
-
-    def unheard(self) -> int:
-        """Frames left out so far because the listener could not keep up."""
+    def statistics(self) -> Mapping[str, Any]:
+        """`state` in words, `restarts`, `skipped_frames` (the listener could not keep up), `step_ms` p50 and p99."""
 
     def close(self) -> None: ...
 
@@ -76,7 +73,9 @@ class TickConversion(Protocol):
 
 
 class Bus(Protocol):
-    """Servos of one or several named buses, addressed by joint. Never raises for one servo."""
+    """Servos of one or several named buses, addressed by joint. One servo's trouble is never raised: it is a named
+    fault in its `Reading`. Except for `torque_off`, one thread at a time calls it.
+    """
 
     @property
     def joints(self) -> Sequence[str]:
@@ -87,19 +86,51 @@ class Bus(Protocol):
         """Per joint, what its family tells or does: position, velocity, current, voltage, temperature, torque."""
 
     def connect(self) -> None:
-        """Open, identify every servo, check it against the head. Raises PortError, BusError or ServoError."""
+        """Open the ports, identify every servo that answers and check it against the head. Torque stays as found.
+
+        Blocks for as long as identifying takes (a silent id a few tenths of a second). A servo that does not answer
+        is left absent, with a fault in its reading, and brought in when it appears. Raises PortError; BusError when
+        nobody answers; ServoError when a servo contradicts the head's file.
+        """
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
-        """Torque on without a jump: goal := present, verified, then enable. Returns the angles held, rad (J,)."""
+        """Torque on without a jump: goal := present, verified, then torque. Returns the angles held, rad (J,), in the
+        order of `joints`; of a joint that is absent 0 rad, or the end of its range nearest to it: its goals are
+        withheld until it has been brought in, which its reading tells by `rejoined`.
+
+        Blocks per joint for a few exchanges and the stagger time. Raises ServoError for a servo that refuses, BusError
+        when the supply or the port fails meanwhile; call `stop` then.
+        """
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
-        """One goal per joint, rad (J,). Refuses (raises ValueError) what is not finite or not in range."""
+        """One goal per joint, rad (J,), sent in one packet; those of joints without torque are withheld.
+
+        Never waits for an answer. Raises ValueError, with nothing sent, before `enable`, and for a shape, a value that
+        is not finite, or a goal to be sent that is not in the range in force.
+        """
 
     def poll(self, now_s: float) -> Mapping[str, Reading]:
-        """Freshest reading of every joint; blocks at most the configured read deadline."""
+        """Freshest reading of every joint; whoever is in trouble is looked after.
+
+        Blocks within the bus's time budget, whatever is lost on the wire: silence of any number of servos costs one
+        read deadline. What does not fit is left to later polls. Raises BusError when the bus has failed: nobody has
+        answered for `reconnect_s`.
+        """
+
+    def torque_off(self, policy: StopPolicy) -> None:
+        """Send torque-off now, unconfirmed: one packet per wire, to this head's ids alone; pulses off on boards.
+
+        May be called from any thread at any time after `connect`, also while another one is inside `poll`. Never
+        raises, never waits for an answer. With the policy "hold" nothing is sent. Does not refuse later goals: `stop`
+        does.
+        """
 
     def stop(self, policy: StopPolicy) -> None:
-        """Torque off, or hold, for every servo that can be reached. Completes whatever is dead; idempotent."""
+        """Torque off on all buses first, then confirmed and repeated, as far as servos answer; joints whose safety or
+        `policy` says hold keep theirs. Goals are refused from now on.
+
+        Never raises; takes 0.5 s at most, whatever is dead; idempotent.
+        """
 
     def close(self) -> None:
         """Give the ports back. Idempotent."""

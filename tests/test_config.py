@@ -107,5 +107,5 @@ def test_a_file_that_is_no_mapping_is_one_line(tmp_path, text):
 
 
 def test_an_unknown_head_lists_the_shipped_ones():
-    with pytest.raises(ConfigError, match=r"--head 'face82'.*face28"):
+    with pytest.raises(ConfigError, match=r"head 'face82'.*face28"):
         load_head("face82")

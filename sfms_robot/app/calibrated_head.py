@@ -10,23 +10,23 @@ from collections.abc import Collection, Mapping
 from typing import Final
 
 from sfms_robot.app.servo.servo_wire import Seen, Wire
-from sfms_robot.app.session import BOARDS, SIM, devices
+from sfms_robot.app.wiring import SIM, devices, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
-from sfms_robot.servo.discovery import stable_name
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)
 
+BOARDS: Final = ("maestro", "ssc32")
 _REVERSED: Final = 1  # bit of the drive mode: which way ticks run
 
 
-def unit_head(name: str, port: str) -> Head:
+def calibrated_head(name: str, port: str) -> Head:
     """The head as it may move on this port.
 
     On emulated servos every head counts as calibrated. On real ones each measured servo is asked who it is first; a
@@ -69,24 +69,13 @@ def identify(
         if bus.family in BOARDS:
             servos |= {j: Identity(id=head.joints[j].id, model=head.joints[j].model) for j in mine}
         elif mine:
-            port = open_port(where[name], bus.baud, clock)
+            port = port_of(where[name], bus, clock)()
             try:
                 for joint in mine:
                     servos[joint] = _identity(port, bus.family, bus.baud, head.joints[joint], clock)
             finally:
                 port.close()
     return servos
-
-
-def open_port(where: Chain | str, baud: int, clock: Clock) -> Port:
-    """A serial device, or an emulated chain. Raises PortError."""
-    if isinstance(where, str):
-        return SerialPort(stable_name(where), baud, clock)
-    return (
-        VirtualTimePort(where.device, where.control, baud, clock)
-        if where.virtual
-        else SerialPort(where.device, baud, clock)
-    )
 
 
 def _identity(port: Port, family: str, baud: int, joint: Joint, clock: Clock) -> Identity | None:

@@ -1,37 +1,63 @@
-"""A head's file -> its parts: the bus that drives it, and what turns motion into safe joint angles."""
+"""Composition root: the one place where concrete parts are put together, for every command that moves a head.
+
+    prepare_head    what can be checked before anything is opened: the head's file, its ports, what is confirmed
+    open_head       the servos: emulated ones started, ports opened, every servo identified; torque is untouched
+    drive_head      torque on, the loop, rest, torque off, and the report
+    run             all three around a listener and a person: `sfms-robot run`, and `Robot`
+
+Whatever happens after torque came on, the loop brings the head to rest, and there is a report.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.app.calibrated_head import calibrated_head
+from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.limitation import limitation
+from sfms_robot.app.listen.report import run_report
 from sfms_robot.app.safety_settings import check_safety
-from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map, load_head
-from sfms_robot.config.emulate import load_stored
+from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
+from sfms_robot.config import Head, Joint, find, load_head
 from sfms_robot.data import data_dir, shipped_names
-from sfms_robot.emulator.launch import Chain, EmulatedServo
-from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles
+from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.errors import ConfigError, PortError, RobotError
+from sfms_robot.frames import Doubles, Floats
+from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.motion.audit import Audit
-from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
-from sfms_robot.ports import Bus, Clock
+from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Source, Timeline
 from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.life import Life
+from sfms_robot.runtime.clock import RealClock, VirtualClock
+from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
+from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
 from sfms_robot.servo.composite import CompositeBus
-from sfms_robot.servo.discovery import list_ports, stable_name
+from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
-from sfms_robot.servo.port_choice import AUTO, choose_ports, parse_ports
-from sfms_robot.servo.serial_io import Rs485
+from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
+from sfms_robot.sources.registry import open_source
 
-SIM = "sim"
-SIM_READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
+logger = logging.getLogger(__name__)
+
+SIM_READ_DEADLINE_S: Final = 0.02  # an emulator shares the computer's cores: it may be late without being silent
+FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
+INTERRUPTED: Final = 130
+EVENTS: Final = {"nods": find_nods, "blinks": find_blinks, "smiles": find_smiles}
 # The class of each bus family; only those of the head are imported.
 FAMILIES = {
     "dynamixel2": "sfms_robot.servo.chain.dynamixel2_bus:DynamixelBus",
@@ -41,10 +67,9 @@ FAMILIES = {
     "ssc32": "sfms_robot.servo.boards.ssc32_bus:Ssc32Bus",
 }
 BOARDS = ("maestro", "ssc32")
-HANGING = 0.3  # where an emulated joint stands at power-up: this share of the way from rest to its lower end
 
 
-Opened = dict[str, Chain | str]  # per named bus: an emulated chain, or a serial device
+# --- a head and its servos ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -57,6 +82,86 @@ class Motion:
     audit: Audit
     leads_s: Doubles
     rest_rad: Doubles
+
+
+@dataclass(frozen=True)
+class HeadOptions:
+    """Which head, on which servos.
+
+    Attributes:
+        head: shipped name, or a folder with a head.yaml.
+        port: "sim", a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
+        fast: virtual time; needs emulated servos.
+        yes: hobby servos may jump when they come on.
+        without: joints left out: their servos are not addressed at all.
+    """
+
+    head: str = "face28"
+    port: str = SIM
+    fast: bool = False
+    yes: bool = False
+    without: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class OpenHead:
+    """A head whose servos are connected; torque is untouched. `rate_hz` is that of its fastest bus."""
+
+    options: HeadOptions
+    config: Head
+    motion: Motion
+    bus: Bus
+    clock: Clock
+    rate_hz: float
+    opened: Opened
+
+    def digests(self) -> dict[str, Any]:
+        """What went over each emulated wire: two runs that say the same here sent the same bytes."""
+        digests = {name: chain.digest() for name, chain in self.opened.items() if isinstance(chain, Chain)}
+        return {name: {"sha256": sha256, "bytes": count} for name, (sha256, count) in digests.items()}
+
+
+def prepare_head(options: HeadOptions) -> Head:
+    """All that can be wrong with a head and its ports before anything is opened. Raises ConfigError, PortError."""
+    if options.fast and options.port != SIM:
+        raise ConfigError(f"--port {options.port!r}: --fast needs emulated servos, time is virtual (sim)")
+    head = load_head(options.head)
+    for joint in options.without:
+        if joint not in head.joints:
+            raise ConfigError(f"--without {joint!r} is no joint of head {head.name!r} ({', '.join(head.joints)})")
+    if options.port == SIM:
+        return head
+    where = devices(head, options.port)
+    if (jumping := on_boards(head)) and not options.yes:
+        raise ConfigError(
+            f"head {head.name!r}: hobby servos report no position, and each jumps to rest when it comes on "
+            f"({', '.join(jumping)}); keep clear, and confirm it with --yes"
+        )
+    for device in where.values():
+        if "://" not in device and (problem := access_problem(device)):
+            raise PortError(f"{device}: {problem}")
+    return head
+
+
+@contextmanager
+def open_head(options: HeadOptions) -> Iterator[OpenHead]:
+    """Connect to every servo of a head. Blocks for as long as identifying takes. Raises RobotError."""
+    prepare_head(options)
+    head = calibrated_head(options.head, options.port)
+    rate_hz = max(bus.rate_hz for bus in head.buses.values())
+    motion = build_motion(head, rate_hz)
+    clock: Clock = VirtualClock() if options.fast else RealClock()
+    with ExitStack() as stack:
+        opened: Opened
+        if options.port == SIM:
+            chains = plugged_in(options.head, head)
+            opened = {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
+        else:
+            opened = devices(head, options.port)
+        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without)
+        stack.callback(bus.close)
+        bus.connect()
+        yield OpenHead(options, head, motion, bus, clock, rate_hz, opened)
 
 
 def shipped_heads() -> list[dict[str, Any]]:
@@ -86,55 +191,10 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
         PlanTimeline(1.0 / rate_hz),
         retargeter,
         JerkLimiter(limits, 1.0 / rate_hz),
-        Audit(limits, _calibration(head.joints), 1.0 / rate_hz),
+        Audit(limits, calibration_of(head.joints), 1.0 / rate_hz),
         leads_s,
         np.array([joint.rest_rad for joint in head.joints.values()]),
     )
-
-
-def _maps(joints: dict[str, Joint]) -> dict[str, FirmwareMap]:
-    return {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
-
-
-def _calibration(joints: dict[str, Joint]) -> Calibration:
-    maps = _maps(joints)
-    turns = np.array([maps[joint.model].ticks_per_revolution for joint in joints.values()])
-    return Calibration(joints, turns)
-
-
-def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
-    """Per bus, the servos of a head that was switched off: hanging a little from rest, torque off."""
-    by_bus: dict[str, list[EmulatedServo]] = {}
-    for name, joint in head.joints.items():
-        hanging = np.array([joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)])
-        ticks = int(_calibration({name: joint}).to_ticks(hanging)[0])
-        baud = head.buses[joint.bus].baud
-        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
-        by_bus.setdefault(joint.bus, []).append(servo)
-    return by_bus
-
-
-def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
-    """As `emulated`, with what somebody has stored in the servos of head `name` and the supply that they run on.
-
-    Raises ConfigError for stored values of a joint that the head does not have.
-    """
-    stored = load_stored(name)
-    for joint in stored.joints:
-        if joint not in head.joints:
-            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
-    joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
-    return {
-        bus: [
-            replace(
-                servo,
-                registers={**servo.registers, **stored.of(joints[bus, servo.id])},
-                supply_v=stored.supply_v,
-            )
-            for servo in servos
-        ]
-        for bus, servos in emulated(head).items()
-    }
 
 
 def on_boards(head: Head) -> list[str]:
@@ -142,13 +202,11 @@ def on_boards(head: Head) -> list[str]:
     return [name for name, joint in head.joints.items() if head.buses[joint.bus].family in BOARDS]
 
 
-def devices(head: Head, port: str) -> dict[str, str]:
-    """What `--port` says -> device per named bus. Raises ConfigError, and PortError for `auto` without an adapter."""
-    return choose_ports(head.buses, list_ports()) if port == AUTO else parse_ports(head.buses, port)
+def build_bus(head: Head, opened: Opened, clock: Clock, *, confirmed: bool = False, without: Sequence[str] = ()) -> Bus:
+    """The head's bus, not yet connected.
 
-
-def build_bus(head: Head, opened: Opened, clock: Clock, confirmed: bool = False) -> Bus:
-    """The head's bus, not yet connected. `confirmed`: hobby servos may jump when their pulses come on."""
+    `confirmed`: hobby servos may jump when their pulses come on. `without`: joints whose servos are left alone.
+    """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
@@ -162,7 +220,7 @@ def _build_one(
     head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool
 ) -> Bus:
     config = head.buses[name]
-    maps = _maps(joints)
+    maps = firmware_maps(joints)
     check_safety(head, joints, maps)
     servos = [
         BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
@@ -180,8 +238,8 @@ def _build_one(
     bus: Bus = build(
         name,
         servos,
-        _calibration(joints),
-        _port(where, config.baud, clock, config.rs485),
+        calibration_of(joints),
+        port_of(where, config, clock),
         config.baud,
         deadline_s,
         config=config,
@@ -190,9 +248,219 @@ def _build_one(
     return bus
 
 
-def _port(where: Chain | str, baud: int, clock: Clock, rs485: Rs485 | None) -> Callable[[], Port]:
-    if isinstance(where, str):
-        return partial(SerialPort, stable_name(where), baud, clock, rs485)
-    if where.virtual:
-        return partial(VirtualTimePort, where.device, where.control, baud, clock)
-    return partial(SerialPort, where.device, baud, clock)
+# --- what is played on it -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Programme:
+    """What a head is to do: a person who is listened to, or a timeline that is played.
+
+    Attributes:
+        source, feed: the person, and who answers.
+        duration_s: None for ever.
+        timeline: None for that of plans.
+        life: what the head does of itself; None for nothing.
+        knobs: see `Parts`.
+        overlay: see `Parts`.
+        observers: closed by whoever made them.
+    """
+
+    source: Source
+    feed: PlanFeed
+    duration_s: float | None
+    timeline: Timeline | None = None
+    life: Life | None = None
+    knobs: Callable[[], Any] | None = None
+    overlay: Callable[[Floats, Doubles], Floats] | None = None
+    observers: Sequence[Observer] = ()
+
+
+@dataclass(frozen=True)
+class Drove:
+    """How a drive ended: "done", "interrupted" or "failed", and then the error."""
+
+    outcome: str
+    log: RunLog
+    elapsed_s: float | None
+    priority: str
+    error: Exception | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """Of the process: see `errors`."""
+        if self.outcome == "interrupted":
+            return INTERRUPTED
+        return 0 if self.error is None else getattr(self.error, "exit_code", 1)
+
+
+def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, signals: bool = True) -> Drove:
+    """Torque on, the loop, rest, torque off. Blocks until then.
+
+    An exception on the way is kept, not raised: the head is at rest and the report is still to be made. `signals`:
+    Ctrl-C and the like ask `interrupt`; main thread only.
+    """
+    motion = opened.motion
+    parts = Parts(
+        programme.source, programme.feed, programme.timeline or motion.timeline, motion.retargeter, motion.limiter,
+        opened.bus, programme.observers, motion.leads_s, motion.rest_rad, programme.life, programme.knobs,
+        programme.overlay,
+    )  # fmt: skip
+    log = RunLog(motion.retargeter.joints, 1.0 / opened.rate_hz, motion.audit, EVENTS)
+    duration_s = math.inf if programme.duration_s is None else programme.duration_s
+    real = not opened.options.fast
+    outcome, error = "failed", None
+    with signals_to(interrupt) if signals else nullcontext(), realtime_priority(wanted=real) as priority:
+        interrupt.arm(opened.bus)
+        began_s = time.monotonic()
+        try:
+            outcome = drive(
+                parts, opened.clock, log, rate_hz=opened.rate_hz, duration_s=duration_s, interrupted=interrupt
+            )
+        except KeyboardInterrupt:
+            outcome = "interrupted"
+        except Exception as failure:
+            error = failure
+            if not isinstance(failure, RobotError):
+                logger.exception("the run ends by an error that nobody expected")
+        elapsed_s = time.monotonic() - began_s if real else None
+    return Drove(outcome, log, elapsed_s, priority, error)
+
+
+# --- a person, a listener, a head -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The flags of `sfms-robot run`; None where a flag has a default that depends on the others."""
+
+    head: str = "face28"
+    port: str = SIM
+    listener: str = "sfms-small"
+    audio: str = "default"
+    face: str = "auto"
+    agent_audio: str = "none"
+    duration_s: float | None = None
+    fast: bool = False
+    seed: int = 0
+    record: Path | None = None
+    overwrite: bool = False
+    dry_run: bool = False
+    yes: bool = False
+    intensity: tuple[str, ...] = ()
+    style: tuple[str, ...] = ()
+    without: tuple[str, ...] = field(default=())
+
+    @property
+    def servos(self) -> HeadOptions:
+        """The head and its servos."""
+        return HeadOptions(self.head, self.port, self.fast, self.yes or self.dry_run, self.without)
+
+
+def run(
+    options: RunOptions,
+    progress: Callable[[float | None], Observer] | None = None,
+    *,
+    source: Source | None = None,
+    feed: PlanFeed | None = None,
+    observers: Sequence[Observer] = (),
+    knobs: Callable[[HeadRetargeter], Callable[[], Any]] | None = None,
+    overlay: Callable[[Floats, Doubles], Floats] | None = None,
+    interrupt: Interrupt | None = None,
+    signals: bool = True,
+) -> dict[str, Any]:
+    """Listen until the duration is over or somebody interrupts. Returns the report.
+
+    Blocks until then. What is cheap to check is checked first; the listener loads in its own process meanwhile. After
+    torque came on nothing is raised any more: the report says `"exit": "failed"` and why, the head is at rest.
+
+    Args:
+        progress: makes an observer that shows a run of that many seconds.
+        source, feed: instead of those that the options name.
+        knobs: from the retargeter of the opened head, what is asked at every tick; None: the options' own.
+        observers, overlay: see `Programme`.
+        interrupt: asked to end the run from another thread.
+
+    Raises RobotError before torque came on.
+    """
+    prepare_head(options.servos)
+    if options.record is not None:
+        check_folder(options.record, options.overwrite)
+    limited = limitation(options.listener) if feed is None else None
+    if limited is not None:
+        logger.warning("%s: %s", Path(options.listener).name, limited)
+    with ExitStack() as stack:
+        if feed is None and not options.dry_run:
+            feed = _feed(options, stack)
+        if source is None:
+            source = open_source(options.audio, options.face, options.duration_s, agent_audio=options.agent_audio)
+            stack.callback(source.close)
+        duration_s = source.duration_s if options.duration_s is None else options.duration_s
+        if options.fast and duration_s is None:
+            raise ConfigError("--fast without a recording never ends: give it a --duration")
+        opened = stack.enter_context(open_head(options.servos))
+        if feed is None:
+            return {"version": 1, "head": opened.config.name, "port": options.port, "exit": "done", **_present(opened)}
+        if isinstance(feed, ListenerProcess):
+            feed.wait_ready()
+        turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
+        recorder = _recorder(options, opened.config)
+        own = [each for each in (recorder, progress(duration_s) if progress else None) if each is not None]
+        for observer in own:
+            stack.callback(observer.close)
+        programme = Programme(
+            source, feed, duration_s,
+            life=Life(opened.config.life, options.seed),
+            knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
+            overlay=overlay,
+            observers=[*observers, *own],
+        )  # fmt: skip
+        drove = drive_head(opened, programme, interrupt or Interrupt(), signals=signals)
+        report = run_report(
+            drove.log, opened.bus, feed, head=opened.config.name, listener=Path(options.listener).name,
+            port=options.port, seed=options.seed, outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz,
+            elapsed_s=drove.elapsed_s, priority=drove.priority,
+        )  # fmt: skip
+        report["exit_code"] = drove.exit_code
+        report["limitation"] = limited
+        if recorder is not None:
+            recorder.close()
+            report["recording"] = recorder.statistics()
+        if options.fast:
+            report["wire"] = opened.digests()
+    if options.record is not None:
+        write_report(options.record, report)
+    return report
+
+
+def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
+    """Inline in virtual time, so that one seed is one run; else in a process of its own, which loads from now on."""
+    find("listeners", options.listener, "config.yaml")
+    feed: PlanFeed
+    if options.fast:
+        from sfms_robot.listeners.registry import load_listener, one_thread  # torch: only here in this process
+
+        one_thread()
+        feed = InlineFeed(load_listener(options.listener), options.seed, FAST_LATENCY_S)
+    else:
+        feed = ListenerProcess(options.listener, options.seed)
+    stack.callback(feed.close)
+    return feed
+
+
+def _recorder(options: RunOptions, head: Head) -> Recorder | None:
+    if options.record is None:
+        return None
+    about = {
+        "head": head.name,
+        "listener": Path(options.listener).name,
+        "seed": str(options.seed),
+        "audio": Path(options.audio).name,
+    }
+    when_full: FullPolicy = "wait" if options.fast else "drop"
+    return Recorder(options.record, list(head.joints), when_full=when_full, about=about)
+
+
+def _present(opened: OpenHead) -> dict[str, Any]:
+    """What the servos say of themselves, torque untouched."""
+    readings: Mapping[str, Any] = opened.bus.poll(opened.clock.now_s())
+    return {"readings": {name: {"position_rad": r.position_rad, "fault": r.fault} for name, r in readings.items()}}

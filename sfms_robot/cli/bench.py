@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_module
 import sys
 from enum import StrEnum
+from pathlib import Path
 
 import typer
 
@@ -16,6 +17,7 @@ class Bench(StrEnum):
     retarget = "retarget"
     lead = "lead"
     listener = "listener"
+    memory = "memory"
     campaign = "campaign"
     fuzz = "fuzz"
 
@@ -25,23 +27,27 @@ def bench(
     head: str | None = typer.Option(None, help="For 'lead', and for 'retarget --frames': this head."),
     frames: int | None = typer.Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
     minutes: float = typer.Option(0.0, min=0.0, help="For 'fuzz': go on for so long; 0 = a million bytes each."),
+    against: Path | None = typer.Option(
+        None, help="A folder with another installation: it becomes the peer, and the two run in turn."
+    ),
+    hours: float = typer.Option(4.0, min=0.1, help="For 'memory': virtual hours."),
     json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
     """Measure: start of the command line, one bus tick, one retarget tick, one listener plan.
 
     'campaign' tries every fault on every family of servos, 'fuzz' random bytes; both end with exit code 1 when
-    something is not as it should be. They are not part of 'all'.
+    something is not as it should be. They and 'memory' are not part of 'all'.
     """
     if name in (Bench.campaign, Bench.fuzz):
         _trial(name, minutes, json)
         return
     from sfms_robot.app.bench import run_bench
 
-    result = run_bench(name.value, head, frames)
+    result = run_bench(name.value, head, frames, against, hours)
     if json:
         print(json_module.dumps(result))
     else:
-        from sfms_robot.cli.tables import print_bench
+        from sfms_robot.cli.show import print_bench
 
         print_bench(result)
 
@@ -52,7 +58,7 @@ def _trial(name: Bench, minutes: float, json: bool) -> None:
     from dataclasses import asdict
 
     from sfms_robot.app.bench import campaign, fuzz
-    from sfms_robot.cli.tables import print_rows
+    from sfms_robot.cli.show import print_rows
 
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json as json_module
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 
 import typer
@@ -25,14 +25,10 @@ def compose(
     json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object."),
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
-    from sfms_robot.app.train.learn import compose_dyads
+    from sfms_robot.app.train.datasets import compose_dyads
+    from sfms_robot.cli.show_learning import show
 
-    figures = compose_dyads(data, out, minutes, seed)
-    if json:
-        print(json_module.dumps(figures))
-    else:
-        for key, value in figures.items():
-            print(f"{key}: {value}")
+    show(compose_dyads(data, out, minutes, seed), json)
 
 
 @app.command()
@@ -47,14 +43,10 @@ def check(
     json: bool = typer.Option(False, "--json", help="Print everything found as one JSON object."),
 ) -> None:
     """Read a whole data set once: what is there, and everything that is wrong with it."""
-    from sfms_robot.app.train.data_check import check_data
+    from sfms_robot.app.train.datasets import check_data
+    from sfms_robot.cli.show_learning import print_check, show
 
     report = check_data(folder, layout, order.value if order else None, window)
-    if json:
-        print(json_module.dumps(report))
-    else:
-        from sfms_robot.cli.data_tables import print_check
-
-        print_check(report, channels)
+    show(report, json, partial(print_check, channels=channels))
     if not report["usable"]:
         raise typer.Exit(2)

@@ -38,7 +38,7 @@ def emulate(
     seed: int = typer.Option(0, min=0, help="Of the faults that are left to chance."),
 ) -> None:
     """Serve emulated servos until SIGTERM or Ctrl-C; prints the device to open, one line per bus."""
-    from sfms_robot.app.servo.emulate import EmulateOptions, emulators, until_stopped
+    from sfms_robot.app.servo.emulated_chains import EmulateOptions, emulators, until_stopped
 
     options = EmulateOptions(
         head,

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json as json_module
-from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -39,9 +36,7 @@ JSON = typer.Option(False, "--json", help="Print one JSON object.")
 @app.command()
 def tokenizer(
     listener: str = LISTENER,
-    table: str | None = typer.Option(
-        None, metavar="3|4|bits|adaptive|all", help="Of the SFMS paper; error at equal bits; one model for every k."
-    ),
+    table: str | None = typer.Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
     data: Path | None = typer.Option(
         None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
     ),
@@ -55,23 +50,19 @@ def tokenizer(
     json: bool = JSON,
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
+    from sfms_robot.cli.show_learning import print_figures, print_tokenizer_tables, show
+
     if table is None:
-        from sfms_robot.app.train.learn import evaluate_tokenizer
+        from sfms_robot.app.evaluate.listener_evaluation import evaluate_tokenizer
 
         if data is None:
             raise typer.BadParameter("--data is needed without --table")
-        _print(evaluate_tokenizer(listener, data, order.value if order else None), json)
+        show(evaluate_tokenizer(listener, data, order.value if order else None), json, print_figures)
         return
-    from sfms_robot.app.evaluate.tables import TableOptions, evaluate_table
+    from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
 
     options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
-    result = interruptible(lambda: evaluate_table(options))
-    if json:
-        print(json_module.dumps(result))
-    else:
-        from sfms_robot.cli.paper_tables import print_tables
-
-        print_tables(result)
+    show(interruptible(lambda: evaluate_table(options)), json, print_tokenizer_tables)
 
 
 @app.command("listener")
@@ -91,30 +82,23 @@ def listener_(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.app.train.learn import evaluate_listener, listener_table
+    from sfms_robot.app.evaluate.listener_evaluation import evaluate_listener, listener_table
+    from sfms_robot.cli.show_learning import print_figures, print_listener_table, show
 
     if table is None:
-        _print(evaluate_listener(listener, data, seed, order.value if order else None), json)
+        show(evaluate_listener(listener, data, seed, order.value if order else None), json, print_figures)
         return
     if table.value.startswith("arig"):
         if order is not None:
             raise typer.BadParameter("--order is for --table 1 and 2, or none")
-        from sfms_robot.app.evaluate.arig import AblationOptions, arig_table
+        from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
-        _print(interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations)), json)
+        found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
+        show(found, json, print_figures)
         return
     result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None)
-    if json:
-        print(json_module.dumps(result))
-    else:
-        from sfms_robot.cli.tables import print_listener_table
-
-        print_listener_table(result["rows"])
-        typer.echo(
-            f"{result['clips']} clips of {result['frames']} frames, {result['samples']} samples; {result['features']}. "
-            "The paper's rows are from other data; FRRea, a distance between rendered pictures, is out of scope."
-        )
+    show(result, json, print_listener_table)
 
 
 @app.command()
@@ -133,13 +117,14 @@ def timing(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
-    from sfms_robot.app.evaluate import timing as command
+    from sfms_robot.app.evaluate import meetings as command
+    from sfms_robot.cli.show_learning import print_figures, show
 
     if fit_table is not None:
-        _print(command.fit_table(data, fit_table), json)
+        show(command.fit_table(data, fit_table), json, print_figures)
         return
     limits = (None, None) if everything else (people, minutes)
-    _print(command.evaluate_timing(listener, data, seeds, *limits, seed, jobs), json)
+    show(command.evaluate_timing(listener, data, seeds, *limits, seed, jobs), json, print_figures)
 
 
 @app.command()
@@ -151,15 +136,10 @@ def interaction(
     json: bool = JSON,
 ) -> None:
     """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
-    from sfms_robot.app.evaluate.arig import evaluate_interaction
+    from sfms_robot.app.evaluate.arig_evaluation import evaluate_interaction
+    from sfms_robot.cli.show_learning import print_interaction, show
 
-    result = evaluate_interaction(listener, data, clips, seed)
-    if json:
-        print(json_module.dumps(result))
-    else:
-        from sfms_robot.cli.arig_tables import print_interaction
-
-        print_interaction(result)
+    show(evaluate_interaction(listener, data, clips, seed), json, print_interaction)
 
 
 @app.command()
@@ -170,14 +150,6 @@ def fidelity(
 ) -> None:
     """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""
     from sfms_robot.app.head.fidelity import fidelity as measure
+    from sfms_robot.cli.show_learning import print_figures, show
 
-    _print(measure(head, data), json)
-
-
-def _print(result: Mapping[str, Any], json: bool) -> None:
-    if json:
-        print(json_module.dumps(result))
-    else:
-        from sfms_robot.cli.tables import print_rows
-
-        print_rows(result["rows"])
+    show(measure(head, data), json, print_figures)

@@ -27,7 +27,7 @@ def list_heads(json: bool = typer.Option(False, "--json", help="Print as one JSO
     if json:
         print(json_module.dumps({"heads": heads}))
         return
-    from sfms_robot.cli.head_tables import print_heads
+    from sfms_robot.cli.show_head import print_heads
 
     print_heads(heads)
 
@@ -54,7 +54,7 @@ def check(
     if json:
         print(json_module.dumps(checked.as_dict()))
     else:
-        from sfms_robot.cli.head_tables import print_check
+        from sfms_robot.cli.show_head import print_check
 
         print_check(checked)
     if checked.problems:
@@ -79,7 +79,7 @@ def show(
         told = {j: {key: {"value": v, "from": o} for key, (v, o) in values.items()} for j, values in joints.items()}
         print(json_module.dumps({"name": name, "joints": told, "refused": refused}))
         return
-    from sfms_robot.cli.head_tables import print_provenance
+    from sfms_robot.cli.show_head import print_provenance
 
     print_provenance(name, joints, refused)
 
@@ -94,7 +94,7 @@ def calibrate(
 ) -> None:
     """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
     from sfms_robot.app.head.calibrate import calibrate as lead_through
-    from sfms_robot.cli.head_tables import Terminal, print_calibration
+    from sfms_robot.cli.show_head import Terminal, print_calibration
 
     outcome = lead_through(name, port, Terminal(), joint, again)
     if json:
@@ -119,7 +119,7 @@ def pose(
 ) -> None:
     """Move one expression or channel under the head's limits, hold it, and go back to rest."""
     from sfms_robot.app.head.pose import PoseOptions, pose_head
-    from sfms_robot.cli.head_tables import print_pose
+    from sfms_robot.cli.show_head import print_pose
 
     told = pose_head(PoseOptions(name, tuple(face), port, hold, fast, yes))
     if json:

@@ -53,7 +53,7 @@ def fit(
 
 def _tell(result: object, json: bool) -> None:
     from sfms_robot.app.head.fit import HeadFit
-    from sfms_robot.cli.head_fit_table import print_fit
+    from sfms_robot.cli.show_head import print_fit
 
     assert isinstance(result, HeadFit)
     if json:

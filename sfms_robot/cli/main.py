@@ -2,31 +2,57 @@
 
 from __future__ import annotations
 
-import errno
+import json as json_module
 import logging
+import os
 import sys
+from collections.abc import Sequence
+from contextlib import suppress
 
 import typer
 
 from sfms_robot import __version__
-from sfms_robot.cli import bench, data, doctor, emulate, evaluate, head, replay, run, servo, train
+from sfms_robot.cli import (
+    bench,
+    data,
+    demo,
+    doctor,
+    emulate,
+    evaluate,
+    head,
+    listener,
+    port,
+    replay,
+    run,
+    servo,
+    speaker,
+    train,
+)
 from sfms_robot.errors import ConfigError, RobotError
 
+NAME = "sfms-robot"
+INTERRUPTED = 130
+UNEXPECTED = 1
+_COMPLETION = "_SFMS_ROBOT_COMPLETE"  # set by a shell that asks what could come next
+
 app = typer.Typer(
-    name="sfms-robot",
+    name=NAME,
     help="A robot head that listens: while a person talks, it nods, blinks, smiles and looks.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,
+    rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.command("demo")(demo.demo)
 app.command("run")(run.run)
 app.command("replay")(replay.replay)
 app.command("emulate")(emulate.emulate)
 app.command("doctor")(doctor.doctor)
 app.command("bench")(bench.bench)
 app.add_typer(head.app, name="head")
+app.add_typer(listener.app, name="listener")
+app.add_typer(speaker.app, name="speaker")
+app.add_typer(port.app, name="port")
 app.add_typer(servo.app, name="servo")
 app.add_typer(data.app, name="data")
 app.add_typer(train.app, name="train")
@@ -35,29 +61,82 @@ app.add_typer(evaluate.app, name="evaluate")
 
 def _version(wanted: bool) -> None:
     if wanted:
-        print(f"sfms-robot {__version__}")
+        print(f"{NAME} {__version__}")
         raise typer.Exit()
 
 
 @app.callback()
 def _common(
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
-    verbose: bool = typer.Option(False, "--verbose", "-v", help="Log more, to stderr."),
+    verbose: bool = typer.Option(False, "--verbose", "-v", help="Log more, to stderr. Also after a command."),
 ) -> None:
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s"
     )
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Entry point: a RobotError is one line on stderr and its own exit code; so is a file that cannot be used."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point; leaves by SystemExit.
+
+    What goes wrong is one line on stderr and an exit code of its own (see `errors`); with --json one object on stdout
+    too, as its last line. A command that already said how it ended leaves by typer.Exit and is not spoken for.
+    """
+    if _COMPLETION in os.environ:
+        app()
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    code, problem = _outcome([word for word in words if word in ("-v", "--verbose")] + [
+        word for word in words if word not in ("-v", "--verbose")
+    ])  # fmt: skip
+    if problem is not None and "--json" in words:
+        ended = "interrupted" if code == INTERRUPTED else "failed"
+        told = {"version": 1, "exit": ended, "error": problem, "exit_code": code}
+        with suppress(OSError):
+            print(json_module.dumps(told), flush=True)
+    sys.exit(code)
+
+
+def _outcome(words: list[str]) -> tuple[int, str | None]:
+    """Run the command: its exit code, and what went wrong, said on stderr already; None where it told that itself."""
     try:
-        app(arguments)
+        command = typer.main.get_command(app)
+        with command.make_context(NAME, words) as context:
+            command.invoke(context)
+        sys.stdout.flush()
+    except typer.Exit as ended:
+        return ended.exit_code, None
+    except SystemExit as ended:
+        return ended.code if isinstance(ended.code, int) else 0, None
+    except KeyboardInterrupt:
+        return INTERRUPTED, "interrupted"
+    except (EOFError, typer.Abort):
+        return _said(UNEXPECTED, "there is nobody to answer (stdin ended)")
     except RobotError as error:
-        print(f"sfms-robot: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-    except OSError as error:
-        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            raise  # not about a file that somebody named: ours to repair
-        print(f"sfms-robot: {error.filename or 'a file of this command'}: {error.strerror}", file=sys.stderr)
-        sys.exit(ConfigError.exit_code)
+        return _said(error.exit_code, str(error))
+    except BrokenPipeError:
+        _silence_stdout()
+        return UNEXPECTED, None
+    except OSError as error:  # a file that somebody named, or a full disk behind stdout
+        _silence_stdout()
+        logging.getLogger(__name__).info("what led to it", exc_info=True)
+        problem = error.strerror or str(error)
+        named = error.filename is not None
+        return _said(ConfigError.exit_code, f"{error.filename}: {problem}") if named else _said(UNEXPECTED, problem)
+    except Exception as error:
+        usage = getattr(error, "show", None)  # of a flag or argument that is none
+        if usage is None:
+            logging.getLogger(__name__).error("an error that nobody expected", exc_info=True)
+            return _said(UNEXPECTED, f"{type(error).__name__}: {error}")
+        usage()
+        return ConfigError.exit_code, str(error.format_message())  # type: ignore[attr-defined]
+    return 0, None
+
+
+def _said(code: int, problem: str) -> tuple[int, str]:
+    print(f"{NAME}: {problem}", file=sys.stderr)
+    return code, problem
+
+
+def _silence_stdout() -> None:
+    """What is still to be written to a pipe or disk that takes no more would fail again when the process ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

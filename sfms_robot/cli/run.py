@@ -8,57 +8,109 @@ from pathlib import Path
 
 import typer
 
-INTERRUPTED = 130
+from sfms_robot.cli import names
+
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
+HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
 
 
 def run(
-    head: str = typer.Option("face28", help="Shipped head, or a folder with a head.yaml."),
-    port: str = typer.Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
-    listener: str = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights."),
+    head: str = typer.Option(
+        "face28", autocompletion=names.heads, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
+    ),
+    port: str = typer.Option(
+        "sim",
+        rich_help_panel=HEAD,
+        help="'sim' for emulated servos, 'auto' for the adapter that is plugged in, a device, or NAME=DEVICE per bus.",
+    ),
+    intensity: list[str] = typer.Option(
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="How far a region goes, 0 to 2; may be repeated."
+    ),
+    style: list[str] = typer.Option(
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="How much of its small motions shows, 0 to 2."
+    ),
     audio: str = typer.Option(
         "default",
+        autocompletion=names.speakers,
+        rich_help_panel=PERSON,
         help="FILE.wav (any rate, mono or stereo), a shipped speaker, 'none', or 'default': a shipped speaker.",
     ),
     face: str = typer.Option(
-        "auto", help="The speaker's face: FILE.csv[.gz], 'none', or 'auto': the shipped speaker's own, else none."
+        "auto",
+        rich_help_panel=PERSON,
+        help="The speaker's face: FILE.csv or .csv.gz, 'none', or 'auto': the shipped speaker's own, else none.",
     ),
     agent_audio: str = typer.Option(
         "none",
+        autocompletion=names.speakers,
+        rich_help_panel=PERSON,
         help="What the robot itself says: FILE.wav, a shipped speaker or 'none'. An ARIG listener's lips follow it.",
     ),
-    duration: float | None = typer.Option(None, min=0.04, help="Seconds; default: as long as the recording."),
-    fast: bool = typer.Option(False, help="Virtual time: as fast as it goes, bit-identical for one --seed."),
+    duration: float | None = typer.Option(
+        None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."
+    ),
+    listener: str = typer.Option(
+        "sfms-small",
+        autocompletion=names.listeners,
+        rich_help_panel=LISTENER,
+        help="Shipped listener, or a folder with config.yaml and weights.",
+    ),
     seed: int = typer.Option(
-        0, min=0, max=MAX_SEED, help="Two seeds listen differently, one seed repeats (with --fast)."
+        0,
+        min=0,
+        max=MAX_SEED,
+        rich_help_panel=LISTENER,
+        help="Two seeds listen differently, one seed repeats (with --fast).",
     ),
-    record: Path | None = typer.Option(None, help="Folder to write the run to, for `sfms-robot replay`."),
-    dry_run: bool = typer.Option(False, "--dry-run", help="Open and read the servos, never switch torque on."),
+    fast: bool = typer.Option(
+        False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
+    ),
+    record: Path | None = typer.Option(
+        None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
+    ),
+    overwrite: bool = typer.Option(
+        False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
+    ),
+    json: bool = typer.Option(
+        False, "--json", rich_help_panel=OUTPUT, help="Print the report as one JSON object, last line of stdout."
+    ),
+    dry_run: bool = typer.Option(
+        False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
+    ),
     yes: bool = typer.Option(
-        False, "--yes", help="Hobby servos may jump when they come on: they report no position to begin from."
+        False,
+        "--yes",
+        rich_help_panel=SAFETY,
+        help="Hobby servos may jump when they come on: they report no position to begin from.",
     ),
-    intensity: list[str] = typer.Option([], metavar="REGION=V", help="How far a region goes, 0 to 2; may be repeated."),
-    style: list[str] = typer.Option([], metavar="REGION=V", help="How much of its small motions shows, 0 to 2."),
-    json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
+    without: list[str] = typer.Option(
+        [],
+        metavar="JOINT",
+        rich_help_panel=SAFETY,
+        help="Leave a joint's servo alone (broken, or not there); may be repeated.",
+    ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.listen.progress import RunProgress
-    from sfms_robot.app.listen.run import RunOptions, run_head
-    from sfms_robot.cli.tables import print_dry_run, print_run
+    from sfms_robot.app.listen.preflight import check_names
 
-    options = RunOptions(
-        head, port, listener, audio, face, agent_audio, duration, fast, seed, record, dry_run, yes,
-        tuple(intensity), tuple(style),
+    check_names(head, listener, port, audio, face, agent_audio)
+    from sfms_robot.app import session
+    from sfms_robot.app.listen.progress import RunProgress
+
+    options = session.RunOptions(
+        head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
+        tuple(intensity), tuple(style), tuple(without),
     )  # fmt: skip
-    try:
-        report = run_head(options, RunProgress)
-    except KeyboardInterrupt:  # before torque came on; after that an interruption is a flag, and the head comes to rest
-        sys.exit(INTERRUPTED)
+    report = session.run(options, RunProgress)
     if json:
         print(json_module.dumps(report))
-    elif dry_run:
-        print_dry_run(report)
     else:
-        print_run(report, record)
-    if report["exit"] == "interrupted":
-        sys.exit(INTERRUPTED)
+        from sfms_robot.cli.show import print_dry_run, print_run
+
+        if dry_run:
+            print_dry_run(report)
+        else:
+            print_run(report, record)
+    if report.get("error"):
+        print(f"sfms-robot: {report['error']}", file=sys.stderr)
+    raise typer.Exit(report.get("exit_code", 0))

@@ -23,7 +23,7 @@ def maps(
         if json:
             print(json_module.dumps({"maps": rows}))
         else:
-            from sfms_robot.cli.tables import print_rows
+            from sfms_robot.cli.show import print_rows
 
             print_rows([{key: row[key] for key in _SHOWN} for row in rows])
         return

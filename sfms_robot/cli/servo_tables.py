@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from sfms_robot.cli.screen import screen
+from sfms_robot.cli.show import screen
 
 _SHORT = {
     "model_number": "number", "firmware": "fw", "voltage_V": "V", "temperature_degC": "degC", "position_deg": "deg",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -58,13 +57,13 @@ def tokenizer(
     json: bool = JSON,
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
-    from sfms_robot.app.train.training import TrainOptions, train_tokenizer
+    from sfms_robot.app.train.train_runs import TrainOptions, train_tokenizer
 
     placed = placement.value if placement else None
     options = TrainOptions(
         config, data, out, resume, device.value, steps, placed, tensorboard, order.value if order else None, overwrite
     )
-    _print(interruptible(lambda: train_tokenizer(options)), json)
+    _show(interruptible(lambda: train_tokenizer(options)), json)
 
 
 @app.command()
@@ -81,12 +80,12 @@ def listener(
     json: bool = JSON,
 ) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
-    from sfms_robot.app.train.training import TrainOptions, train_listener
+    from sfms_robot.app.train.train_runs import TrainOptions, train_listener
 
     options = TrainOptions(
         config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None, overwrite
     )
-    _print(interruptible(lambda: train_listener(options)), json)
+    _show(interruptible(lambda: train_listener(options)), json)
 
 
 def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -98,11 +97,9 @@ def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         sys.exit(INTERRUPTED)
 
 
-def _print(figures: Mapping[str, Any], json: bool) -> None:
+def _show(figures: Mapping[str, Any], json: bool) -> None:
+    from sfms_robot.cli.show_learning import show
+
     if figures["resumed_at"] == figures["steps"]:
         print(f"sfms-robot: had already finished at step {figures['steps']}", file=sys.stderr)
-    if json:
-        print(json_module.dumps(figures))
-    else:
-        for key, value in figures.items():
-            print(f"{key}: {value}")
+    show(figures, json)

@@ -2,7 +2,7 @@
 
 from sfms_robot.config.arig import Arig, Diffusion
 from sfms_robot.config.arig_training import ArigPhase, ArigTraining, Stage, load_training, parse_training
-from sfms_robot.config.base import Model, find, load, parse
+from sfms_robot.config.base import Model, load, parse
 from sfms_robot.config.drives import drives
 from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
 from sfms_robot.config.head import Head, load_head
@@ -20,6 +20,7 @@ from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.recipe import Baseline, Dense, Grouped, Recipe
 from sfms_robot.config.safety_rules import Faults, LoadRule, Safety, Threshold
 from sfms_robot.config.training import Phase, PredictorTraining, TokenizerTraining, Training
+from sfms_robot.data import find
 
 __all__ = [
     "Arig",

@@ -7,13 +7,12 @@ seconds. Nothing past `load` handles a plain dict.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar, get_args
+from typing import Annotated, Any, Final, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from sfms_robot.config.yaml_file import read
-from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 
 UNKNOWN_KEY: Final = "unknown_key"  # type of that problem, its key in the context
@@ -76,14 +75,3 @@ def one_line(problem: ErrorDetails, where: str = "") -> str:
     value = problem["input"]
     shown = f" = {value!r}" if isinstance(value, (str, int, float, bool)) or value is None else ""
     return f"{key}{shown}: {text}" if key else text
-
-
-def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
-    """Folder of a shipped head or listener by name, or of anybody's by path. Raises ConfigError with the choices."""
-    root = data_dir("configs") / kind
-    for folder in (root / name, Path(name)):
-        if (folder / marker).is_file():
-            return folder
-    shipped = shipped_names(root, marker)
-    flag, choices = "--" + kind.removesuffix("s"), ", ".join(shipped)
-    raise ConfigError(f"{flag} {name!r} is neither a shipped name nor a folder with a {marker} ({choices})")

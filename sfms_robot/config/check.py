@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from sfms_robot.config.base import UNKNOWN_KEY, Name, find, one_line
+from sfms_robot.config.base import UNKNOWN_KEY, Name, one_line
 from sfms_robot.config.consistency import problems, rates, wiring
 from sfms_robot.config.firmware import load_firmware_map
 from sfms_robot.config.head import Head, load_head
@@ -27,6 +27,7 @@ from sfms_robot.config.overlay import load_overlay
 from sfms_robot.config.register_rules import register_problems
 from sfms_robot.config.safety_rules import Safety
 from sfms_robot.config.yaml_file import read
+from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 
 _TABLES: dict[str, Any] = {

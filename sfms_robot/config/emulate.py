@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from sfms_robot.config.base import Model, Name, Positive, find, load
+from sfms_robot.config.base import Model, Name, Positive, load
+from sfms_robot.data import find
 
 _FILE = "emulate.yaml"
 

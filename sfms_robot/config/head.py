@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from sfms_robot.config.base import Model, Name, find, parse
+from sfms_robot.config.base import Model, Name, parse
 from sfms_robot.config.consistency import problems, rates, wiring
 from sfms_robot.config.inheritance import expanded
 from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
@@ -19,6 +19,7 @@ from sfms_robot.config.migration import VERSION, former_words, migrated
 from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.safety_rules import Faults, Safety
 from sfms_robot.config.yaml_file import read
+from sfms_robot.data import find
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 STEP_S = 0.025  # what one plan may take at most (99th percentile, paper size, two CPU cores)
 LEAD_S = 0.080  # longest lead of a joint: the slowest servo's lag and a tick
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
-Placement = Literal["exact", "static", "static_paper", "learned_paper", "learned", "nested"]
+Placement = Literal["exact", "static", "static_paper", "learned_paper", "learned"]
 
 
 class ChannelGroup(Model):

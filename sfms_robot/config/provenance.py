@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sfms_robot.config.base import Model, find
+from sfms_robot.config.base import Model
 from sfms_robot.config.head import load_head
 from sfms_robot.config.inheritance import NOT_SHARED
 from sfms_robot.config.joint import Joint
 from sfms_robot.config.overlay import CALIBRATE, FIT, head_hash, layered, load_overlay
 from sfms_robot.config.yaml_file import read
+from sfms_robot.data import find
 
 SHOWN: Final = (
     "bus", "id", "model", "zero_ticks", "sign", "ratio", "min_deg", "rest_deg", "max_deg", "limits", "lag_ms", "unit",

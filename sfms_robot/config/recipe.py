@@ -20,14 +20,12 @@ class Baseline(Model):
     Attributes:
         quantizer: a fixed grid (fsq), or as many learned vectors of `code_dims` dimensions (vq).
         levels: multiply to the codes of a codebook.
-        codes_at_once: codes for each frame, or each group of 8 frames; every one has a codebook of its own.
         layers: transformer blocks of the encoder, and as many of the decoder.
     """
 
     window_frames: Annotated[int, Field(ge=1)] = 48
     quantizer: Literal["fsq", "vq"]
     levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
-    codes_at_once: Count = 1
     code_dims: Count = 8
     width: Count = 64
     layers: Count = 2

@@ -53,29 +53,18 @@ class TokenizerTraining(Phase):
     """Phase 1: scores, quantizer, inpainter.
 
     Attributes:
-        keyframes_drawn: least and most keyframes per group, drawn for each sample: one model for every number between;
-            None: the groups' own.
-        score_tracks: tracks (a window of one group) that the scores of `learned` and `nested` learn from in a step.
-        untold: share of them whose scores do not know how many keyframes come; what `nested` uses.
+        score_tracks: tracks (a window of one group) that the scores of `learned` learn from in a step.
         mask_loss: alpha of equation (13); temperature: first and last of Algorithm 1. Both of `learned_paper`.
         commitment: weight of ||sg[z_q] - E(z)|| in equation (13), of quantizer vq.
         velocity_loss: weight of the error from one frame to the next.
     """
 
-    keyframes_drawn: tuple[Count, Count] | None = None
     score_learning_rate: Positive = 3e-3
     score_tracks: Count = 32
-    untold: Share = 0.3
     mask_loss: NonNegative = 0.1
     temperature: tuple[Positive, Positive] = (2.0, 0.1)
     commitment: NonNegative = 1.0
     velocity_loss: NonNegative = 0.0
-
-    @model_validator(mode="after")
-    def _drawn_ascend(self) -> TokenizerTraining:
-        if self.keyframes_drawn is not None and self.keyframes_drawn[0] > self.keyframes_drawn[1]:
-            raise ValueError(f"keyframes_drawn: {self.keyframes_drawn[0]} is above {self.keyframes_drawn[1]}")
-        return self
 
 
 class PredictorTraining(Phase):
@@ -111,15 +100,6 @@ class Training(Model):
     listener: Sfms
     tokenizer: TokenizerTraining
     predictor: PredictorTraining
-
-    @model_validator(mode="after")
-    def _drawn_fit(self) -> Training:
-        drawn, window = self.tokenizer.keyframes_drawn, self.listener.window_frames
-        if drawn is not None and drawn[1] > window:
-            raise ValueError(f"tokenizer.keyframes_drawn: {drawn[1]} keyframes do not fit a window of {window} frames")
-        if drawn is not None and self.listener.placement == "learned_paper":
-            raise ValueError("tokenizer.keyframes_drawn: placement learned_paper has one number of keyframes per group")
-        return self
 
     @model_validator(mode="after")
     def _known_groups(self) -> Training:

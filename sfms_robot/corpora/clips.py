@@ -48,7 +48,7 @@ class Dyad:
         mel: (4N, 128) natural log of the speaker's mel power, for data that ships this in place of a waveform.
         features: more about each frame by name, (N, F): "hubert", "attributes", ...
         agent_audio: (samples_of(N, fps),) the listener's own voice, or None: the data ships none.
-        states: (N,) int8, his conversational state (`learning.arig.labels`), -1 where not known; None: nowhere.
+        states: (N,) int8, his conversational state (`corpora.states`), -1 where not known; None: nowhere.
     """
 
     name: str

@@ -201,7 +201,7 @@ def launch(
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
     process = subprocess.Popen(
-        [sys.executable, "-m", "sfms_robot.emulator.serve"],
+        [sys.executable, "-m", "sfms_robot.emulator.chain_process"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         start_new_session=True,  # signals of the terminal are for the host

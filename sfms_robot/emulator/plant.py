@@ -31,7 +31,7 @@ _DECAY: Final = 1.0 - math.exp(-_HEAT_STEPS * STEP_S / _COOLING_S)
 _STRAINED: Final = 0.95  # of full effort
 
 
-class Drive(NamedTuple):
+class MotorCommand(NamedTuple):
     """What a motor is told. Ticks and seconds; a profile limit of 0 is no limit.
 
     goal: a position, or a speed when `by_speed`. torque: share of its full torque that the motor may use.
@@ -69,7 +69,7 @@ class Plant:
     def overloaded(self) -> bool:
         return self.strained_steps * STEP_S >= OVERLOAD_S
 
-    def advance(self, now_s: float, drive: Drive | None) -> None:
+    def advance(self, now_s: float, drive: MotorCommand | None) -> None:
         """Move on to the last grid point at or before `now_s`; going back in time does nothing."""
         steps = int(now_s / STEP_S + 1e-6) - self.step
         if steps <= 0:
@@ -92,19 +92,19 @@ class Plant:
             if self.step % _HEAT_STEPS == 0:
                 self._warm()
 
-    def _arrived(self, drive: Drive) -> bool:
+    def _arrived(self, drive: MotorCommand) -> bool:
         if drive.by_speed:
             return drive.goal == 0.0 == self.reference_speed
         return self.position == drive.goal == self.reference and self.load == 0.0
 
-    def _follow(self, drive: Drive) -> None:
+    def _follow(self, drive: MotorCommand) -> None:
         self._plan(drive)
         self._move(drive, _STIFFNESS * (_STIFFNESS * (self.reference - self.position) - 2.0 * self.speed))
         if self.reference == drive.goal and abs(drive.goal - self.position) < _THERE and abs(self.speed) < 1.0:
             if self.load == 0.0:
                 self.position, self.speed, self.acceleration, self.effort = drive.goal, 0.0, 0.0, 0.0
 
-    def _turn(self, drive: Drive) -> None:
+    def _turn(self, drive: MotorCommand) -> None:
         change = drive.profile_acceleration * STEP_S or 2.0 * drive.top_speed
         self.reference_speed += min(max(drive.goal - self.reference_speed, -change), change)
         self._move(drive, 2.0 * _STIFFNESS * (self.reference_speed - self.speed))
@@ -112,7 +112,7 @@ class Plant:
         if drive.goal == 0.0 == self.reference_speed and abs(self.speed) < 1.0:
             self.speed = self.acceleration = self.effort = 0.0
 
-    def _move(self, drive: Drive, pull: float) -> None:
+    def _move(self, drive: MotorCommand, pull: float) -> None:
         """One step of a motor that wants to accelerate by `pull`."""
         full = drive.top_speed / _SPIN_UP_S
         limit = full * drive.torque
@@ -128,7 +128,7 @@ class Plant:
         strained = abs(self.effort) >= _STRAINED and abs(self.speed) < 0.01 * drive.top_speed
         self.strained_steps = self.strained_steps + 1 if strained else 0
 
-    def _plan(self, drive: Drive) -> None:
+    def _plan(self, drive: MotorCommand) -> None:
         """Move the reference one step towards the goal."""
         if drive.profile_speed == 0.0:
             self.reference, self.reference_speed = drive.goal, 0.0

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sfms_robot.emulator.plant import Drive, Plant
+from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.registers import Field, Table
 
@@ -27,7 +27,7 @@ _CENTER_ON_STS: Final = 2048
 _EVERYTHING: Final = 256
 
 
-class Frame1Servo:
+class Protocol1Servo:
     """A servo that answers instructions. All times are seconds of the wire's clock.
 
     Attributes:
@@ -53,7 +53,7 @@ class Frame1Servo:
         self._firmware = firmware
         self._registered: tuple[int, bytes] | None = None
         self._checks = 0
-        self._drive: Drive | None = None
+        self._drive: MotorCommand | None = None
         for field in table.fields.values():
             self._put(field, field.initial)
         self._identify()
@@ -308,7 +308,7 @@ class Frame1Servo:
         strength = table.role("torque_limit")
         share = 1.0 if strength is None else min(1.0, self._get(strength.name) / 1000.0)
         if self._role("torque_enable") == 1 and positioning and share:
-            self._drive = Drive(
+            self._drive = MotorCommand(
                 float(self._get("goal_position") + self._offset()),
                 table.top_speed_ticks_s,
                 self._rate(table.role("moving_speed")),

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.states import STATE, UNKNOWN
-from sfms_robot.evaluation.stage import Played
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
-from sfms_robot.listeners.arig import sound
+from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.signals.events import near
 
 LAGS: Final = 12  # frames either way in which the jaw is looked for
@@ -54,7 +53,9 @@ class VoiceRule:
 def heard_voices(dyad: Dyad) -> Bools:
     """(N, 2) speech of agent and user as the listener itself hears it: the agent's now, the user's a frame late."""
     silent = np.zeros(len(dyad.listener), bool)
-    agent, user = (silent if track is None else sound.track(track)[1] for track in (dyad.agent_audio, dyad.audio))
+    agent, user = (
+        silent if track is None else audio_frontend.track(track)[1] for track in (dyad.agent_audio, dyad.audio)
+    )
     return np.stack([agent, np.r_[False, user[:-1]]], axis=-1)
 
 
@@ -82,7 +83,7 @@ def balanced_accuracy(table: NDArray[np.int64]) -> float:
 
 
 @dataclass(frozen=True)
-class Lips:
+class JawTracking:
     """How a jaw follows the recorded one.
 
     Attributes:
@@ -97,16 +98,16 @@ class Lips:
     spread: float
 
 
-def lips(played: Sequence[Floats], recorded: Sequence[Floats], lags: int = LAGS) -> Lips:
+def jaw_tracking(played: Sequence[Floats], recorded: Sequence[Floats], lags: int = LAGS) -> JawTracking:
     """Motions (N, 58), made and recorded; a pair that is not longer than `lags` either way does not count."""
     long = [pair for pair in zip(played, recorded, strict=True) if len(pair[0]) > 2 * lags]
     if not long:
-        return Lips(0.0, 0, 0.0, 0.0)
+        return JawTracking(0.0, 0, 0.0, 0.0)
     played, recorded = zip(*long, strict=True)
     found = {lag: _pooled(played, recorded, lag) for lag in range(-lags, lags + 1)}
     best = max(found, key=lambda lag: (found[lag], -abs(lag)))
     spreads = [np.concatenate([one[:, JAW] - one[:, JAW].mean() for one in each]).std() for each in (played, recorded)]
-    return Lips(found[0], best, found[best], float(spreads[0] / max(spreads[1], STILL)))
+    return JawTracking(found[0], best, found[best], float(spreads[0] / max(spreads[1], STILL)))
 
 
 def _pooled(played: Sequence[Floats], recorded: Sequence[Floats], lag: int) -> float:
@@ -141,17 +142,17 @@ def border_ratio(motions: Sequence[Floats], period: int, first: int = 1, skip: i
     return float(np.concatenate(at).mean()) / inside if inside else float("nan")
 
 
-def listening_again(played: Sequence[Played], dyads: Sequence[Dyad]) -> float:
-    """Share of the jaw's mean opening that is left a second after the agent's own voice has stopped."""
+def listening_again(played: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
+    """Of motions (N, 58): share of the jaw's mean opening left a second after the agent's own voice has stopped."""
     speaking, after = [], []
     for one, dyad in zip(played, dyads, strict=True):
         if dyad.agent_audio is None:
             continue
-        active = sound.track(dyad.agent_audio)[1]
+        active = audio_frontend.track(dyad.agent_audio)[1]
         spans = np.flatnonzero(active)[:, None] * FRAME_S + np.array([0.0, FRAME_S])
         recent = near(spans, len(active), 1 / FRAME_S, 1.0)
-        speaking.append(one.motion[active, JAW])
-        after.append(one.motion[~recent, JAW])
+        speaking.append(one[active, JAW])
+        after.append(one[~recent, JAW])
     said = np.concatenate(speaking) if speaking else np.zeros(0)
     quiet = np.concatenate(after) if after else np.zeros(0)
     return float(quiet.mean() / said.mean()) if len(said) and len(quiet) and said.mean() > 0 else float("nan")

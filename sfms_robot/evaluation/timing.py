@@ -20,8 +20,8 @@ from sfms_robot.corpora.compose.composed import Stretch, active, cast, speaker_o
 from sfms_robot.corpora.compose.motions import Motions
 from sfms_robot.corpora.compose.voices import Voice
 from sfms_robot.evaluation.nod_table import Counts, Ints, NodTable, cells
+from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, SpeakerFrame
-from sfms_robot.learning.rollout import frames_of
 from sfms_robot.signals import events as timing
 from sfms_robot.signals import phase
 from sfms_robot.signals.events import Bools
@@ -94,7 +94,7 @@ def scene(
     return Scene(
         f"{person.meeting}_{person.agent}",
         series(person.meeting),
-        tuple(frames_of(audio, face)),
+        tuple(speaker_frames(audio, face)),
         _starting_in(person.nods, stretch),
         active(person.others, stretch),
         active(person.talk, stretch),

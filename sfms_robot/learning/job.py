@@ -90,8 +90,8 @@ class Report:
     looked: bool
 
 
-def nobody(report: Report) -> None:
-    """Watches nothing."""
+def unwatched(report: Report) -> None:
+    """Shows nothing to anybody."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Run:
 
     resume: bool = False
     device: torch.device = torch.device("cpu")
-    watch: Callable[[Report], None] = nobody
+    watch: Callable[[Report], None] = unwatched
 
 
 @dataclass(frozen=True)

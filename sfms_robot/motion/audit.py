@@ -33,7 +33,7 @@ class Audit:
     """Holds the limits of the joints of one bus; `calibration` has the same joints in the same order."""
 
     def __init__(self, limits: JointLimits, calibration: Calibration, dt_s: float) -> None:
-        self._limits, self._calibration = limits, calibration
+        self._own, self._calibration = limits.range, calibration
         self._bounds = np.stack([limits.speed * dt_s, limits.acceleration * dt_s**2, limits.jerk * dt_s**3])
         self._bounds *= 1 + _TOLERANCE
         self._stride_ticks = limits.speed * dt_s * np.abs(calibration.ticks_per_rad) * (1 + _TOLERANCE) + 1
@@ -51,9 +51,8 @@ class Audit:
     def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: AuditState) -> AuditState:
         """Count one command (J,) against the limits, and against `wanted_rad` (J,), what the limiter was asked for.
 
-        A joint that breaks several limits in one tick counts once. One that was found outside its range may stay
-        there and come in, not go further out. An angle that is not finite is a violation, and
-        is not carried on.
+        A joint that breaks several limits in one tick counts once. One outside its own range may stay there and come
+        in, not go farther out (`sfms_robot.ranges`). An angle that is not finite is a violation, and is not carried on.
         """
         finite = np.isfinite(angles_rad)
         angles = np.where(finite, angles_rad, state.recent_rad[-1])
@@ -62,7 +61,7 @@ class Audit:
         second = first[1:] - first[:-1]
         differences = np.stack([first[-1], second[-1], second[-1] - second[-2]])
         last = state.recent_rad[-1]
-        bad = ~finite | (angles < np.minimum(self._limits.low, last)) | (angles > np.maximum(self._limits.high, last))
+        bad = ~finite | ~self._own.reaching(last).holds(angles)
         bad |= np.logical_or.reduce(np.abs(differences) > self._bounds, axis=0)
 
         ticks = self._calibration.to_ticks(angles)

@@ -6,14 +6,17 @@ range, its speed and acceleration being within their limits all the way. A tick 
 1. If one tick of bounded jerk leads exactly to the reference sample, and the law holds there, the sample passes
    unchanged: no lag, no chatter. Three equal pieces of constant jerk meet any position, speed and acceleration
    exactly, so the test is a 3x3 product for all joints at once.
-2. Otherwise ruckig plans the fastest way to the reference and its first tick is the candidate, if the law holds.
+2. Otherwise the candidate is the first tick of a way to the reference (`motion.chase`), if the law holds.
 3. Otherwise the joint brakes for one tick. The braking curve of a lawful state stays lawful, so by induction there
    is always a way out.
 
 Nearly always all joints pass, and bounds that are a little too strict but cost a few array operations for all of them
 show it. The joints that they do not settle are looked at one by one.
 
-A joint that is found outside its range starts there, and the range reaches out to it until it has come in.
+A joint that is found outside its own range starts there, and the range in force (`sfms_robot.ranges`) reaches out to
+it. There the law also says that the stop of a joint never turns back: it moves in or stands still, and its braking
+curve inherits that. Where the reference does not bring it in, `motion.way_in` does, so that it is inside its own range
+after `latest_s` whatever the reference is, and stays.
 
 Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, hence within
 the same limits. A reference that is not finite is refused: the joint brakes, and the tick is counted.
@@ -24,17 +27,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
-import ruckig
-from numpy.typing import NDArray
 
 from sfms_robot.config import Head
 from sfms_robot.frames import Doubles
-from sfms_robot.motion.stop import SLACK, Bound, State, Stop, lawful
-
-Bools = NDArray[np.bool_]
+from sfms_robot.motion.chase import ChaseFactory, build_chase
+from sfms_robot.motion.stop import SLACK, Bound, State, Stop, lawful, moves_in
+from sfms_robot.motion.way_in import WayIn, latest_s
+from sfms_robot.ranges import Bools, Range
 
 _HEADROOM: Final = 1 - 2e-7  # of a limit, for rounding; the law is tested at 1e-6
 _EDGE_SLACK_RAD: Final = 1e-12  # so that rounding does not make a joint at the end of its range a hard case
@@ -67,126 +70,156 @@ class JointLimits:
             np.radians([limit.jerk_deg_s3 for limit in classes]),
         )
 
+    @property
+    def range(self) -> Range:
+        return Range(self.low, self.high)
+
 
 @dataclass(frozen=True)
 class LimiterState:
     """Position, speed, acceleration (3, J) after the last tick, and what was counted.
 
     Attributes:
-        low, high: (J,) the range in force: that of the joint, and out to where it was found until it has come in.
+        way_in: how joints that were found outside their own ranges come in; None once all are inside.
         chased: ticks x joints where the reference was out of reach.
         refused: ticks x joints where the reference was not finite.
     """
 
     motion: Doubles
-    low: Doubles
-    high: Doubles
+    way_in: WayIn | None = None
     chased: int = 0
     refused: int = 0
 
 
 @dataclass(frozen=True)
-class _Range:
+class _Bounds:
     """A range in force, as the array arithmetic needs it.
 
     Attributes:
-        low, high, middle: (J,).
+        range: (J,).
+        middle: (J,).
         floor, ceiling: (3, J) just out of the limits: what is farther out is brought here, for 1e300 overflows.
-        bounds: (10, J) of what `JerkLimiter._needed` gives.
+        needed: (10, J) at most, of what `JerkLimiter._needed` gives.
     """
 
-    low: Doubles
-    high: Doubles
+    range: Range
     middle: Doubles
     floor: Doubles
     ceiling: Doubles
-    bounds: Doubles
+    needed: Doubles
 
 
 class JerkLimiter:
-    """Implements `ports.Limiter` for joints that share one tick of `dt_s`."""
+    """Implements `ports.Limiter` for joints that share one tick of `dt_s`. `chase`: the fastest there is by default."""
 
-    def __init__(self, limits: JointLimits, dt_s: float) -> None:
+    def __init__(self, limits: JointLimits, dt_s: float, chase: ChaseFactory = build_chase) -> None:
         self._speed = limits.speed * _HEADROOM
         self._acceleration = limits.acceleration * _HEADROOM
         self._jerk = limits.jerk * _HEADROOM
         self._dt_s = dt_s
         self._piece = _one_tick(dt_s)
         self._stop_s, self._per_acceleration = self._acceleration / self._jerk, 0.5 / self._acceleration
-        self._own = self._range(limits.low, limits.high)
-        self._planner = ruckig.Ruckig(1)
-        self._path = ruckig.Trajectory(1)
+        self._own = limits.range
+        self._own_bounds = self._within(self._own)
         each = zip(self._speed.tolist(), self._acceleration.tolist(), self._jerk.tolist(), strict=True)
         self._bounds = [Bound(*bound) for bound in each]
-        self._inputs = [_input(bound, dt_s) for bound in self._bounds]
+        self._ends = list(zip(limits.low.tolist(), limits.high.tolist(), strict=True))
+        self._chase = chase(self._bounds, dt_s)
 
     def start(self, angles_rad: Doubles) -> LimiterState:
         """At rest at `angles_rad` (J,), in its range or not. Raises ValueError when an angle is not finite."""
         if not np.isfinite(angles_rad).all():
             raise ValueError(f"joint {int(np.argmin(np.isfinite(angles_rad)))} starts at an angle that is not finite")
         still = np.zeros_like(self._own.low)
-        low, high = np.minimum(self._own.low, angles_rad), np.maximum(self._own.high, angles_rad)
-        return LimiterState(np.stack([angles_rad, still, still]), low, high)
+        return self._found(LimiterState(np.stack([angles_rad, still, still])), np.ones(len(still), np.bool_))
 
     def restart(self, joints: Bools, angles_rad: Doubles, state: LimiterState) -> LimiterState:
         """Some `joints` (J,) stand still at `angles_rad` (J,), in their range or not; the others go on."""
         still = np.zeros_like(angles_rad)
         motion = np.where(joints, np.stack([angles_rad, still, still]), state.motion)
-        low = np.where(joints, np.minimum(self._own.low, angles_rad), state.low)
-        high = np.where(joints, np.maximum(self._own.high, angles_rad), state.high)
-        return replace(state, motion=motion, low=low, high=high)
+        return self._found(replace(state, motion=motion), joints)
+
+    def latest_in_s(self, angles_rad: Doubles) -> Doubles:
+        """Time [s] (J,) after which joints found at `angles_rad` (J,) are inside their ranges, whatever is asked."""
+        out_rad = np.abs(angles_rad - self._own.nearest(angles_rad))
+        latest = latest_s(out_rad, self._speed, self._acceleration, self._jerk)
+        return np.where(out_rad == 0, 0.0, latest)
+
+    def _found(self, state: LimiterState, joints: Bools) -> LimiterState:
+        angles_rad = state.motion[0]
+        if self._own.holds(angles_rad).all():
+            return replace(state, way_in=None)
+        found = WayIn.of(angles_rad, self._own, self._speed, self._acceleration, self._jerk)
+        return replace(state, way_in=found if state.way_in is None else state.way_in.replaced(joints, found))
 
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Reference (3, J) one tick ahead -> angles (J,) that may be sent, and the state after the tick."""
-        at_home = state.low is self._own.low and state.high is self._own.high
-        within = self._own if at_home else self._range(state.low, state.high)
+        if state.way_in is None:
+            after, chased, refused = self._tick(reference_rad, state.motion, self._own_bounds)
+            return after[0].copy(), LimiterState(after, None, state.chased + chased, state.refused + refused)
+        way_in = state.way_in.after(self._dt_s)
+        outside = ~self._own.holds(state.motion[0])
+        guided = np.where(outside, way_in.guided(reference_rad), reference_rad)
+        within = self._within(self._own.reaching(state.motion[0]))
+        after, chased, refused = self._tick(guided, state.motion, within, outside)
+        left_out = outside & ~np.isfinite(reference_rad).all(axis=0)
+        refused += int(np.count_nonzero(left_out))
+        still_out = way_in if not self._own.holds(after[0]).all() else None
+        return after[0].copy(), LimiterState(after, still_out, state.chased + chased, state.refused + refused)
+
+    def _tick(
+        self, reference_rad: Doubles, motion: Doubles, within: _Bounds, outside: Bools | None = None
+    ) -> tuple[Doubles, int, int]:
+        """The state (3, J) one tick after `motion` (3, J), and how many joints were chased and refused.
+
+        `outside` (J,): who is outside its own range; None: nobody.
+        """
+        low, high = within.range.low, within.range.high
         after = np.minimum(np.maximum(reference_rad, within.floor), within.ceiling)
-        fine = self._needed(state.motion, after, within.middle) <= within.bounds  # False for NaN
-        chased, refused = state.chased, state.refused
+        fine = self._needed(motion, after, within.middle) <= within.needed  # False for NaN
+        if outside is not None:
+            fine[6:, outside] = False
+        chased = refused = 0
         if np.count_nonzero(fine) < fine.size:
             hard = np.flatnonzero(~np.logical_and.reduce(fine, axis=0))
             met = np.logical_and.reduce(fine[:6, hard], axis=0)
-            each = [
-                *state.motion[:, hard],
-                *reference_rad[:, hard],
-                *after[:, hard],
-                within.low[hard],
-                within.high[hard],
-            ]
+            each = [*motion[:, hard], *reference_rad[:, hard], *after[:, hard], low[hard], high[hard]]
             settled = []
             for j, ok, column in zip(hard.tolist(), met.tolist(), np.stack(each).T.tolist(), strict=True):
-                before, reference, wanted, (low, high) = column[:3], column[3:6], column[6:9], column[9:]
+                before, reference, wanted, ends = column[:3], column[3:6], column[6:9], column[9:]
                 if not all(map(math.isfinite, reference)):
                     settled.append(self._braked(j, before))
                     refused += 1
-                elif ok and lawful(wanted, low, high, self._bounds[j]):
+                elif ok and self._lawful(j, wanted, *ends):
                     settled.append(wanted)
                 else:
-                    settled.append(self._chased(j, before, wanted, low, high))
+                    settled.append(self._chased(j, before, wanted, *ends))
                     chased += 1
             after[:, hard] = np.array(settled).T
-        angles = after[0]
-        np.maximum(angles, within.low, out=angles)
-        np.minimum(angles, within.high, out=angles)
-        if at_home:
-            return angles.copy(), LimiterState(after, state.low, state.high, chased, refused)
-        return angles.copy(), LimiterState(after, *self._come_in(after, state.low, state.high), chased, refused)
+        np.maximum(after[0], low, out=after[0])
+        np.minimum(after[0], high, out=after[0])
+        return after, chased, refused
 
-    def _come_in(self, motion: Doubles, low: Doubles, high: Doubles) -> tuple[Doubles, Doubles]:
-        """The range in force, without the way out where a joint is lawful in its own range."""
-        own = zip(motion.T.tolist(), self._own.low.tolist(), self._own.high.tolist(), self._bounds, strict=True)
-        inside = np.array([lawful((p, v, a), first, last, bound) for (p, v, a), first, last, bound in own])
-        if inside.all():
-            return self._own.low, self._own.high
-        return np.where(inside, self._own.low, low), np.where(inside, self._own.high, high)
+    def _lawful(self, j: int, state: State, low: float, high: float) -> bool:
+        """Whether joint j, the range in force being low..high, may go to `state`."""
+        first, last, bound = self._ends[j][0], self._ends[j][1], self._bounds[j]
+        if low == first and high == last:
+            return lawful(state, low, high, bound)
+        if not low <= state[0] <= high:
+            return False
+        if first <= state[0] <= last:
+            return lawful(state, first, last, bound)
+        way = 1.0 if low < first else -1.0
+        return lawful(state, low, high, bound) and moves_in(state, way, bound)
 
-    def _range(self, low: Doubles, high: Doubles) -> _Range:
+    def _within(self, limits: Range) -> _Bounds:
+        low, high = limits.low, limits.high
         ceiling = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
         half = (high - low) / 2 + _EDGE_SLACK_RAD
         one_tick = [self._jerk] * 3 + [self._acceleration] * 2 + [self._speed * self._dt_s]
         stop = [self._speed * (1 + SLACK), self._acceleration * (1 + SLACK), half, half]
         floor = np.stack([low - 1, -ceiling[1], -ceiling[2]])
-        return _Range(low, high, (low + high) / 2, floor, ceiling, np.stack([*one_tick, *stop]))
+        return _Bounds(limits, (low + high) / 2, floor, ceiling, np.stack([*one_tick, *stop]))
 
     def _needed(self, motion: Doubles, wanted: Doubles, middle: Doubles) -> Doubles:
         """What it takes to go from `motion` to `wanted` (3, J) in one tick, and to stop from there: sizes (10, J).
@@ -210,21 +243,16 @@ class JerkLimiter:
         return np.abs(out, out=out)
 
     def _chased(self, j: int, before: State, wanted: State, low: float, high: float) -> State:
-        """Joint j one tick on its fastest way to what is possible of `wanted`; braked where that is not lawful."""
-        given, bound = self._inputs[j], self._bounds[j]
-        position, speed, acceleration = _possible(wanted, low, high, bound)
-        given.current_position, given.current_velocity, given.current_acceleration = ([x] for x in before)
-        given.target_position, given.target_velocity, given.target_acceleration = [position], [speed], [acceleration]
-        try:
-            self._planner.calculate(given, self._path)
-        except (
-            ruckig.RuckigError,
-            ValueError,
-        ):  # it finds no way at the rim of the law, or one of hours (-101, unnamed)
-            return self._braked(j, before)
-        (position,), (speed,), (acceleration,) = self._path.at_time(self._dt_s)
-        after = (position, speed, acceleration)
-        return after if lawful(after, low, high, bound) else self._braked(j, before)
+        """Joint j one tick on its way to what is possible of `wanted`; braked where that is not lawful."""
+        target = _possible(wanted, low, high, self._bounds[j])
+        lawful_next = partial(self._lawful, j, low=low, high=high)
+        after = self._chase.step(j, before, target, lawful_next)
+        if (low, high) != self._ends[j]:
+            # To meet a reference that moves, a joint may want to take a run-up. One outside its own range goes on.
+            still = self._chase.step(j, before, (target[0], 0.0, 0.0), lawful_next)
+            way = 1.0 if low < self._ends[j][0] else -1.0
+            after = max((each for each in (after, still) if each), key=lambda each: way * each[1], default=None)
+        return self._braked(j, before) if after is None else after
 
     def _braked(self, j: int, before: State) -> State:
         way, speed, acceleration = Stop.of(before[1], before[2], self._bounds[j]).after(self._dt_s)
@@ -250,15 +278,8 @@ def _one_tick(dt: float) -> Doubles:
     return np.concatenate([jerks, inner, [[-1.0, 0, 0, 1, 0, 0]]])
 
 
-def _input(bound: Bound, dt_s: float) -> ruckig.InputParameter:
-    given = ruckig.InputParameter(1)
-    given.max_velocity, given.max_acceleration, given.max_jerk = [bound.speed], [bound.acceleration], [bound.jerk]
-    given.minimum_duration = dt_s
-    return given
-
-
 def _possible(wanted: State, low: float, high: float, bound: Bound) -> State:
-    """What ruckig may aim at: `wanted` where it is lawful, else inside the range, and slower or standing still."""
+    """What may be aimed at: `wanted` where it is lawful, else inside the range, and slower or standing still."""
     position = _clipped(wanted[0], low, high)
     speed = _clipped(wanted[1], -bound.speed, bound.speed)
     acceleration = _clipped(wanted[2], -bound.acceleration, bound.acceleration)

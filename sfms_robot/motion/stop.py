@@ -15,6 +15,7 @@ State = Sequence[float]  # position, speed, acceleration
 # Rounding eats into a limit at about 1e-9 of it; the law is tested at 1e-6.
 SLACK: Final = 1e-9
 POSITION_SLACK_RAD: Final = 1e-10
+_STANDS_RAD_S: Final = 1e-12
 
 
 class Bound(NamedTuple):
@@ -94,3 +95,9 @@ def lawful(state: State, low: float, high: float, bound: Bound) -> bool:
         return False
     below, above = Stop.of(speed, acceleration, bound).extent()
     return position + below >= low - POSITION_SLACK_RAD and position + above <= high + POSITION_SLACK_RAD
+
+
+def moves_in(state: State, way: float, bound: Bound) -> bool:
+    """Whether a joint moves along `way` (1 or -1) or stands still, also all the while it stops."""
+    _, speed, acceleration = state
+    return way * speed >= 0 and way * (speed + 0.5 * acceleration * abs(acceleration) / bound.jerk) >= -_STANDS_RAD_S

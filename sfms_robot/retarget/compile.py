@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from sfms_robot.config import Expression
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
@@ -56,7 +55,7 @@ class _Curves:
             origins[row, 1 : len(x)] = x[:-1]
             pieces[row, 0, 3], pieces[row, len(x), 3] = y[0], y[-1]
             with np.errstate(over="ignore"):  # slopes too small for a float are 0
-                pieces[row, 1 : len(x)] = PchipInterpolator(x, y).c.T
+                pieces[row, 1 : len(x)] = _monotone_cubics(x, y)
         return cls(np.array(where, dtype=np.intp), breaks, origins, pieces)
 
     def into(self, values: Doubles) -> None:
@@ -69,6 +68,30 @@ class _Curves:
         t = np.where(flat, 0.0, x - self.origins[rows, piece])  # outside, x may be too large to be cubed
         t[piece == self.breaks.shape[1]] = 0.0
         values[..., self.where] = ((c[..., 0] * t + c[..., 1]) * t + c[..., 2]) * t + c[..., 3]
+
+
+def _monotone_cubics(x: Doubles, y: Doubles) -> Doubles:
+    """Cubics between K points (Fritsch, Butland 1984) that overshoot none: (K-1, 4), highest power first."""
+    dx = np.diff(x)
+    rise = np.diff(y) / dx
+    slopes = np.full(len(x), rise[0])
+    if len(x) > 2:
+        w1, w2 = 2 * dx[1:] + dx[:-1], dx[1:] + 2 * dx[:-1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inner = 1.0 / ((w1 / rise[:-1] + w2 / rise[1:]) / (w1 + w2))
+        slopes[1:-1] = np.where(rise[:-1] * rise[1:] > 0, inner, 0.0)
+        slopes[0] = _end_slope(dx[0], dx[1], rise[0], rise[1])
+        slopes[-1] = _end_slope(dx[-1], dx[-2], rise[-1], rise[-2])
+    bend = (slopes[:-1] + slopes[1:] - 2 * rise) / dx
+    return np.stack([bend / dx, (rise - slopes[:-1]) / dx - bend, slopes[:-1], y[:-1]], axis=1)
+
+
+def _end_slope(dx0: float, dx1: float, rise0: float, rise1: float) -> float:
+    """By three points, kept from overshooting."""
+    slope = ((2 * dx0 + dx1) * rise0 - dx0 * rise1) / (dx0 + dx1)
+    if np.sign(slope) != np.sign(rise0):
+        return 0.0
+    return 3.0 * rise0 if np.sign(rise0) != np.sign(rise1) and abs(slope) > 3.0 * abs(rise0) else slope
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class VirtualClock:
 
 
 @dataclass(frozen=True)
-class Beat:
+class TickTime:
     """One tick: its nominal time since the start, how late it began, and how many ticks were skipped before it."""
 
     time_s: float
@@ -53,8 +53,11 @@ class Beat:
     skipped: int
 
 
-def beats(clock: Clock, rate_hz: float, start_s: float) -> Iterator[Beat]:
-    """Endless ticks from now on, at `rate_hz`; nominal times are exact multiples of the period since `start_s`."""
+def tick_times(clock: Clock, rate_hz: float, start_s: float) -> Iterator[TickTime]:
+    """Endless ticks from now on, at `rate_hz`; nominal times are exact multiples of the period since `start_s`.
+
+    Blocks until each is due.
+    """
     index = max(0, math.ceil((clock.now_s() - start_s) * rate_hz - _SAME))
     while True:
         due_s = start_s + index / rate_hz
@@ -62,5 +65,5 @@ def beats(clock: Clock, rate_hz: float, start_s: float) -> Iterator[Beat]:
         late_s = max(0.0, clock.now_s() - due_s)
         skipped = int(late_s * rate_hz)
         index += skipped
-        yield Beat(index / rate_hz, late_s - skipped / rate_hz, skipped)
+        yield TickTime(index / rate_hz, late_s - skipped / rate_hz, skipped)
         index += 1

@@ -1,55 +1,99 @@
-"""What a run measures of itself. Every figure of the report comes from here or from the bus's own counters."""
+"""What a run measures of itself. Every figure of the report comes from here or from the parts' own counters.
+
+Days of running fit in memory: of everything that grows only running figures, quantiles in fixed memory and the last
+half minute of three channels are kept.
+"""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Audit
-from sfms_robot.runtime.clock import Beat
+from sfms_robot.runtime.clock import TickTime
+from sfms_robot.signals.quantiles import Quantiles
 
-LATE_SHARE = 0.5  # a tick is late when it starts more than this share of a period behind its deadline
-_PITCH = CHANNEL_INDEX["pitch"]
-_BLINKS = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
-_SMILES = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
-SPEECH_RMS = 0.01  # a frame louder than this counts as speech when latency is measured
+LATE_SHARE: Final = 0.5  # a tick is late when it starts more than this share of a period behind its deadline
+SPEECH_RMS: Final = 0.01  # a frame louder than this counts as speech when latency is measured
+_PITCH: Final = CHANNEL_INDEX["pitch"]
+_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
+_SMILES: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
+_REMEMBERED: Final = 250  # frames of speech and plans that wait to be measured: ten seconds
+_BLOCK_S: Final = 20.0  # counted at once
+_MARGIN_S: Final = 8.0  # looked at on both sides of a block; no nod is longer
+
+FindEvents = Callable[[Doubles, float], Sequence[tuple[float, float, float]]]
+
+
+class EventCounter:
+    """Counts events in a signal that never ends, a block at a time.
+
+    Args:
+        find: signal (N,) and its rate -> events (start_s, end_s, size) in order, as those of `signals.events`.
+
+    Blocks overlap, and an event counts in the block that it starts in, so the count is that of the whole signal.
+    """
+
+    def __init__(self, find: FindEvents, rate_hz: float) -> None:
+        self._find, self._rate_hz = find, rate_hz
+        self._block, self._margin = round(_BLOCK_S * rate_hz), round(_MARGIN_S * rate_hz)
+        self._values: list[float] = []
+        self._before = 0  # values of the block before, at the front
+        self._counted = 0
+
+    def add(self, value: float) -> None:
+        self._values.append(value)
+        if len(self._values) >= self._before + self._block + self._margin:
+            self._counted += self._starting(self._before, self._before + self._block)
+            keep = self._before + self._block - self._margin
+            self._values, self._before = self._values[keep:], self._margin
+
+    def total(self) -> int:
+        """Events so far, those in the unfinished block included."""
+        return self._counted + self._starting(self._before, len(self._values))
+
+    def _starting(self, first: int, last: int) -> int:
+        events = self._find(np.asarray(self._values), self._rate_hz)
+        return sum(first <= max(0, round(start_s * self._rate_hz)) < last for start_s, _, _ in events)
 
 
 @dataclass
 class RunLog:
-    """Filled by the loop, read once at the end. `period_s` is the tick's.
-
-    Hours of running must fit in memory: joints are kept as running figures, and of the face only the three channels
-    that are counted (head pitch, blink, smile), as packed doubles.
-    """
+    """Filled by the loop, read once at the end. `period_s` is the tick's, `find` finds events by name."""
 
     joints: Sequence[str]
     period_s: float
     audit: Audit
-    late_ms: array[float] = field(default_factory=lambda: array("d"))
+    find: Mapping[str, FindEvents] = field(default_factory=dict)
+    ticks: int = 0
+    late: int = 0
     skipped: int = 0
     frames: int = 0
     refused_plans: int = 0
-    frame_to_wire_ms: array[float] = field(default_factory=lambda: array("d"))
-    speech_to_wire_ms: array[float] = field(default_factory=lambda: array("d"))
-    pitch_rad: array[float] = field(default_factory=lambda: array("d"))
-    blink: array[float] = field(default_factory=lambda: array("d"))
-    smile: array[float] = field(default_factory=lambda: array("d"))
+    late_ms: Quantiles = field(default_factory=Quantiles)
+    frame_to_wire_ms: Quantiles = field(default_factory=Quantiles)
+    speech_to_wire_ms: Quantiles = field(default_factory=Quantiles)
     eased: int = 0
     listened_s: float = 0.0
     min_rad: Doubles | None = None
     max_rad: Doubles | None = None
     travel_rad: Doubles | None = None
     audited: Any = None
+    state: Any = None  # of the loop at its end: timeline and limiter tell what they counted
+    detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
     _last_rad: Doubles | None = None
-    _waiting: list[Plan] = field(default_factory=list)
-    _speech_s: list[float] = field(default_factory=list)
+    _waiting: deque[Plan] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    _speech_s: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    _counters: dict[str, EventCounter] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._counters = {name: EventCounter(find, 1.0 / self.period_s) for name, find in self.find.items()}
 
     def start(self, held_rad: Doubles) -> None:
         """Torque came on at `held_rad` (J,)."""
@@ -70,38 +114,36 @@ class RunLog:
     def planned(self, plan: Plan) -> None:
         self._waiting.append(plan)
 
-    def wrote(
-        self,
-        beat: Beat,
-        now_s: float,
-        wire_s: float,
-        reach_s: float,
-        goals_rad: Doubles,
-        asked_rad: Doubles,
-        motion: Floats,
-    ) -> None:
-        """The tick of `now_s` is on the wire at `wire_s`; it played the timeline up to `reach_s`."""
-        self.listened_s = now_s
-        self._beat(beat, goals_rad, asked_rad)
-        self.pitch_rad.append(float(motion[_PITCH]))
-        self.blink.append(float(motion[_BLINKS].max()))
-        self.smile.append(float(motion[_SMILES].mean()))
-        used = [plan for plan in self._waiting if plan.times_s[0] <= reach_s]
-        for plan in used:
-            self._waiting.remove(plan)
-            self.frame_to_wire_ms.append((wire_s - plan.made_at_s) * 1e3)
-            for spoken_s in [t for t in self._speech_s if t <= plan.made_at_s]:
-                self._speech_s.remove(spoken_s)
-                self.speech_to_wire_ms.append((wire_s - (spoken_s - FRAME_S)) * 1e3)  # from the frame's first sample
+    def commanded(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles, motion: Floats) -> None:
+        """What the limiter gave for this tick, sent or not: `goals_rad` (J,) of `asked_rad` (J,), for a face (58,)."""
+        self.listened_s = tick.time_s
+        self._tick(tick, goals_rad, asked_rad)
+        for name, value in (
+            ("nods", motion[_PITCH]), ("blinks", motion[_BLINKS].max()), ("smiles", motion[_SMILES].mean()),
+        ):  # fmt: skip
+            if name in self._counters:
+                self._counters[name].add(float(value))
 
-    def ease(self, beat: Beat, goals_rad: Doubles, asked_rad: Doubles) -> None:
+    def wrote(self, wire_s: float, reach_s: float) -> None:
+        """The command is on the wire at `wire_s`; it played the timeline up to `reach_s`."""
+        while self._waiting and self._waiting[0].times_s[0] <= reach_s:
+            made_at_s = self._waiting.popleft().made_at_s
+            self.frame_to_wire_ms.add(max(0.0, wire_s - made_at_s) * 1e3)
+            while self._speech_s and self._speech_s[0] <= made_at_s:
+                first_sample_s = self._speech_s.popleft() - FRAME_S
+                self.speech_to_wire_ms.add(max(0.0, wire_s - first_sample_s) * 1e3)
+
+    def ease(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles) -> None:
         """One tick of the way to rest."""
-        self._beat(beat, goals_rad, asked_rad)
+        self._tick(tick, goals_rad, asked_rad)
         self.eased += 1
 
-    def _beat(self, beat: Beat, goals_rad: Doubles, asked_rad: Doubles) -> None:
-        self.late_ms.append((beat.late_s + beat.skipped * self.period_s) * 1e3)
-        self.skipped += beat.skipped
+    def _tick(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles) -> None:
+        late_s = tick.late_s + tick.skipped * self.period_s
+        self.ticks += 1
+        self.late += late_s > LATE_SHARE * self.period_s
+        self.late_ms.add(late_s * 1e3)
+        self.skipped += tick.skipped
         self.audited = self.audit.step(goals_rad, asked_rad, self.audited)
         if self._last_rad is None or self.min_rad is None or self.max_rad is None or self.travel_rad is None:
             self.min_rad, self.max_rad, self.travel_rad = goals_rad.copy(), goals_rad.copy(), np.zeros_like(goals_rad)
@@ -111,15 +153,19 @@ class RunLog:
             self.travel_rad = self.travel_rad + np.abs(goals_rad - self._last_rad)
         self._last_rad = goals_rad
 
+    def motion_report(self) -> dict[str, int]:
+        """`motion` of the report."""
+        return {name: counter.total() for name, counter in self._counters.items()}
+
     def tick_report(self, target_hz: float, elapsed_s: float | None) -> dict[str, Any]:
         """`tick` of the report; wall-clock figures are null where there is no wall clock (`elapsed_s` None)."""
-        late = np.asarray(self.late_ms)
         real = elapsed_s is not None
+        late_ms = self.late_ms if real else Quantiles()
         return {
             "target_hz": target_hz,
-            "achieved_hz": round(len(late) / elapsed_s, 2) if elapsed_s else None,
-            "late": int(np.sum(late > LATE_SHARE * self.period_s * 1e3)) if real else None,
-            "jitter_ms": quantiles(late if real else (), p50=50, p99=99, max=100),
+            "achieved_hz": round(self.ticks / elapsed_s, 2) if elapsed_s else None,
+            "late": self.late if real else None,
+            "jitter_ms": late_ms.report(p50=50, p99=99, max=100),
         }
 
     def joint_report(self) -> dict[str, dict[str, float]]:
@@ -134,10 +180,3 @@ class RunLog:
             }
             for name, low, high, way in zip(self.joints, self.min_rad, self.max_rad, self.travel_rad, strict=True)
         }
-
-
-def quantiles(values: Sequence[float] | array[float] | Doubles, **percent: float) -> dict[str, float | None]:
-    """{"p50": ..., ...}; every value None when nothing was measured."""
-    if not len(values):
-        return dict.fromkeys(percent)
-    return {name: round(float(np.percentile(values, p)), 3) for name, p in percent.items()}

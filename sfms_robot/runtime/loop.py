@@ -2,9 +2,10 @@
 
     source -> listener -> timeline -> retarget -> limits -> bus -> observers
 
-One tick every 1/rate_hz s on absolute deadlines. What changes while it runs is a `State` handed from tick to tick, so
-that whatever happens, the last whole state is there to come to rest from. The reference of a tick is the face at
-(tick time + lead of the joint); speed and acceleration are central differences, so one sample lies one tick ahead.
+One tick every 1/rate_hz s on absolute deadlines. What changes while it runs is a `State` handed from step to step. It
+is kept as soon as the limiter has decided, so whatever is raised after that, and wherever, the way to rest begins at
+the last command. The reference of a tick is the face at (tick time + lead of the joint); speed and acceleration are
+central differences, so one sample lies one tick ahead.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Doubles, Floats, Reading
 from sfms_robot.ports import (
     Bus,
     Clock,
@@ -29,8 +30,9 @@ from sfms_robot.ports import (
     Tick,
     Timeline,
 )
-from sfms_robot.runtime.clock import Beat, beats
+from sfms_robot.runtime.clock import tick_times
 from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.observers import Observers
 from sfms_robot.runtime.safety import EASE_S, come_to_rest, smooth
 
 
@@ -38,7 +40,8 @@ from sfms_robot.runtime.safety import EASE_S, come_to_rest, smooth
 class Parts:
     """Everything a run is made of, put together by `app`. `leads_s` and `rest_rad` are (J,) in joint order.
 
-    `knobs` is asked at every tick how much the head is to show; None: what its file says.
+    `knobs` is asked at every tick how much the head is to show; None: what its file says. `overlay` (motion (N, 58),
+    times (N,)) -> motion lays what somebody asks for by hand over what the listener planned.
     """
 
     source: Source
@@ -52,6 +55,7 @@ class Parts:
     rest_rad: Doubles
     life: Life | None = None
     knobs: Callable[[], Any] | None = None
+    overlay: Callable[[Floats, Doubles], Floats] | None = None
 
 
 @dataclass(frozen=True)
@@ -80,38 +84,57 @@ def drive(
 ) -> str:
     """Torque on, ease in, listen for `duration_s`, ease to rest, torque off. Returns "done" or "interrupted".
 
-    Whatever is raised on the way, the head comes to rest and `bus.stop` is called before it goes on.
+    Blocks until then. Whatever is raised on the way, wherever, every bus that still works eases its joints to rest,
+    and `bus.stop` is called before it is raised further.
     """
+    observers = Observers(parts.observers)
+    log.detached = observers.detached
     try:
-        held_rad = parts.bus.enable(parts.retargeter.joints)
-        log.start(held_rad)
-        limiter, life = parts.limiter.start(held_rad), parts.life.start() if parts.life else None
-        state = State(parts.timeline.start(), limiter, held_rad, 0 * held_rad, held_rad, held_rad, life)
-        state = replace(state, retargeter=parts.retargeter.start())
+        state = _enabled(parts, log, interrupted)
+        if state is None:
+            return "interrupted"
         start_s = clock.now_s()
         try:
-            for beat in beats(clock, rate_hz, start_s):
-                if interrupted():
-                    return "interrupted"
-                if beat.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
+            for tick in tick_times(clock, rate_hz, start_s):
+                if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
                     break
-                state = _tick(parts, log, clock, beat, state, start_s, 1.0 / rate_hz)
-            return "done"
+                state = _heard(parts, observers, log, tick.time_s, state)
+                state, command = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
+                log.commanded(tick, command.goals_rad, command.asked_rad, command.motion)
+                parts.bus.write(command.goals_rad, tick.time_s)
+                log.wrote(clock.now_s() - start_s, command.reach_s)
+                readings = parts.bus.poll(tick.time_s)
+                state = _rejoined(parts, log, readings, state, tick.time_s)
+                observers.tick(Tick(tick.time_s, command.motion, command.goals_rad, readings))
         finally:
-            ticks = beats(clock, rate_hz, start_s)
-            come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, ticks, log)
+            way = tick_times(clock, rate_hz, start_s)
+            come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log)
+            log.state = state
     finally:
         parts.bus.stop(stop)
+    return "interrupted" if interrupted() else "done"
 
 
-def _tick(parts: Parts, log: RunLog, clock: Clock, beat: Beat, state: State, start_s: float, period_s: float) -> State:
-    now_s = beat.time_s  # the run's own time: 0 when torque came on
+def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> State | None:
+    """Torque on, joint by joint, so that who asks to end need not wait for all of them; None when somebody did."""
+    held_rad = np.zeros(len(parts.retargeter.joints))
+    for index, joint in enumerate(parts.retargeter.joints):
+        if interrupted():
+            return None
+        held_rad[index] = parts.bus.enable([joint])[0]
+    log.start(held_rad)
+    return State(
+        parts.timeline.start(), parts.limiter.start(held_rad), held_rad, 0 * held_rad, held_rad, held_rad,
+        parts.life.start() if parts.life else None, parts.retargeter.start(),
+    )  # fmt: skip
+
+
+def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state: State) -> State:
+    """Frames of the person go to the listener, plans that are ready join the timeline."""
     for frame in parts.source.read(now_s):
         parts.feed.push(frame, now_s)
         log.heard(frame)
-        for observer in parts.observers:
-            observer.heard(frame)
-
+        observers.heard(frame)
     timeline = state.timeline
     for plan in parts.feed.poll(now_s):
         if not np.isfinite(plan.frames).all():
@@ -119,31 +142,40 @@ def _tick(parts: Parts, log: RunLog, clock: Clock, beat: Beat, state: State, sta
             continue
         timeline = parts.timeline.accept(plan, timeline)
         log.planned(plan)
-        for observer in parts.observers:
-            observer.planned(plan)
+        observers.planned(plan)
+    return replace(state, timeline=timeline)
 
+
+@dataclass(frozen=True)
+class Command:
+    """What a tick asks of the servos: goals (J,), what the limiter was asked for (J,), the face (58,) behind it.
+
+    `reach_s`: how far into the timeline it looked.
+    """
+
+    goals_rad: Doubles
+    asked_rad: Doubles
+    motion: Floats
+    reach_s: float
+
+
+def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tuple[State, Command]:
+    """The face of this instant, each joint ahead by its lead, as goals inside the limits."""
     times_s = np.concatenate([[now_s], now_s + parts.leads_s + period_s])
-    motion, timeline = parts.timeline.sample(times_s, now_s, timeline)
+    motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
+    if parts.overlay:
+        motion = parts.overlay(motion, times_s)
     life = state.life
     if parts.life:
         motion, life = parts.life.step(motion, times_s, now_s, life)
     knobs = parts.knobs() if parts.knobs else None
-    asked_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
+    angles_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
     eased = smooth((now_s + period_s - state.since_s) / EASE_S)
-    ahead_rad = state.held_rad + eased * (asked_rad - state.held_rad)
+    ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)
-
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)
-    parts.bus.write(goals_rad, now_s)
-    log.wrote(beat, now_s, clock.now_s() - start_s, float(times_s.max()), goals_rad, reference[0], motion[0])
-    readings = parts.bus.poll(now_s)
-
-    seen = Tick(now_s, motion[0], goals_rad, readings)
-    for observer in parts.observers:
-        observer.tick(seen)
-    state = replace(state, timeline=timeline, life=life, retargeter=retargeter, limiter=limiter)
-    state = replace(state, before_rad=state.here_rad, here_rad=ahead_rad)
-    return _rejoined(parts, log, readings, state, now_s)
+    state = State(timeline, limiter, state.held_rad, state.since_s, state.here_rad, ahead_rad, life, retargeter)
+    return state, Command(goals_rad, reference[0], motion[0], float(times_s.max()))
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: State, now_s: float) -> State:

@@ -2,7 +2,8 @@
 
 The loop only drops a value into a bounded queue; a thread of its own encodes and writes. When the queue is full a
 value is dropped and counted, never waited for - except in virtual time, where waiting costs nothing and the file must
-be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second.
+be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
+goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
 Topics: /speaker (25 Hz: sound, level, face), /plan (per plan), /face (per tick: the 58 channels asked for),
 /joints (per tick and joint: goal, present, age, fault).
@@ -18,6 +19,7 @@ import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal
@@ -37,6 +39,7 @@ FullPolicy = Literal["drop", "wait"]
 
 _QUEUE_LENGTH: Final = 2000  # ten seconds of a 100 Hz loop
 _CHUNK_BYTES: Final = 64 * 1024  # short stalls, and little is lost when a run is killed
+PART_MESSAGES: Final = 100_000  # about seven minutes of a 100 Hz loop
 _DIGITS: Final = 5
 _log = logging.getLogger(__name__)
 
@@ -92,9 +95,11 @@ class Recorder:
         self._written = 0
         self._trouble: str | None = None
         self._closed = False
-        self._file = _open(folder)
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
-        self._channels = self._begin(about or {})
+        self._folder = folder
+        self._about = {**(about or {}), "joints": json.dumps(self._joints), "started_utc": _now_utc()}
+        self._parts = 0
+        self._in_part = 0
+        self._begin()
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
@@ -117,8 +122,7 @@ class Recorder:
         self._closed = True
         self._queue.put(None)
         self._thread.join()
-        self._attempt(self._writer.finish)
-        self._attempt(self._file.close)
+        self._end()
         if self._trouble:
             _log.warning("the recording is not whole: %s", self._trouble)
         if self._dropped:
@@ -136,15 +140,23 @@ class Recorder:
         except queue.Full:
             self._dropped += 1
 
-    def _begin(self, about: Mapping[str, str]) -> dict[str, int]:
+    def _begin(self) -> None:
+        """Open the next file. Raises ConfigError where it cannot be written."""
+        self._parts += 1
+        self._in_part = 0
+        self._file = _open(self._folder, part_name(self._parts))
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
         self._writer.start(profile="", library="sfms-robot")
-        self._writer.add_metadata("run", {**about, "joints": json.dumps(self._joints)})
-        channels = {}
+        self._writer.add_metadata("run", self._about)
+        self._channels = {}
         for topic, properties in _SCHEMAS.items():
             schema = json.dumps({"type": "object", "properties": properties}).encode()
             number = self._writer.register_schema(f"sfms_robot{topic.replace('/', '.')}", "jsonschema", schema)
-            channels[topic] = self._writer.register_channel(topic, "json", number)
-        return channels
+            self._channels[topic] = self._writer.register_channel(topic, "json", number)
+
+    def _end(self) -> None:
+        self._attempt(self._writer.finish)
+        self._attempt(self._file.close)
 
     def _work(self) -> None:
         """The thread: runs till close. After trouble with the file it goes on emptying the queue."""
@@ -153,10 +165,12 @@ class Recorder:
                 self._attempt(partial(self._write, value))
 
     def _attempt(self, action: Callable[[], Any]) -> None:
+        """Whatever goes wrong with the file ends the recording, not the run, and is told in the report."""
         try:
             action()
-        except (OSError, ValueError) as error:
-            self._trouble = self._trouble or str(error)
+        except Exception as error:
+            self._trouble = self._trouble or f"{type(error).__name__}: {error}"
+            _log.error("the recording ends here: %s", self._trouble)
 
     def _write(self, value: Tick | SpeakerFrame | Plan) -> None:
         for topic, time_s, body in _messages(value, self._joints):
@@ -164,25 +178,53 @@ class Recorder:
             data = json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
             self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
             self._written += 1
+            self._in_part += 1
+        if self._in_part >= PART_MESSAGES:
+            self._end()
+            self._begin()
+
+
+def check_folder(folder: Path, overwrite: bool = False) -> None:
+    """Whether a run may be recorded there. Raises ConfigError where one is already, unless it may be overwritten."""
+    if (folder / RUN_FILE).exists() and not overwrite:
+        raise ConfigError(f"--record {folder}: holds a recording already (another folder, or --overwrite)")
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
-    """DIR/report.json, whole or not at all. Raises ConfigError when the folder cannot be written to."""
+    """DIR/report.json, whole or not at all. Where it cannot be written that is said: it is printed all the same."""
     part = folder / (REPORT_FILE + ".part")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         part.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
         part.replace(folder / REPORT_FILE)
     except OSError as error:
-        raise ConfigError(f"--record {folder}: cannot be written to: {error.strerror or error}") from error
+        _log.error("--record %s: the report cannot be written: %s", folder, error.strerror or error)
 
 
-def _open(folder: Path) -> BinaryIO:
+def part_name(part: int) -> str:
+    """File name of a recording's first, second ... part."""
+    return RUN_FILE if part == 1 else f"run-{part:04d}.mcap"
+
+
+def parts_of(folder: Path) -> list[Path]:
+    """The files of a recording, in order; none where there is none."""
+    first = folder / RUN_FILE
+    return [first, *sorted(folder.glob("run-[0-9][0-9][0-9][0-9].mcap"))] if first.is_file() else []
+
+
+def _open(folder: Path, name: str) -> BinaryIO:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return (folder / RUN_FILE).open("wb")
+        if name == RUN_FILE:
+            for old in parts_of(folder):  # of a recording that may be replaced, see `check_folder`
+                old.unlink()
+        return (folder / name).open("wb")
     except OSError as error:
         raise ConfigError(f"--record {folder}: cannot be written to: {error.strerror or error}") from error
+
+
+def _now_utc() -> str:
+    return datetime.now(UTC).isoformat()
 
 
 def _messages(value: Tick | SpeakerFrame | Plan, joints: Sequence[str]) -> list[tuple[str, float, dict[str, Any]]]:

@@ -1,4 +1,4 @@
-"""What keeps a run safe from the outside: the way to rest, signals turned into a flag, real-time priority."""
+"""What keeps a run safe from the outside: the way to rest, signals turned into a request to end, real-time priority."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from sfms_robot.errors import RobotError
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import Bus, Limiter
-from sfms_robot.runtime.clock import Beat
+from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.log import RunLog
 
-EASE_S = 1.0  # torque-on pose -> live face, and live face -> rest
-SETTLE_S = 2.0  # a slow joint may need longer than EASE_S; after this the torque goes off all the same
-ARRIVED_RAD = 1e-4
-SWITCH_S = 0.0005  # Python's own 5 ms is half a tick
+EASE_S: Final = 1.0  # torque-on pose -> live face, and live face -> rest
+SETTLE_S: Final = 2.0  # a slow joint may need longer than EASE_S; after this the torque goes off all the same
+ARRIVED_RAD: Final = 1e-4
+FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
+SWITCH_S: Final = 0.0005  # Python's own 5 ms is half a tick
 
 T = TypeVar("T", float, Doubles)
 logger = logging.getLogger(__name__)
@@ -35,46 +35,96 @@ def smooth(u: T) -> T:
 
 
 def come_to_rest(
-    bus: Bus, limiter: Limiter, state: Any, from_rad: Doubles, rest_rad: Doubles, ticks: Iterable[Beat], log: RunLog
+    bus: Bus, limiter: Limiter, state: Any, from_rad: Doubles, rest_rad: Doubles, ticks: Iterable[TickTime], log: RunLog
 ) -> None:
-    """Ease every joint to its rest angle under the limits. A bus that fails on the way ends it early, with a line."""
+    """Ease every joint to its rest angle under the limits; blocks for up to EASE_S + SETTLE_S.
+
+    Takes as long in seconds however many ticks that is. A tick that raises (a bus that fails, a goal that is refused)
+    is said once and left out; after `FAILURES` in a row it gives up. Never raises an Exception.
+    """
     span = rest_rad - from_rad
-    period_s = log.period_s
-    try:
-        for count, beat in enumerate(ticks):
-            before, angle, ahead = (smooth((count + k) * period_s / EASE_S) for k in (-1, 0, 1))
-            speed, acceleration = (ahead - before) / (2 * period_s), (ahead - 2 * angle + before) / period_s**2
-            reference = np.stack([from_rad + angle * span, speed * span, acceleration * span])
+    began_s: float | None = None
+    failed = 0
+    for tick in ticks:
+        began_s = tick.time_s if began_s is None else began_s
+        since_s = tick.time_s - began_s
+        before, angle, ahead = (smooth((since_s + k * log.period_s) / EASE_S) for k in (-1, 0, 1))
+        speed, acceleration = (ahead - before) / (2 * log.period_s), (ahead - 2 * angle + before) / log.period_s**2
+        reference = np.stack([from_rad + angle * span, speed * span, acceleration * span])
+        arrived = False
+        try:
             goals_rad, state = limiter.step(reference, state)
-            bus.write(goals_rad, beat.time_s)
-            log.ease(beat, goals_rad, reference[0])
-            bus.poll(beat.time_s)
-            arrived = bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD))
-            if arrived and count * period_s >= EASE_S or count * period_s >= EASE_S + SETTLE_S:
-                return
-    except RobotError as error:
-        logger.error("could not ease to rest: %s", error)
+            log.ease(tick, goals_rad, reference[0])
+            bus.write(goals_rad, tick.time_s)
+            bus.poll(tick.time_s)
+            arrived, failed = bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD)), 0
+        except Exception as error:  # whatever it is, the other buses are still to be eased
+            failed += 1
+            logger.error("on the way to rest: %s", error)
+        if failed >= FAILURES or (arrived and since_s >= EASE_S) or since_s >= EASE_S + SETTLE_S:
+            return
 
 
-_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, kill, a terminal or connection that closes
+class Released(KeyboardInterrupt):
+    """Asked to end for the second time: torque is off."""
+
+
+class Interrupt:
+    """Somebody asks a run to end: once, and the head comes to rest; twice, and torque is off at once.
+
+    Before `arm` nothing moves, so the first request ends whatever goes on by KeyboardInterrupt.
+    """
+
+    def __init__(self) -> None:
+        self._asked = 0
+        self._bus: Bus | None = None
+
+    def arm(self, bus: Bus) -> None:
+        """Torque comes on from here on; `bus` is what a second request releases."""
+        self._bus = bus
+
+    def __call__(self) -> bool:
+        """Whether somebody asked."""
+        return self._asked > 0
+
+    def ask(self) -> None:
+        """A request from any thread: counts, and releases at the second. Raises nothing."""
+        self._asked += 1
+        if self._asked > 1 and self._bus is not None:
+            self._bus.torque_off("release")
+
+    def on_signal(self, number: int, frame: FrameType | None) -> None:
+        """A request from the main thread's signal handler. Ctrl-\\ asks for release at once, as a second Ctrl-C does.
+
+        Raises KeyboardInterrupt before torque, `Released` after the second request: what blocks then is cut short.
+        """
+        if number == getattr(signal, "SIGQUIT", None):
+            self._asked += 1
+        self.ask()
+        if self._bus is None:
+            raise KeyboardInterrupt
+        if self._asked > 1:
+            raise Released
+
+
+# Ctrl-C, kill, a terminal or connection that closes, Ctrl-\; the last two do not exist on Windows.
+_ENDINGS: Final = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name)
+]
 
 
 @contextmanager
-def interrupt_flag() -> Iterator[Callable[[], bool]]:
-    """SIGINT, SIGTERM and SIGHUP set a flag instead of raising, so that no write is cut in half. Restored on exit.
+def signals_to(interrupt: Interrupt) -> Iterator[None]:
+    """SIGINT, SIGTERM, SIGHUP and SIGQUIT ask `interrupt`, so that no write is cut in half. Restored on exit.
 
-    SIGHUP only where it is not ignored: under nohup a lost terminal ends nothing.
+    SIGHUP only where it is not ignored: under nohup a lost terminal ends nothing. Only in the main thread: Python
+    gives signals to no other.
     """
-    caught: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        caught.append(number)
-
-    nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    heeded = [each for each in _ENDINGS if each != signal.SIGHUP or not nohup]
-    previous = {number: signal.signal(number, note) for number in heeded}
+    hangup = getattr(signal, "SIGHUP", None)
+    heeded = [each for each in _ENDINGS if each != hangup or signal.getsignal(each) is not signal.SIG_IGN]
+    previous = {number: signal.signal(number, interrupt.on_signal) for number in heeded}
     try:
-        yield lambda: bool(caught)
+        yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -14,7 +14,7 @@ from typing import Final, Generic, Protocol, TypeVar
 
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.errors import BusError, PortError, RobotError
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Reading
 from sfms_robot.ports import StopPolicy, TickConversion
 from sfms_robot.servo.goals import Goals
 from sfms_robot.servo.policy import BusServo
@@ -144,13 +144,12 @@ class WireBus(ABC, Generic[L]):
             log.warning("bus %r: %s", self.name, error)
             return None
 
-    def _check(self, goals_rad: Doubles, enabled: bool) -> None:
-        """Raises ValueError before `enable`, for a goal that is not finite, or one out of range."""
+    def _check(self, enabled: bool) -> None:
+        """Raises BusError before `connect`, ValueError before `enable`."""
         if self._lost_s is None:
             self._connected()
         if not enabled:
             raise ValueError(f"bus {self.name!r}: no joint is enabled, goals are refused")
-        self._goals.check(goals_rad)
 
     def _lose(self, error: BusError, now_s: float) -> None:
         log.warning("bus %r: %s; trying to open it again", self.name, error)

@@ -1,7 +1,4 @@
-"""Which goals a bus may send: inside the limits of each joint, and whole ticks.
-
-A servo that stands outside the limits of its joint is held where it stands; it may come in, and never go further out.
-"""
+"""Which goals a bus may send: inside the range in force of each joint (`sfms_robot.ranges`), and whole ticks."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import TickConversion
+from sfms_robot.ranges import Range
 
 _SLACK_RAD: Final = 1e-9
 
@@ -43,43 +41,40 @@ class Goals:
         self._bus = bus
         self._servos = tuple(servos)
         self._conversion = conversion
-        self._lowest = np.array([servo.min_rad for servo in servos])
-        self._highest = np.array([servo.max_rad for servo in servos])
-        zero = conversion.to_rad(np.zeros(len(servos), np.int64))
-        self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - zero
-        self._rad_at_zero = zero
-        self._outside: set[int] = set()  # who was found outside its limits, and may still be on its way in
+        self._own = Range(np.array([servo.min_rad for servo in servos]), np.array([servo.max_rad for servo in servos]))
+        self._last_rad = self._own.low.copy()  # where each was found, or sent to last
+        self._rad_at_zero = conversion.to_rad(np.zeros(len(servos), np.int64))
+        self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - self._rad_at_zero
 
     def hold(self, index: int, angle_rad: float) -> bool:
-        """A servo has torque at this angle; whether that is inside the limits of its joint."""
-        servo = self._servos[index]
-        self._lowest[index] = min(servo.min_rad, angle_rad)
-        self._highest[index] = max(servo.max_rad, angle_rad)
-        inside = servo.min_rad <= angle_rad <= servo.max_rad
-        if not inside:
-            self._outside.add(index)
-        return inside
+        """A servo has torque at this angle, which its range now reaches; whether that is inside its own range."""
+        self._last_rad[index] = angle_rad
+        return bool(self._servos[index].min_rad <= angle_rad <= self._servos[index].max_rad)
 
-    def check(self, goals_rad: Doubles) -> None:
-        """Raises ValueError for goals of the wrong shape, not finite, or outside the limits."""
-        if goals_rad.shape != self._lowest.shape:
+    def allows(self, index: int, goal_rad: float) -> bool:
+        """Whether a goal lies in the range in force of a servo."""
+        return bool(self._own.reaching(self._last_rad).holds(np.asarray(goal_rad), _SLACK_RAD)[index])
+
+    def ticks(self, goals_rad: Doubles, sent: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Goals (J,) -> ticks (J,); those of the indices `sent` (n,) will be put on the wire, and are judged for it.
+
+        The range in force of a joint that is sent closes behind its goal; the others keep theirs. Raises ValueError,
+        with nothing changed, for another shape, a goal that is not finite, or one of `sent` outside the range in force.
+        """
+        if goals_rad.shape != self._last_rad.shape:
             raise ValueError(f"bus {self._bus!r} has {len(self._servos)} joints, got goals of shape {goals_rad.shape}")
-        inside = (goals_rad >= self._lowest - _SLACK_RAD) & (goals_rad <= self._highest + _SLACK_RAD)  # no NaN is
-        if not inside.all():
-            i = int(np.argmin(inside))
-            allowed = f"{self._lowest[i]:g}..{self._highest[i]:g} rad"
-            raise ValueError(f"goal of {self._servos[i].joint} = {goals_rad[i]:g} rad is not in {allowed}")
-
-    def ticks(self, goals_rad: Doubles) -> NDArray[np.int64]:
-        """Ticks (J,) to send; the way out closes behind a joint that comes in."""
+        finite = np.isfinite(goals_rad)
+        if not finite.all():
+            raise ValueError(f"goal of {self._servos[int(np.argmin(finite))].joint} is not finite")
+        in_force = self._own.reaching(self._last_rad)
+        refused = sent[~in_force.holds(goals_rad, _SLACK_RAD)[sent]]
+        if refused.size:
+            first = int(refused[0])
+            allowed = f"{in_force.low[first]:g}..{in_force.high[first]:g} rad"
+            raise ValueError(f"goal of {self._servos[first].joint} = {goals_rad[first]:g} rad is not in {allowed}")
         ticks = self._conversion.to_ticks(goals_rad)
-        for i in list(self._outside):
-            servo, goal = self._servos[i], goals_rad[i]
-            self._lowest[i] = min(servo.min_rad, goal)
-            self._highest[i] = max(servo.max_rad, goal)
-            if servo.min_rad <= goal <= servo.max_rad:
-                self._outside.discard(i)
-            else:
-                # On its way in from outside: the conversion would jump to the limit, so the tick is worked out here.
-                ticks[i] = round((goal - self._rad_at_zero[i]) / self.rad_per_tick[i])
+        # On the way in from outside: the conversion would jump to the limit, so the tick is worked out here.
+        for i in np.flatnonzero(~self._own.holds(goals_rad, _SLACK_RAD) & in_force.holds(goals_rad, _SLACK_RAD)):
+            ticks[i] = round((goals_rad[i] - self._rad_at_zero[i]) / self.rad_per_tick[i])
+        self._last_rad[sent] = in_force.nearest(goals_rad)[sent]
         return ticks

@@ -11,7 +11,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, signal, stats
+
+from sfms_robot.signals.peaks import band_pass, find_peaks, half_widths
 
 Event = tuple[float, float, float]
 Bools = NDArray[np.bool_]
@@ -31,8 +32,7 @@ def find_nods(pitch_rad: ArrayLike, rate_hz: float, least_rad: float = np.deg2ra
     pitch = np.asarray(pitch_rad, np.float64)
     if len(pitch) < int(rate_hz):
         return []
-    sos = signal.butter(2, (0.8, min(6.0, 0.45 * rate_hz)), "bandpass", fs=rate_hz, output="sos")
-    swing = signal.sosfiltfilt(sos, pitch)
+    swing = band_pass(pitch, 0.8, min(6.0, 0.45 * rate_hz), rate_hz)
     turns = _turns(swing, 0.35 * least_rad)
     found: list[Event] = []
     for a, b, c in zip(turns[:-2], turns[1:-1], turns[2:], strict=True):
@@ -53,8 +53,8 @@ def find_nods(pitch_rad: ArrayLike, rate_hz: float, least_rad: float = np.deg2ra
 
 def _turns(values: NDArray[np.float64], least: float) -> list[int]:
     """Alternating highs and lows that stand out by `least`, with both ends."""
-    highs, _ = signal.find_peaks(values, prominence=least)
-    lows, _ = signal.find_peaks(-values, prominence=least)
+    highs, _ = find_peaks(values, least)
+    lows, _ = find_peaks(-values, least)
     return sorted({0, len(values) - 1, *highs.tolist(), *lows.tolist()})
 
 
@@ -64,12 +64,14 @@ def find_blinks(blink: ArrayLike, rate_hz: float, least: float = 0.35) -> list[E
     Returns (start_s, end_s, height), counted against the closure around it, so lids that rest half closed are fine.
     """
     closed = np.asarray(blink, np.float64)
-    peaks, found = signal.find_peaks(np.r_[0.0, closed, 0.0], prominence=least, distance=max(1, int(0.12 * rate_hz)))
-    if not len(peaks):
-        return []
-    widths, _, left, right = signal.peak_widths(np.r_[0.0, closed, 0.0], peaks, rel_height=0.5)
-    rows = zip(left, right, found["prominences"], widths / rate_hz, strict=True)
-    return [((a - 1) / rate_hz, (b - 1) / rate_hz, float(height)) for a, b, height, wide in rows if wide <= 0.6]
+    framed = np.r_[0.0, closed, 0.0]
+    peaks, heights = find_peaks(framed, least, max(1, int(0.12 * rate_hz)))
+    rows = zip(*half_widths(framed, peaks, heights), heights, strict=True)
+    return [
+        (float(a - 1) / rate_hz, float(b - 1) / rate_hz, float(height))
+        for a, b, height in rows
+        if (b - a) / rate_hz <= 0.6
+    ]
 
 
 def find_smiles(smile: ArrayLike, rate_hz: float, least: float = 0.2) -> list[Event]:
@@ -92,6 +94,8 @@ def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.0
     The floor is the quietest twentieth of the 8 s around; the threshold lies 8 dB above it, but always 16 to 34 dB
     below the loud parts, so that neither hum, nor gain, nor talk without a pause confuses it. Offline: it looks ahead.
     """
+    from scipy import ndimage
+
     samples = np.asarray(audio, np.float64)
     size = int(round(rate_hz * frame_s))
     frames = len(samples) // size
@@ -207,6 +211,8 @@ def rank_auc(scores: ArrayLike, positive: ArrayLike, negative: ArrayLike) -> flo
 
     scores (N,); positive and negative are (N,) masks or indices.
     """
+    from scipy import stats
+
     values = np.asarray(scores, np.float64)
     high, low = values[np.asarray(positive)], values[np.asarray(negative)]
     if not len(high) or not len(low):
@@ -220,6 +226,8 @@ def find_gaze_shifts(yaw_rad: ArrayLike, pitch_rad: ArrayLike, rate_hz: float, l
 
     A jump is a change within 0.2 s from one quarter second of rest to the next; those closer than 0.3 s are one.
     """
+    from scipy import signal
+
     gaze = np.stack([np.asarray(yaw_rad, np.float64), np.asarray(pitch_rad, np.float64)], axis=1)
     rest, jump = max(1, round(0.24 * rate_hz)), max(1, round(0.2 * rate_hz))
     if len(gaze) < 2 * rest + jump:

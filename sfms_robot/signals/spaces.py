@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats, reorder
@@ -151,6 +150,8 @@ def encode(
         out[:, known.rotation] = angles_of(whole)
         out[:, known.rotation.start] %= 2 * np.pi  # about pi, not about -pi
     else:
+        from scipy.spatial.transform import Rotation
+
         out[:, known.rotation] = Rotation.from_matrix(whole).as_rotvec()
     scale = metres_per_unit if metres_per_unit is not None else known.metres_per_unit
     if known.translation is not None and scale is not None:
@@ -188,7 +189,12 @@ def _space(name: str) -> Space:
 
 def _rotations(space: Space, values: Doubles) -> Doubles:
     """(N, 3) as the space writes them -> (N, 3, 3)."""
-    return turned_by(values) if space.euler else Rotation.from_rotvec(values).as_matrix()
+    if space.euler:
+        return turned_by(values)
+    from scipy.spatial.transform import Rotation
+
+    turns: Doubles = Rotation.from_rotvec(values).as_matrix()
+    return turns
 
 
 def turned_by(angles_rad: Doubles) -> Doubles:

@@ -12,22 +12,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, SpeakerFrame
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.tracks import Track, read_track, resample
+from sfms_robot.sources.speakers import recorded_files
 
-DEFAULT_SPEAKER = "facegood_1114_3_16"
 _PAUSE_FRAMES = FRAME_HZ  # silence before a recording starts again
 _EPS_FRAMES = 1e-6
-_AUDIO_LATER = ("mic",)
-_FACE_LATER = ("live-link", "vmc", "webcam")
 
 
 class Recording:
@@ -120,29 +115,6 @@ class _Frames:
         return self._audio.read(FRAME_SAMPLES)
 
 
-@dataclass(frozen=True)
-class Speaker:
-    """A recorded person that ships with the package: `sim/speakers/NAME/`."""
-
-    name: str
-    audio: Path
-    face: Path | None
-
-
-def speakers() -> list[str]:
-    """Names of the shipped speakers."""
-    return shipped_names(data_dir("sim") / "speakers", "speech.wav")
-
-
-def shipped_speaker(name: str) -> Speaker:
-    """A shipped speaker by name. Raises ConfigError with the names there are."""
-    if name not in speakers():
-        raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speakers())})")
-    folder = data_dir("sim") / "speakers" / name
-    face = folder / "face.csv.gz"
-    return Speaker(name, folder / "speech.wav", face if face.is_file() else None)
-
-
 def open_recording(
     audio: str = "default",
     face: str = "auto",
@@ -152,58 +124,13 @@ def open_recording(
 ) -> Recording:
     """What `--audio FILE|SPEAKER|none|default`, `--face FILE|none|auto` and `--agent-audio FILE|none` ask for.
 
-    `default` is `DEFAULT_SPEAKER`, or no voice when a face file is given. A face `auto` is the shipped speaker's
-    own, or none beside somebody's sound file. Raises ConfigError for a kind of input that is not there and for files
-    that cannot be used.
+    See `recorded_files`. Raises ConfigError for files that cannot be used.
     """
-    if audio == "default":
-        audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
-    voice, own_face = _voice(audio)
-    seen = own_face if face == "auto" else _face(face)
-    said = _agent_voice(agent_audio)
+    files = recorded_files(audio, face, agent_audio)
     return Recording(
-        None if voice is None else AudioFile(voice),
-        None if seen is None else read_track(seen),
+        None if files.audio is None else AudioFile(files.audio),
+        None if files.face is None else read_track(files.face),
         duration_s,
         loop,
-        None if said is None else AudioFile(said),
+        None if files.agent_audio is None else AudioFile(files.agent_audio),
     )
-
-
-def _voice(name: str) -> tuple[Path | None, Path | None]:
-    """Sound file, and the face that belongs to it."""
-    choices = f"FILE.wav, none, default, {', '.join(speakers())}"
-    if name.partition(":")[0] in _AUDIO_LATER:
-        raise ConfigError(f"--audio {name}: not available yet ({choices})")
-    if name == "none":
-        return None, None
-    if name in speakers() and not Path(name).is_file():
-        speaker = shipped_speaker(name)
-        return speaker.audio, speaker.face
-    if not Path(name).exists():
-        raise ConfigError(f"--audio {name}: no such file ({choices})")
-    return Path(name), None
-
-
-def _agent_voice(name: str) -> Path | None:
-    choices = f"FILE.wav, none, {', '.join(speakers())}"
-    if name == "loopback":
-        raise ConfigError(f"--agent-audio {name}: not available yet ({choices})")
-    if name == "none":
-        return None
-    if name in speakers() and not Path(name).is_file():
-        return shipped_speaker(name).audio
-    if not Path(name).exists():
-        raise ConfigError(f"--agent-audio {name}: no such file ({choices})")
-    return Path(name)
-
-
-def _face(name: str) -> Path | None:
-    choices = "FILE.csv, FILE.csv.gz, none, auto"
-    if name.partition(":")[0] in _FACE_LATER:
-        raise ConfigError(f"--face {name}: not available yet ({choices})")
-    if name == "none":
-        return None
-    if not Path(name).exists():
-        raise ConfigError(f"--face {name}: no such file ({choices})")
-    return Path(name)

@@ -8,8 +8,8 @@ import soundfile
 import torch
 
 from sfms_robot import config
-from sfms_robot.app.listen.run import RunOptions, run_head
 from sfms_robot.app.replay import read_recording
+from sfms_robot.app.session import RunOptions, run
 from sfms_robot.cli.main import main
 from sfms_robot.config.arig import STATES
 from sfms_robot.data import data_dir
@@ -48,27 +48,27 @@ def voice(file, seconds: float):
     return str(file)
 
 
-def run(listener, **options):
-    return run_head(dataclasses.replace(RunOptions(listener=str(listener), fast=True, seed=3), **options))
+def listened(listener, **options):
+    return run(dataclasses.replace(RunOptions(listener=str(listener), fast=True, seed=3), **options))
 
 
 def test_a_voice_shorter_than_the_run_ends_and_the_head_goes_on(seeded, tmp_path):
     said = voice(tmp_path / "said.wav", 1.0)
-    done = run(seeded, agent_audio=said, duration_s=3.0)
+    done = listened(seeded, agent_audio=said, duration_s=3.0)
     assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 75, 0)
-    mute = run(seeded, duration_s=3.0)
+    mute = listened(seeded, duration_s=3.0)
     assert done["wire"]["main"]["sha256"] != mute["wire"]["main"]["sha256"]
-    assert done == run(seeded, agent_audio=said, duration_s=3.0)
+    assert done == listened(seeded, agent_audio=said, duration_s=3.0)
 
 
 def test_a_robot_that_only_speaks_needs_nobody_to_hear(seeded, tmp_path):
-    done = run(seeded, audio="none", face="none", agent_audio=voice(tmp_path / "said.wav", 2.0))
+    done = listened(seeded, audio="none", face="none", agent_audio=voice(tmp_path / "said.wav", 2.0))
     assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 50, 0)
 
 
 @trained
 def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_path):
-    run(SHIPPED, agent_audio=voice(tmp_path / "said.wav", 4.0), duration_s=9.0, record=tmp_path / "run")
+    listened(SHIPPED, agent_audio=voice(tmp_path / "said.wav", 4.0), duration_s=9.0, record=tmp_path / "run")
     shown = read_recording(tmp_path / "run")
     jaw, at_s = shown.motion[:, JAW], shown.times_s
     talking, after = jaw[(at_s > 0.5) & (at_s < 4.0)], jaw[at_s > 5.5]

@@ -7,7 +7,8 @@ import pytest
 
 from sfms_robot.app.bench.campaign import FAMILIES, SPECS, Judge, Outcome, Rig, head_of, one, run_campaign, table
 from sfms_robot.app.bench.fuzz import BYTES, fuzz_one
-from sfms_robot.app.session import build_bus, emulated
+from sfms_robot.app.session import build_bus
+from sfms_robot.app.wiring import emulated
 from sfms_robot.emulator.faults import KINDS
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError

@@ -7,7 +7,7 @@ import dataset_writers as write
 import numpy as np
 import pytest
 
-from sfms_robot.app.train.data_check import check_data
+from sfms_robot.app.train.datasets import check_data
 from sfms_robot.cli.main import main
 from sfms_robot.corpora.formats import open_dataset, with_feature
 from sfms_robot.errors import ConfigError

@@ -2,7 +2,7 @@ import shutil
 
 import pytest
 
-from sfms_robot.app.servo.emulate import EmulateOptions, emulators, parse_servos
+from sfms_robot.app.servo.emulated_chains import EmulateOptions, emulators, parse_servos
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.app.listen.run import RunOptions, run_head
+from sfms_robot.app.session import RunOptions, run
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 
@@ -12,7 +12,7 @@ HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
 @pytest.mark.parametrize("name", HEADS)
 def test_it_listens_for_three_seconds_without_a_violation(name):
     head = load_head(name)
-    report = run_head(RunOptions(head=name, duration_s=3.0, fast=True))
+    report = run(RunOptions(head=name, duration_s=3.0, fast=True))
     assert (report["exit"], report["head"], report["frames"]) == ("done", name, 75)
     assert report["limits"]["violations"] == 0
     assert (report["bus"]["errors"], report["bus"]["silent"], report["bus"]["faults"]) == (0, [], [])

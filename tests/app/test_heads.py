@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import FAMILIES, build_bus, emulated, plugged_in
+from sfms_robot.app.session import FAMILIES, build_bus
+from sfms_robot.app.wiring import emulated, plugged_in
 from sfms_robot.config import Faults, Head, Safety, load_head, parse
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError

@@ -5,8 +5,8 @@ import pytest
 
 from sfms_robot.app.bench.lead import Nobody, Waves
 from sfms_robot.app.listen.knobs import turned
-from sfms_robot.app.listen.run import RunOptions, run_head
-from sfms_robot.app.session import build_bus, build_motion, emulated
+from sfms_robot.app.session import RunOptions, build_bus, build_motion, run
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
@@ -50,8 +50,8 @@ def test_a_knob_that_is_none_is_refused_in_one_line(given, said):
 
 
 def test_a_run_with_the_neck_turned_off_keeps_it_at_rest():
-    still = run_head(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=0",)))
-    loud = run_head(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=2",)))
+    still = run(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=0",)))
+    loud = run(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=2",)))
     assert sum(joint["travel_rad"] for joint in still["joints"].values()) < sum(
         joint["travel_rad"] for joint in loud["joints"].values()
     )

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from sfms_robot.app.head.head_check import check
 from sfms_robot.app.listen.limitation import limitation
-from sfms_robot.app.listen.run import RunOptions, run_head
+from sfms_robot.app.session import RunOptions, run
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.sfms.model import SfmsModel
@@ -55,10 +55,10 @@ def test_with_a_matrix_beside_it_nothing_is_missing(deca):
 def test_a_matrix_that_is_not_there_is_told_before_anything_moves(deca):
     (deca / "config.yaml").write_text(yaml.safe_dump(TINY | {"flame_matrix": "gone.npy"}))
     with pytest.raises(ConfigError, match=r"gone\.npy"):
-        run_head(RunOptions(listener=str(deca), duration_s=0.4, fast=True))
+        run(RunOptions(listener=str(deca), duration_s=0.4, fast=True))
 
 
 def test_a_run_logs_it_and_reports_it(deca, caplog):
-    report = run_head(RunOptions(head="op3_head", listener=str(deca), duration_s=0.4, fast=True))
+    report = run(RunOptions(head="op3_head", listener=str(deca), duration_s=0.4, fast=True))
     assert "pose and jaw only" in report["limitation"] and "pose and jaw only" in caplog.text
     assert json.dumps(report)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.head.pose import EXPRESSIONS, RISE_S, Held, PoseOptions, parse_face, pose_head
+from sfms_robot.app.head.pose import EXPRESSIONS, RISE_S, HeldFace, PoseOptions, parse_face, pose_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX
@@ -48,7 +48,7 @@ def test_what_is_no_face_is_refused(word, message):
 
 
 def test_the_face_rises_stays_and_falls():
-    held = Held(parse_face(["jawOpen=0.8"]), hold_s=1.0)
+    held = HeldFace(parse_face(["jawOpen=0.8"]), hold_s=1.0)
     times = np.array([0.0, EASE_S, EASE_S + RISE_S, EASE_S + RISE_S + 1.0, held.duration_s])
     jaw = held.sample(times, 0.0, None)[0][:, CHANNEL_INDEX["jawOpen"]]
     assert jaw.tolist() == pytest.approx([0, 0, 0.8, 0.8, 0], abs=1e-6)
@@ -74,5 +74,5 @@ def test_virtual_time_on_real_servos_is_refused():
 
 
 def test_hobby_servos_move_only_when_somebody_said_yes():
-    with pytest.raises(ConfigError, match="hobby servos jump to rest when they come on .*--yes"):
+    with pytest.raises(ConfigError, match="hobby servos report no position, and each jumps to rest .*--yes"):
         pose_head(PoseOptions("inmoov2_maestro", ("blink",), port="/dev/null"))

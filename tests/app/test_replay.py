@@ -1,9 +1,14 @@
+import base64
+import json
+import tracemalloc
+
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from sfms_robot.app.replay import plot, read_recording, sheet, summary
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FaceFrame, Plan, Reading, SpeakerFrame
+from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
 
@@ -41,6 +46,35 @@ def test_what_was_recorded_is_read_back(tmp_path):
     assert np.isnan(run.speaker[1::2]).all() and (run.speaker[::2] == 0.25).all()
 
 
+def test_reading_holds_numbers_and_no_messages(tmp_path):
+    """Every message of the file is in the arrays; on the way nothing is kept that is much larger than they are."""
+    file = record(tmp_path, 20.0) / RUN_FILE
+    bodies: dict[str, list] = {"/speaker": [], "/plan": [], "/face": [], "/joints": []}
+    with file.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            bodies[channel.topic].append(json.loads(message.data))
+    tracemalloc.start()
+    run = read_recording(tmp_path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    kept = sum(value.nbytes for value in vars(run).values() if isinstance(value, np.ndarray))
+    assert peak < 6 * kept, f"{peak / 2000:.0f} bytes a tick"
+
+    moved = bodies["/joints"]
+    assert run.times_s.tolist() == [body["time_s"] for body in moved]
+    for key, values in (("goal_rad", run.goals_rad), ("present_rad", run.present_rad)):
+        told = np.array([[body["joints"][name][key] for name in JOINTS] for body in moved], dtype=np.float32)
+        np.testing.assert_array_equal(values, told)
+    named = [[body["joints"][name]["fault"] is not None for name in JOINTS] for body in moved]
+    assert run.faults.tolist() == named
+    faces = np.array([[body[name] for name in CHANNELS] for body in bodies["/face"]], dtype=np.float32)
+    np.testing.assert_array_equal(run.motion, faces)
+    assert run.energy_db.tolist() == [body["energy_db"] for body in bodies["/speaker"]]
+    pcm = b"".join(base64.b64decode(body["audio_pcm16"]) for body in bodies["/speaker"])
+    np.testing.assert_array_equal(run.audio, np.frombuffer(pcm, "<i2") / np.float32(32767))
+    assert run.plans == len(bodies["/plan"])
+
+
 def test_phrases_are_where_the_speaker_talks(tmp_path):
     run = read_recording(record(tmp_path))
     assert run.talks_at(np.array([0.02, 0.5, 0.98, 1.06, 1.9])).tolist() == [True, True, True, False, False]
@@ -49,7 +83,9 @@ def test_phrases_are_where_the_speaker_talks(tmp_path):
 
 
 def test_a_summary_counts(tmp_path):
-    assert summary(read_recording(record(tmp_path))) == {
+    counted = summary(read_recording(record(tmp_path)))
+    assert counted.pop("started_utc").startswith("20")
+    assert counted == {
         "head": "face28", "seed": "3", "duration_s": 1.99, "ticks": 200, "speaker_frames": 50, "plans": 50,
         "joints": 3, "faults": 1, "whole": True,
     }  # fmt: skip

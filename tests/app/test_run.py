@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from sfms_robot.app.listen.run import RunOptions, run_head
 from sfms_robot.app.replay import read_recording
+from sfms_robot.app.session import RunOptions, run
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError, PortError
 
@@ -16,7 +16,7 @@ SHORT = RunOptions(duration_s=3.0, fast=True, seed=3)
 
 @pytest.fixture(scope="module")
 def report():
-    return run_head(SHORT)
+    return run(SHORT)
 
 
 def test_the_report_has_what_it_promises(report):
@@ -41,8 +41,8 @@ def test_in_virtual_time_wall_clock_figures_are_null(report):
 
 
 def test_one_seed_is_one_command_stream_and_another_seed_another(report):
-    assert run_head(SHORT) == report
-    other = run_head(dataclasses.replace(SHORT, seed=4))
+    assert run(SHORT) == report
+    other = run(dataclasses.replace(SHORT, seed=4))
     assert other["wire"]["main"]["sha256"] != report["wire"]["main"]["sha256"]
 
 
@@ -52,7 +52,7 @@ def test_a_missing_modality_is_normal(audio, face, tmp_path):
         from sfms_robot.data import data_dir
 
         face = str(data_dir("sim") / "speakers" / "facegood_1114_3_16" / face)
-    done = run_head(dataclasses.replace(SHORT, audio=audio, face=face))
+    done = run(dataclasses.replace(SHORT, audio=audio, face=face))
     assert done["exit"] == "done" and done["limits"]["violations"] == 0
     assert sum(joint["travel_rad"] for joint in done["joints"].values()) > 0.1
 
@@ -60,11 +60,11 @@ def test_a_missing_modality_is_normal(audio, face, tmp_path):
 def test_a_stereo_file_of_another_rate_is_taken(tmp_path):
     voice = np.random.default_rng(0).normal(0, 0.1, (44_100, 2))
     soundfile.write(tmp_path / "voice.wav", voice, 44_100)
-    assert run_head(dataclasses.replace(SHORT, audio=str(tmp_path / "voice.wav")))["frames"] == 75
+    assert run(dataclasses.replace(SHORT, audio=str(tmp_path / "voice.wav")))["frames"] == 75
 
 
 def test_a_run_is_recorded_whole(tmp_path):
-    done = run_head(dataclasses.replace(SHORT, record=tmp_path / "run"))
+    done = run(dataclasses.replace(SHORT, record=tmp_path / "run"))
     recording = read_recording(tmp_path / "run")
     assert recording.whole and recording.joints == tuple(load_head("face28").joints)
     assert len(recording.times_s) == 301
@@ -73,16 +73,16 @@ def test_a_run_is_recorded_whole(tmp_path):
 
 
 def test_a_dry_run_reads_every_joint_and_moves_none():
-    seen = run_head(dataclasses.replace(SHORT, dry_run=True))
+    seen = run(dataclasses.replace(SHORT, dry_run=True))
     assert all(reading["position_rad"] is not None for reading in seen["readings"].values())
     assert "joints" not in seen
 
 
 def test_virtual_time_needs_an_end_and_emulated_servos():
     with pytest.raises(ConfigError, match="never ends"):
-        run_head(dataclasses.replace(SHORT, audio="none", duration_s=None))
+        run(dataclasses.replace(SHORT, audio="none", duration_s=None))
     with pytest.raises(ConfigError, match="emulated servos"):
-        run_head(dataclasses.replace(SHORT, port="/dev/ttyUSB0"))
+        run(dataclasses.replace(SHORT, port="/dev/ttyUSB0"))
 
 
 def test_hobby_servos_on_a_real_port_move_only_when_that_is_confirmed():
@@ -90,21 +90,21 @@ def test_hobby_servos_on_a_real_port_move_only_when_that_is_confirmed():
     with pytest.raises(
         ConfigError, match=r"'inmoov2_ssc32': hobby servos .* jumps .*\(rothead, .* confirm it with --yes"
     ):
-        run_head(options)
+        run(options)
     with pytest.raises(PortError, match="does-not-exist"):
-        run_head(dataclasses.replace(options, yes=True))
+        run(dataclasses.replace(options, yes=True))
 
 
 def test_an_emulated_head_has_the_supply_of_the_real_one():
-    seen = run_head(RunOptions(head="reachy_mini", duration_s=1.0, fast=True, dry_run=True))
+    seen = run(RunOptions(head="reachy_mini", duration_s=1.0, fast=True, dry_run=True))
     assert all(reading["fault"] is None for reading in seen["readings"].values())  # alert and all: the head allows it
-    done = run_head(RunOptions(head="reachy_mini", duration_s=1.0, fast=True))
+    done = run(RunOptions(head="reachy_mini", duration_s=1.0, fast=True))
     assert (done["exit"], done["bus"]["faults"], done["limits"]["violations"]) == ("done", [], 0)
 
 
 @pytest.mark.slow
 def test_in_real_time_every_figure_is_measured():
-    done = run_head(RunOptions(duration_s=4.0))
+    done = run(RunOptions(duration_s=4.0))
     assert done["exit"] == "done" and done["limits"]["violations"] == 0
     assert done["tick"]["achieved_hz"] > 0 and done["tick"]["jitter_ms"]["max"] >= 0
     assert done["latency_ms"]["frame_to_wire"]["p50"] > 0

@@ -9,7 +9,7 @@ import math
 
 import pytest
 
-from sfms_robot.app.servo.emulate import EmulateOptions, emulators
+from sfms_robot.app.servo.emulated_chains import EmulateOptions, emulators
 
 controller = pytest.importorskip("reachy_mini_motor_controller")
 

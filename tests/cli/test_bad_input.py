@@ -96,9 +96,9 @@ def test_a_face_track_without_a_known_column(fails, tmp_path):
 
 def test_an_unknown_head_and_an_unknown_listener(fails):
     code, told = fails("run", "--head", "face99")
-    assert code == 2 and "--head 'face99'" in told and "face28" in told
+    assert code == 2 and "head 'face99'" in told and "face28" in told
     code, told = fails("run", "--listener", "psychic")
-    assert code == 2 and "--listener 'psychic'" in told and "sfms-small" in told
+    assert code == 2 and "listener 'psychic'" in told and "sfms-small" in told
 
 
 def test_a_joint_given_twice(fails, tmp_path):

@@ -57,7 +57,7 @@ def test_a_table_trains_what_is_missing_keeps_it_and_scores_any_folder(
 
 def test_an_unknown_table_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert command(*TABLE, "5") == 2
-    assert "--table '5' is not one of 3, 4, bits, adaptive, all" in capsys.readouterr().err
+    assert "--table '5' is not one of 3, 4, all" in capsys.readouterr().err
 
 
 def test_training_needs_a_folder_of_ones_own(capsys: pytest.CaptureFixture[str]) -> None:

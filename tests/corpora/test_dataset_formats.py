@@ -16,8 +16,8 @@ from sfms_robot.corpora.collection import ClipError
 from sfms_robot.corpora.external import l2l, react
 from sfms_robot.corpora.formats import LAYOUTS, detect, looks_like, open_dataset, open_for, split_names
 from sfms_robot.errors import ConfigError
-from sfms_robot.learning.sfms.corpus import gather
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.learning.sfms.features import gather
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.l2l import l2l_bilateral
 from sfms_robot.signals.spaces import rest_of
@@ -194,8 +194,8 @@ def test_a_listener_is_given_the_features_that_its_data_ship(tmp_path):
     write.react2025(tmp_path)
     shipped, *_ = open_for("arkit58", tmp_path, "train", features=["wav2vec2"])
     assert shipped.space == "arkit58" and shipped.features["wav2vec2"].shape == (len(shipped.listener), 768)
-    hearing = Hearing("wav2vec2")
-    sound = gather([shipped], 48, MotionSpace("arkit58", rest_of("arkit58")), hearing).sound
+    frontend = AudioFrontend("wav2vec2")
+    sound = gather([shipped], 48, MotionSpace("arkit58", rest_of("arkit58")), frontend).frames.sound
     np.testing.assert_allclose(sound[:, 0], shipped.features["wav2vec2"], rtol=1e-3, atol=1e-4)
     assert not open_for("arkit58", tmp_path, "train", features=["mel"])[0].features
 
@@ -325,8 +325,8 @@ def test_a_data_set_becomes_a_corpus_in_its_own_space(name, tmp_path):
     WRITERS[name](tmp_path)
     dataset = open_dataset(tmp_path, "val" if name == "react" else "train")
     corpus = gather(dataset, 60, MotionSpace(dataset.space, rest_of(dataset.space)))
-    assert corpus.motion.shape == (sum(dataset.lengths), WIDTHS[dataset.space])
-    assert corpus.lengths == dataset.lengths and bool(corpus.face_known.all())
+    assert corpus.frames.motion.shape == (sum(dataset.lengths), WIDTHS[dataset.space])
+    assert corpus.lengths == dataset.lengths and bool(corpus.frames.face_known.all())
 
 
 def test_a_corpus_leaves_out_what_cannot_be_used_and_says_so(tmp_path, caplog):

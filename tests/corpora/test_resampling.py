@@ -8,8 +8,8 @@ from sfms_robot.corpora.clips import Dyad, at_rate, samples_of
 from sfms_robot.corpora.resampling import at_frame_rate
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
-from sfms_robot.learning.sfms.corpus import gather
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.learning.sfms.features import gather
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import phase
 from sfms_robot.signals.spaces import rest_of
@@ -71,10 +71,10 @@ def test_what_cannot_be_resampled_is_said():
 
 @pytest.mark.parametrize("audio", ["mel", "mfcc78"])
 def test_a_corpus_at_30_fps_hears_in_real_time(audio):
-    space, hearing = MotionSpace("arkit58", rest_of("arkit58")), Hearing(audio, phased=True)
+    space, frontend = MotionSpace("arkit58", rest_of("arkit58")), AudioFrontend(audio, phased=True)
     one = dyad(121, 30.0)  # 4.03 s: no whole number of our frames
-    corpus = gather([one], 48, space, hearing)
-    assert corpus.sound.shape == (121, *hearing.shape) and corpus.heard.all() and len(corpus.phase) == 121
+    corpus = gather([one], 48, space, frontend).frames
+    assert corpus.sound.shape == (121, *frontend.shape) and corpus.heard.all() and len(corpus.phase) == 121
     ours = phase.of_audio(np.pad(one.audio, (0, -len(one.audio) % FRAME_SAMPLES)))
     for frame in range(1, 121):
         complete = int((frame + 1) / 30 * FRAME_HZ + 1e-6)
@@ -83,7 +83,7 @@ def test_a_corpus_at_30_fps_hears_in_real_time(audio):
 
 def test_phrases_of_mel_at_30_fps_last_as_long_as_they_do():
     space = MotionSpace("deca56", rest_of("deca56"))
-    place = gather([dyad(240, 30.0, "deca56", mel=True)], 48, space, Hearing("mel", phased=True)).phase
-    slow = gather([dyad(200, 25.0, "deca56", mel=True)], 48, space, Hearing("mel", phased=True)).phase
+    place = gather([dyad(240, 30.0, "deca56", mel=True)], 48, space, AudioFrontend("mel", phased=True)).frames.phase
+    slow = gather([dyad(200, 25.0, "deca56", mel=True)], 48, space, AudioFrontend("mel", phased=True)).frames.phase
     for second in range(1, 8):
         assert torch.equal(place[30 * second - 1], slow[25 * second - 1])

@@ -11,7 +11,7 @@ from tiny_arig_training import dyad, settings, write
 
 from sfms_robot.cli.main import main
 from sfms_robot.corpora import clips
-from sfms_robot.evaluation.paper.arig import PAPER_1, PAPER_2, PAPER_4
+from sfms_robot.evaluation.paper.arig_tables import PAPER_1, PAPER_2, PAPER_4
 from sfms_robot.learning.arig.trainer import train_arig
 
 

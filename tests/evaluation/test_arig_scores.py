@@ -6,8 +6,8 @@ from tiny_arig_training import HZ, dyad, settings
 
 from sfms_robot.corpora.states import STATE
 from sfms_robot.evaluation import interaction as scores
-from sfms_robot.evaluation.paper import arig as tables
-from sfms_robot.evaluation.stage import Played, play, speaker_frames
+from sfms_robot.evaluation.paper import arig_tables as tables
+from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import ArigListener
@@ -58,26 +58,28 @@ def test_a_listener_hears_the_user_one_frame_late_and_itself_at_once():
 def test_the_lag_of_a_jaw_is_found(lag):
     values = talk(600)
     recorded, late = values[20:-20], values[20 - lag : len(values) - 20 - lag]
-    found = scores.lips([jaw(0.5 * late)], [jaw(recorded)])
+    found = scores.jaw_tracking([jaw(0.5 * late)], [jaw(recorded)])
     assert found.lag_frames == lag and found.best == pytest.approx(1, abs=1e-5)
     assert found.correlation == pytest.approx(1, abs=1e-5) if lag == 0 else found.correlation < 0.9
     assert found.spread == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_still_jaw_follows_nothing():
-    found = scores.lips([jaw(np.zeros(100))], [jaw(talk(100))])
+    found = scores.jaw_tracking([jaw(np.zeros(100))], [jaw(talk(100))])
     assert found.correlation == 0 and found.spread == 0
 
 
 def test_a_clip_too_short_to_be_shifted_does_not_count():
     first, short = talk(100), talk(20)
-    assert scores.lips([jaw(first), jaw(-short)], [jaw(first), jaw(short)]) == scores.lips([jaw(first)], [jaw(first)])
-    assert scores.lips([jaw(short)], [jaw(short)]).correlation == 0
+    assert scores.jaw_tracking([jaw(first), jaw(-short)], [jaw(first), jaw(short)]) == scores.jaw_tracking(
+        [jaw(first)], [jaw(first)]
+    )
+    assert scores.jaw_tracking([jaw(short)], [jaw(short)]).correlation == 0
 
 
 def test_clips_are_each_taken_less_their_own_mean():
     first, second = talk(200), talk(200, seed=1)
-    found = scores.lips([jaw(first), jaw(second + 5)], [jaw(first), jaw(second)])
+    found = scores.jaw_tracking([jaw(first), jaw(second + 5)], [jaw(first), jaw(second)])
     assert found.correlation == pytest.approx(1, abs=1e-4)
 
 
@@ -103,11 +105,10 @@ def test_jumps_at_borders_are_seen_and_jumps_elsewhere_are_not():
 
 def test_a_jaw_that_stays_open_after_speech_is_seen():
     one = dyad("a", "speaking", 0)
-    played = Played(one.listener, one.states)
-    assert np.isnan(scores.listening_again([played], [one]))  # it never stays silent for more than a second
+    assert np.isnan(scores.listening_again([one.listener], [one]))  # it never stays silent for more than a second
     silent = dyad("b", "listening", 1)
-    still = Played(jaw(np.full(300, 0.2)), silent.states)
-    assert scores.listening_again([played, still], [one, silent]) == pytest.approx(0.5, abs=0.05)
+    still = jaw(np.full(300, 0.2))
+    assert scores.listening_again([one.listener, still], [one, silent]) == pytest.approx(0.5, abs=0.05)
 
 
 # --- played ---------------------------------------------------------------------------------------------------------
@@ -115,7 +116,7 @@ def test_a_jaw_that_stays_open_after_speech_is_seen():
 
 def test_the_agents_sound_comes_one_frame_early():
     one = dyad("a", "interaction", 0)
-    frames = speaker_frames(one)
+    frames = frames_of_dyad(one)
     for index in (0, 30, len(frames) - 2):
         said = one.agent_audio[(index + 1) * FRAME_SAMPLES : (index + 2) * FRAME_SAMPLES]
         assert np.array_equal(frames[index].agent_audio, said)
@@ -126,9 +127,9 @@ def test_the_agents_sound_comes_one_frame_early():
 def test_what_is_played_has_a_frame_and_a_state_for_every_frame():
     listener = settings().listener
     one = dyad("a", "interaction", 0)
-    played = play(ArigListener(listener, ArigModel(listener)), one, seed=1)
-    assert played.motion.shape == one.listener.shape and np.isfinite(played.motion).all()
-    assert played.states[0] == -1 and (played.states[1:] >= 0).all()
+    played = rollout(ArigListener(listener, ArigModel(listener)), frames_of_dyad(one), [1])
+    assert played.motion[0].shape == one.listener.shape and np.isfinite(played.motion).all()
+    assert played.states[0, 0] == -1 and (played.states[0, 1:] >= 0).all()
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------

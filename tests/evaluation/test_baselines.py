@@ -4,8 +4,6 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sfms_robot import config
 from sfms_robot.config import parse
@@ -32,22 +30,18 @@ def motion(windows: int = 6) -> torch.Tensor:
     return torch.randn(windows, WINDOW, CHANNELS, generator=torch.Generator().manual_seed(3))
 
 
-@given(at_once=st.integers(1, 4))
-@settings(max_examples=4, deadline=None)
-def test_a_dense_window_has_a_code_for_every_frame_and_pays_for_each(at_once: int) -> None:
-    tokenizer = dense(codes_at_once=at_once)
+def test_a_dense_window_has_a_code_for_every_frame_and_pays_for_each() -> None:
+    tokenizer = dense()
     indices = tokenizer.encode(motion())
-    assert indices.shape == (6, WINDOW, at_once)
+    assert indices.shape == (6, WINDOW, 1)
     assert 0 <= int(indices.min()) and int(indices.max()) < 1000
-    assert tokenizer.bits_per_window == pytest.approx(WINDOW * at_once * math.log2(1000))
+    assert tokenizer.bits_per_window == pytest.approx(WINDOW * math.log2(1000))
 
 
-@given(at_once=st.integers(1, 4))
-@settings(max_examples=4, deadline=None)
-def test_a_grouped_window_has_a_code_for_every_eight_frames(at_once: int) -> None:
-    tokenizer = grouped(codes_at_once=at_once)
-    assert tokenizer.encode(motion()).shape == (6, WINDOW // 8, at_once)
-    assert tokenizer.bits_per_window == pytest.approx(WINDOW / 8 * at_once * 5)
+def test_a_grouped_window_has_a_code_for_every_eight_frames() -> None:
+    tokenizer = grouped()
+    assert tokenizer.encode(motion()).shape == (6, WINDOW // 8, 1)
+    assert tokenizer.bits_per_window == pytest.approx(WINDOW / 8 * 5)
 
 
 @pytest.mark.parametrize("make", [dense, grouped])

@@ -9,10 +9,10 @@ import torch
 from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.errors import ConfigError
+from sfms_robot.evaluation.rollout import frames_of_dyad
 from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.learning.rollout import speaker_frames
-from sfms_robot.learning.sfms.corpus import Corpus, context, fit_hearing, gather
-from sfms_robot.learning.sfms.predictor_training import augment, keyframe_scores
+from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
+from sfms_robot.learning.sfms.predictor_trainer import augment, keyframe_scores
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 
@@ -44,8 +44,8 @@ def dyad(frames: int = 60) -> Dyad:
     return Dyad("a", audio, speaker, motion, np.ones(frames, bool))
 
 
-def corpus_of(one: SfmsListener, *dyads: Dyad) -> Corpus:
-    return gather(dyads, 48, one.space, one.hearing)
+def corpus_of(one: SfmsListener, *dyads: Dyad) -> SfmsCorpus:
+    return gather(dyads, 48, one.space, one.frontend)
 
 
 @pytest.mark.parametrize("changes", [{}, {"phase": False}, {"audio": "mfcc78"}])
@@ -53,9 +53,9 @@ def corpus_of(one: SfmsListener, *dyads: Dyad) -> Corpus:
 def test_the_context_of_a_window_is_what_a_stream_remembers_there(changes, start):
     one = listener(**changes)
     corpus = corpus_of(one, dyad(60), dyad(60))
-    fit_hearing(one.model, corpus)
+    fit_sound_scales(one.model, corpus)
     memory = one.start(1)
-    for frame in speaker_frames(dyad(60))[: start + 40]:
+    for frame in frames_of_dyad(dyad(60))[: start + 40]:
         _, memory = one.step(frame, memory)
     tokens = torch.zeros(120, 2).long()
     for at in (start, 60 + start):  # the second dyad does not hear the first
@@ -118,9 +118,9 @@ def test_wav2vec2_that_ships_with_the_data_needs_no_model_to_train_and_one_to_st
     one = listener(audio="wav2vec2")
     shipped = np.random.default_rng(0).normal(size=(60, 768)).astype(np.float32)
     corpus = corpus_of(one, replace(dyad(), features={"wav2vec2": shipped}))
-    assert corpus.sound.shape == (60, 1, 768) and corpus.heard.all()
-    np.testing.assert_allclose(corpus.sound[:, 0], shipped, atol=2e-3)
-    for use in (lambda: corpus_of(one, dyad()), lambda: one.step(speaker_frames(dyad())[0], one.start(1))):
+    assert corpus.frames.sound.shape == (60, 1, 768) and corpus.frames.heard.all()
+    np.testing.assert_allclose(corpus.frames.sound[:, 0], shipped, atol=2e-3)
+    for use in (lambda: corpus_of(one, dyad()), lambda: one.step(frames_of_dyad(dyad())[0], one.start(1))):
         with pytest.raises(ConfigError, match="audio: wav2vec2 needs its model's folder"):
             use()
 

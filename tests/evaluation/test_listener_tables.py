@@ -9,11 +9,10 @@ from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Clip, Dataset
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.paper.answers import collect, shared_space, spread
-from sfms_robot.evaluation.paper.listeners import TABLE_1, TABLE_2, Clips, cut, table
+from sfms_robot.evaluation.paper.listener_clips import collect, shared_space, spread
+from sfms_robot.evaluation.paper.listener_tables import TABLE_1, TABLE_2, Clips, cut, table
+from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
-from sfms_robot.learning.answers import answers, heard_by
-from sfms_robot.learning.rollout import roll_out, speaker_frames
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 
@@ -50,10 +49,10 @@ def dyad(name: str, frames: int = 70, seed: int = 0, space: str = "arkit58") -> 
 
 
 @pytest.mark.parametrize("changes", [{}, {"hop": 1}, {"phase": False, "sequential": False}, {"audio": "mfcc78"}])
-def test_answers_from_arrays_are_those_of_a_stream(changes):
+def test_a_rollout_from_arrays_is_that_of_a_stream(changes):
     model, one = listener(**changes), dyad("a", 45)
-    streamed = roll_out(model, speaker_frames(one), seed=4)
-    whole = answers(model, heard_by(model, one), [3, 4]).motion
+    streamed = rollout(model, frames_of_dyad(one), [4]).motion[0]
+    whole = offline_rollout(model, one, [3, 4]).motion
     shown = model.space.decode(whole[1].numpy())[0]
     np.testing.assert_allclose(shown[1:], streamed[1:], atol=2e-3)  # sound is kept in half precision
 

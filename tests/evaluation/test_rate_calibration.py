@@ -4,8 +4,8 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
+from sfms_robot.evaluation.sampling_calibration import nodding, nods_per_minute, placing
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.learning.calibrate import nodding, nods_per_minute, placing
 from sfms_robot.listeners.sfms.model import SfmsModel
 
 

@@ -1,6 +1,5 @@
 """Tables of tokenizers: takes, folders, scores, rows, what they need and what they say."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,14 @@ from sfms_robot.corpora import takes
 from sfms_robot.corpora.takes import Take
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, ModelError
-from sfms_robot.evaluation.paper import bits, history, model, rows, tables
-from sfms_robot.evaluation.paper.model import TableModel
+from sfms_robot.evaluation.paper import compared_tokenizer, score_history, tokenizer_tables
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.evaluation.paper.recipes import recipes
-from sfms_robot.evaluation.paper.score import Score, Windows, score
-from sfms_robot.evaluation.paper.train import amplified, first_frames, train
+from sfms_robot.evaluation.paper.restoration import Score, Windows, score
+from sfms_robot.evaluation.paper.table_trainer import train
+from sfms_robot.learning.corpus import first_frames
 from sfms_robot.learning.job import Run
+from sfms_robot.learning.sfms.tokenizer_trainer import amplified
 from sfms_robot.listeners.sfms.placement import place_exact
 
 RECIPES = recipes(steps=3)
@@ -88,13 +89,13 @@ def test_first_frames_of_short_takes_are_none() -> None:
 
 
 @pytest.mark.parametrize(
-    "recipe", [sparse(), sparse("nested"), sparse("learned_paper"), dense()], ids=lambda r: r.model.kind
+    "recipe", [sparse(), sparse("learned"), sparse("learned_paper"), dense()], ids=lambda r: r.model.kind
 )
 def test_any_recipe_trains_is_kept_and_scores_the_same_again(recipe: config.Recipe, tmp_path: Path) -> None:
     seen = Windows.of(faces(seed=2), 48)
     trained = train("one", recipe, faces(), tmp_path, Run(), seen.motion[:1])
     assert not list((tmp_path / "one").glob("checkpoint-*")), "a finished tokenizer needs no checkpoint"
-    read = model.read(tmp_path / "one")
+    read = compared_tokenizer.read(tmp_path / "one")
     assert read.recipe == recipe
     ours, again = score(trained, seen), score(read, seen)
     assert again.mse == pytest.approx(ours.mse, rel=0.05)  # half precision on disk may move a code
@@ -102,11 +103,11 @@ def test_any_recipe_trains_is_kept_and_scores_the_same_again(recipe: config.Reci
 
 
 def test_weights_of_another_recipe_are_refused(tmp_path: Path) -> None:
-    model.save(tmp_path / "a", TableModel(sparse()))
-    model.save(tmp_path / "b", TableModel(dense()))
-    (tmp_path / "a" / model.WEIGHTS).replace(tmp_path / "b" / model.WEIGHTS)
+    compared_tokenizer.save(tmp_path / "a", TableModel(sparse()))
+    compared_tokenizer.save(tmp_path / "b", TableModel(dense()))
+    (tmp_path / "a" / compared_tokenizer.WEIGHTS).replace(tmp_path / "b" / compared_tokenizer.WEIGHTS)
     with pytest.raises(ModelError, match="the weights belong to another configuration"):
-        model.read(tmp_path / "b")
+        compared_tokenizer.read(tmp_path / "b")
 
 
 def test_places_cost_bits_only_where_nobody_expects_them() -> None:
@@ -136,53 +137,41 @@ def test_a_window_error_counts_every_channel_the_same() -> None:
 
 
 def test_every_table_needs_only_tokenizers_that_have_a_recipe() -> None:
-    for name in tables.TABLES:
-        assert set(tables.needed(name)) <= set(RECIPES)
-    assert {name for table in tables.TABLES for name in tables.needed(table)} == set(RECIPES), "none is trained in vain"
+    for name in tokenizer_tables.TABLES:
+        assert set(tokenizer_tables.needed(name)) <= set(RECIPES)
+    every = {name for table in tokenizer_tables.TABLES for name in tokenizer_tables.needed(table)}
+    assert every == set(RECIPES), "none is trained in vain"
 
 
 def test_the_paper_rows_of_the_tables_are_those_of_the_paper() -> None:
-    three = {(spec.name, spec.k): spec.paper_e2 for spec in rows.TABLE_3 if spec.paper_e2 is not None}
+    three = {(spec.name, spec.k): spec.paper_e2 for spec in tokenizer_tables.TABLE_3 if spec.paper_e2 is not None}
     assert three["Dynamic (learned)", 3] / three["Static (every N/k-th)", 3] == pytest.approx(0.17, abs=0.005)
-    four = {spec.name: spec.paper_e2 for spec in rows.TABLE_4}
+    four = {spec.name: spec.paper_e2 for spec in tokenizer_tables.TABLE_4}
     assert four["Dense-FSQ-1024"] / four["Sparse-FSQ-256"] == pytest.approx(24, abs=0.5)
     assert four["L2L (VQ-256)"] / four["Sparse-FSQ-256"] == 48
 
 
-def _row(family: str, of_bits: float, mse: float) -> rows.Row:
-    spec = rows.Spec(family, family, note=family)
-    return rows.Row(spec, 1, of_bits, Score(("a",), np.array([[mse]]), 0.0, 0.0))
-
-
-def test_what_bits_buy_is_the_least_error_of_all_that_is_affordable() -> None:
-    found = [_row("sparse", 150, 0.5), _row("sparse", 700, 0.2), _row("dense", 480, 0.3), _row("grouped", 50, 0.4)]
-    at = {point["bits"]: point for point in bits.bought(found)}
-    assert at[200] == {"bits": 200, "sparse": 0.5, "dense": None, "grouped": 0.4, "sparse_is_least": False}
-    assert at[800]["sparse"] == 0.2 and at[800]["sparse_is_least"]
-    assert bits.least_error([replace(found[0], bits=201)], "sparse", 200) is None
-
-
 def test_a_broken_history_is_named(tmp_path: Path) -> None:
-    assert history.load(tmp_path) == []
-    (tmp_path / history.FILE).write_text('[{"stride": 1}]')
+    assert score_history.load(tmp_path) == []
+    (tmp_path / score_history.FILE).write_text('[{"stride": 1}]')
     with pytest.raises(ModelError, match=r"history\.json: not the history of a tokenizer"):
-        history.load(tmp_path)
+        score_history.load(tmp_path)
 
 
 def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> None:
     seen = Windows.of(faces(), 48)
     train("one", sparse("learned"), faces(), tmp_path, Run(), seen.motion[:2])
-    looks = history.load(tmp_path / "one")
-    assert {look.window for look in looks} == {0, 1}
-    assert looks[0].step == 0 and looks[-1].step == 2
-    for look in looks:
-        assert len(look.keyframes) == 3 and len(look.scores) == len(look.errors) == 48
-        assert np.exp(look.scores).sum() == pytest.approx(1, abs=0.01)
+    snapshots = score_history.load(tmp_path / "one")
+    assert {snapshot.window for snapshot in snapshots} == {0, 1}
+    assert snapshots[0].step == 0 and snapshots[-1].step == 2
+    for snapshot in snapshots:
+        assert len(snapshot.keyframes) == 3 and len(snapshot.scores) == len(snapshot.errors) == 48
+        assert np.exp(snapshot.scores).sum() == pytest.approx(1, abs=0.01)
 
 
 def test_amplified_windows_keep_their_shape_and_their_best_masks() -> None:
     batch = torch.randn(4, 48, 3, generator=torch.Generator().manual_seed(1))
-    louder = amplified(batch, torch.Generator().manual_seed(2))
+    louder = amplified(batch, 0.4, torch.Generator().manual_seed(2))
     gain = louder / batch
     assert torch.allclose(gain, gain[:, :1, :1].expand_as(gain), rtol=1e-4)
     assert float(gain.min()) > 0 and float(gain.std()) > 0.05

@@ -9,9 +9,9 @@ from sfms_robot.corpora.compose.voices import read_voice
 from sfms_robot.data import data_dir
 from sfms_robot.evaluation import timing
 from sfms_robot.evaluation.nod_table import Counts, NodTable
+from sfms_robot.evaluation.rollout import rollout, speaker_frames
 from sfms_robot.evaluation.timing import Answer, Scene
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
-from sfms_robot.learning.rollout import frames_of, roll_out_many
 from sfms_robot.signals.events import voice_activity
 
 NONE = np.zeros((0, 2))
@@ -188,8 +188,8 @@ class Choir(Metronome):
 
 
 def test_streams_one_by_one_and_side_by_side_are_rolled_out_alike():
-    speaker = frames_of(None, np.full((30, 58), np.nan, np.float32))
-    alone = roll_out_many(Metronome(), speaker, [3, 5])
-    np.testing.assert_array_equal(alone, roll_out_many(Choir(), speaker, [3, 5]))
+    speaker = speaker_frames(None, np.full((30, 58), np.nan, np.float32))
+    alone = rollout(Metronome(), speaker, [3, 5]).motion
+    np.testing.assert_array_equal(alone, rollout(Choir(), speaker, [3, 5]).motion)
     np.testing.assert_allclose(alone[:, [1, 4, 5, 29], 1], [[3, 3, 3.04, 3.28], [5, 5, 5.04, 5.28]], rtol=1e-6)
     assert not alone[:, 0].any()  # nothing is planned yet while the first frame is heard

@@ -13,14 +13,14 @@ from sfms_robot import config
 from sfms_robot.config import parse_training
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, SpeakerFrame
-from sfms_robot.learning.arig.corpus import SCENES, fit_scales, gather, open_scenes
-from sfms_robot.learning.arig.losses import Pupil, augment, loss_parts, previous_states
+from sfms_robot.learning.arig.features import SCENES, cut, fit_scales, gather, open_scenes
+from sfms_robot.learning.arig.losses import Student, augment, loss_parts, previous_states
 from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
+from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.sound import MEL_WIDTH, WIDTHS
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import LN_PER_DB
 
@@ -38,9 +38,9 @@ def corpus(data):
     return gather(open_scenes(data, "train"), WINDOW, ARKIT, WIDTHS["mel"])
 
 
-def a_pupil(**changes) -> Pupil:
+def a_student(**changes) -> Student:
     torch.manual_seed(0)
-    return Pupil(ArigModel(settings(listener=changes).listener))
+    return Student(ArigModel(settings(listener=changes).listener))
 
 
 def quiet(**changes) -> config.ArigPhase:
@@ -100,7 +100,7 @@ def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path
 
 def test_the_curriculum_decides_where_windows_come_from(corpus):
     phase = settings(steps=100).training
-    starts = corpus.starts(WINDOW)
+    starts = corpus.starts_by_scene(WINDOW)
     generator = torch.Generator().manual_seed(0)
     first_of = {scene: (int(starts[scene].min()), int(starts[scene].max())) for scene in SCENES}
     early = draw(starts, weights_of(phase.stage(0), starts), 50, generator)
@@ -119,7 +119,7 @@ def test_stages_follow_one_another(step):
 
 def test_windows_never_cross_from_one_dyad_into_the_next(corpus):
     ends = np.cumsum(corpus.lengths)
-    for start in torch.cat(list(corpus.starts(WINDOW).values())).tolist():
+    for start in torch.cat(list(corpus.starts_by_scene(WINDOW).values())).tolist():
         assert np.searchsorted(ends, start, side="right") == np.searchsorted(ends, start + WINDOW - 1, side="right")
 
 
@@ -134,17 +134,17 @@ def test_without_the_sets_that_speak_the_curriculum_goes_on_with_listening(data,
 
 
 def test_a_silent_agent_may_lack_its_track_but_one_that_speaks_never(corpus):
-    starts = corpus.starts(WINDOW)
-    told, _ = corpus.cut(torch.cat([starts["speaking"][:20], starts["listening"][:20]]), WINDOW)
-    found, _ = augment(told, a_pupil().model, quiet(drop_agent=1), torch.Generator().manual_seed(0))
+    starts = corpus.starts_by_scene(WINDOW)
+    told = cut(corpus, torch.cat([starts["speaking"][:20], starts["listening"][:20]]), WINDOW)
+    found, _ = augment(told, a_student().model, quiet(drop_agent=1), torch.Generator().manual_seed(0))
     speaks = told.voiced[..., 0].any(1)
     assert speaks.any() and not speaks.all()
     assert torch.equal(found.agent_heard.any(1), speaks)
 
 
 def test_dropping_takes_a_whole_modality_and_its_voice(corpus):
-    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:10], WINDOW)
-    model = a_pupil().model
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:10], WINDOW)
+    model = a_student().model
     found, _ = augment(told, model, quiet(drop_audio=1, drop_face=1), torch.Generator().manual_seed(0))
     assert told.voiced[..., 1].any()
     assert not (found.user_heard.any() or found.voiced[..., 1].any() or found.user_seen.any())
@@ -152,8 +152,8 @@ def test_dropping_takes_a_whole_modality_and_its_voice(corpus):
 
 
 def test_without_augmentation_windows_stay_as_they_are(corpus):
-    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:5], WINDOW)
-    found, truth = augment(told, a_pupil().model, quiet(), torch.Generator().manual_seed(0))
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:5], WINDOW)
+    found, truth = augment(told, a_student().model, quiet(), torch.Generator().manual_seed(0))
     assert torch.equal(truth, told.agent_motion)
     for name in ("user_sound", "agent_sound", "user_heard", "agent_motion", "voiced"):
         assert torch.equal(getattr(found, name), getattr(told, name))
@@ -161,12 +161,12 @@ def test_without_augmentation_windows_stay_as_they_are(corpus):
 
 def sounds_off(corpus, sound: str = "mel", **changes) -> torch.Tensor:
     """(400, N, A) what augmentation adds to the agent's sound."""
-    pupil = Pupil(ArigModel(settings({"sound": sound}).listener))
-    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    student = Student(ArigModel(settings({"sound": sound}).listener))
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(400), WINDOW)
     if sound != "mel":
-        zeros = torch.zeros(400, WINDOW, pupil.model.sound_width)
+        zeros = torch.zeros(400, WINDOW, student.model.sound_width)
         told = replace(told, user_sound=zeros, agent_sound=zeros)
-    found, _ = augment(told, pupil.model, quiet(**changes), torch.Generator().manual_seed(0))
+    found, _ = augment(told, student.model, quiet(**changes), torch.Generator().manual_seed(0))
     return found.agent_sound - told.agent_sound
 
 
@@ -190,10 +190,10 @@ def test_features_that_are_no_logarithms_of_power_are_left_as_they_are(corpus):
 
 
 def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_back(corpus):
-    model = a_pupil().model
+    model = a_student().model
     fit_scales(model, corpus, settings().listener.channels)
     model.step_std.zero_()  # leaves the slow part alone
-    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(400), WINDOW)
     told = replace(told, voiced=torch.zeros_like(told.voiced))
     found, truth = augment(told, model, quiet(history_noise=0.4), torch.Generator().manual_seed(0))
     off = (found.agent_motion - told.agent_motion) / model.motion_std
@@ -203,9 +203,9 @@ def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_
 
 
 def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_once(corpus):
-    model = a_pupil().model
+    model = a_student().model
     fit_scales(model, corpus, settings().listener.channels)
-    told, _ = corpus.cut(corpus.starts(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(400), WINDOW)
     speaks = torch.zeros_like(told.voiced)
     speaks[:, WINDOW // 2 :, 0] = True
     told = replace(told, voiced=speaks)
@@ -220,23 +220,23 @@ def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_onc
 
 @pytest.mark.parametrize("draws", ["motion", "step"])
 def test_what_is_drawn_is_the_inverse_of_what_is_learned(corpus, draws):
-    model = a_pupil(draws=draws).model
+    model = a_student(draws=draws).model
     fit_scales(model, corpus, settings().listener.channels)
-    motion = model.standardise(corpus.agent_motion)
+    motion = model.standardise(corpus.frames.agent_motion)
     last = motion.roll(1, 0)
     assert torch.allclose(model.drawn(model.target(motion, last), last), motion, atol=1e-4)
 
 
 def test_steps_from_one_dyad_into_the_next_are_no_steps(corpus):
-    model = a_pupil(draws="step").model
+    model = a_student(draws="step").model
     fit_scales(model, corpus, settings().listener.channels)
-    motion = model.standardise(corpus.agent_motion).split(corpus.lengths)
+    motion = model.standardise(corpus.frames.agent_motion).split(corpus.lengths)
     largest = torch.stack([(one.diff(dim=0) / model.step_std).abs().amax(0) for one in motion]).amax(0)
     assert torch.allclose(torch.maximum(model.head.high, -model.head.low), largest, atol=1e-3)
 
 
 def test_a_step_never_leads_out_of_the_range_of_the_motion():
-    model = a_pupil(draws="step").model
+    model = a_student(draws="step").model
     model.motion_high.fill_(0.5)
     assert float(model.drawn(torch.full((1, 58), 9.0), torch.zeros(1, 58)).max()) == 0.5
 
@@ -249,17 +249,18 @@ def test_lost_states_are_drawn_and_unknown_ones_wait():
 
 
 def test_unlabelled_frames_have_no_state_loss(corpus):
-    pupil = a_pupil()
-    told, states = corpus.cut(corpus.starts(WINDOW)["listening"][:3], WINDOW)
+    student = a_student()
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["listening"][:3], WINDOW)
+    states = told.states
     unknown = torch.full_like(states, -1)
     parts = loss_parts(
-        pupil, told, unknown, told.agent_motion, 1, torch.Generator().manual_seed(0), states.clamp(min=0)
+        student, told, unknown, told.agent_motion, 1, torch.Generator().manual_seed(0), states.clamp(min=0)
     )
     assert float(parts.state) == 0
 
 
 def test_only_short_dyads_are_refused(data):
-    with pytest.raises(ConfigError, match=r"none of \d+ dyads is as long as a window of 9000 frames"):
+    with pytest.raises(ConfigError, match=r"none of \d+ dyads can be used: \d+ are shorter than a window of 9000"):
         gather(open_scenes(data, "train"), 9000, ARKIT, WIDTHS["mel"])
 
 

@@ -4,13 +4,12 @@ import pytest
 import torch
 
 from sfms_robot import config
-from sfms_robot.learning.sfms.keyframe_scores import imitation, lively, regrets, states
-from sfms_robot.learning.sfms.masks import exact_each
-from sfms_robot.learning.sfms.tokenizer import tokenizer_loss
+from sfms_robot.learning.sfms.imitation import imitation, lively, regrets, states
+from sfms_robot.learning.sfms.tokenizer_trainer import tokenizer_loss
 from sfms_robot.listeners.sfms.choice import choose
 from sfms_robot.listeners.sfms.exact import best_frames, completion_errors, mask_cost
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.placement import place_exact, place_static
+from sfms_robot.listeners.sfms.placement import place_static
 from sfms_robot.listeners.sfms.score import ConditionalScore, tracks
 
 ONE = torch.ones(1, 1)
@@ -34,19 +33,17 @@ def test_what_is_best_has_no_regret_and_what_cannot_be_has_infinite():
     track = tracks(bumps(4), ONE, 1)
     chosen = torch.zeros(4, 24)
     chosen[:, 3] = 1.0
-    for blind in (torch.zeros(4, dtype=torch.bool), torch.ones(4, dtype=torch.bool)):
-        regret = regrets(track, chosen, torch.full((4,), 5), blind, 5)
-        assert regret[:, 3].isinf().all()
-        assert (regret >= 0).all()
-    told = regrets(track, chosen, torch.full((4,), 5), torch.zeros(4, dtype=torch.bool), 5)
-    assert (told.amin(1) < 1e-5).all()
+    regret = regrets(track, chosen, torch.full((4,), 5), 5)
+    assert regret[:, 3].isinf().all()
+    assert (regret >= 0).all()
+    assert (regret.amin(1) < 1e-5).all()
 
 
 def test_following_the_teacher_ends_at_the_best_mask():
     track = tracks(torch.randn(6, 24, 1).cumsum(1), ONE, 1)
-    mask, told = torch.zeros(6, 24), torch.zeros(6, dtype=torch.bool)
+    mask = torch.zeros(6, 24)
     for _ in range(5):
-        regret = regrets(track, mask, torch.full((6,), 5), told, 5)
+        regret = regrets(track, mask, torch.full((6,), 5), 5)
         mask = mask.scatter(1, regret.argmin(1, keepdim=True), 1.0)
     best = torch.zeros(6, 24).scatter(1, best_frames(track.cost, 5), 1.0)
     torch.testing.assert_close(mask_cost(track.cost, mask), mask_cost(track.cost, best), rtol=1e-3, atol=1e-4)
@@ -56,15 +53,15 @@ def test_states_are_those_of_one_choice_each():
     score, drawn = score_network(), torch.Generator().manual_seed(1)
     track = tracks(bumps(3), ONE, 1)
     k = torch.tensor([1, 4, 2])
-    rows, chosen, remaining = states(score, track, k, torch.tensor([False, False, True]), drawn)
+    rows, chosen, remaining = states(score, track, k, drawn)
     assert rows.bincount().tolist() == k.tolist()
     for row, count, coming in zip(rows.tolist(), chosen.sum(1).tolist(), remaining.tolist(), strict=True):
-        assert coming == (0 if row == 2 else k[row] - count)
+        assert coming == k[row] - count
 
 
 def test_imitation_is_the_same_for_the_same_generator_and_reaches_every_weight():
     score, track = score_network(), tracks(bumps(4), ONE, 1)
-    losses = [imitation(score, track, 4, 0.3, torch.Generator().manual_seed(2)) for _ in range(2)]
+    losses = [imitation(score, track, 4, torch.Generator().manual_seed(2)) for _ in range(2)]
     assert losses[0] == losses[1]
     losses[0].backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in score.parameters())
@@ -78,14 +75,7 @@ def test_lively_tracks_are_drawn_before_still_ones():
     assert (found.curves.square().sum((1, 2)) > 1).sum() >= 3
 
 
-def test_exact_masks_for_every_k_are_the_exact_masks():
-    motion, member = torch.randn(3, 16, 3).cumsum(1), torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-    every = exact_each(motion, member, 2, 5)
-    for k, masks in zip(range(2, 6), every, strict=True):
-        assert torch.equal(masks, place_exact(motion, [k, k], member))
-
-
-def test_told_teacher_errors_never_fall_as_more_is_chosen():
+def test_teacher_errors_never_fall_as_more_is_chosen():
     track = tracks(torch.randn(5, 16, 1).cumsum(1), ONE, 1)
     nothing, one = torch.zeros(5, 16), torch.zeros(5, 16)
     one[:, 8] = 1.0
@@ -99,14 +89,13 @@ def test_scores_that_learned_from_the_teacher_beat_even_keyframes_on_unseen_moti
     optimizer = torch.optim.AdamW(score.parameters(), 3e-3)
     for step in range(100):
         optimizer.zero_grad()
-        imitation(score, tracks(bumps(16, seed=step + 1), ONE, 1), 5, 0.3, drawn).backward()
+        imitation(score, tracks(bumps(16, seed=step + 1), ONE, 1), 5, drawn).backward()
         optimizer.step()
     unseen = bumps(100, seed=999)
     track = tracks(unseen, ONE, 1)
     k = torch.full((100,), 4)
     even = mask_cost(track.cost, place_static(unseen, [4])[..., 0]).sum()
-    assert mask_cost(track.cost, choose(score, track, k).mask).sum() < 0.5 * even
-    assert mask_cost(track.cost, choose(score, track, k, told=False).mask).sum() < even
+    assert mask_cost(track.cost, choose(score, track, k)).sum() < 0.5 * even
 
 
 @pytest.mark.parametrize("quantizer", ["fsq", "vq"])
@@ -128,7 +117,7 @@ def test_a_step_in_half_precision_is_finite_and_reaches_codes_inpainter_and_scor
     with torch.autocast("cpu", dtype=torch.bfloat16):
         loss = tokenizer_loss(tokenizer, batch, tokenizer.place(batch, strategy="exact"), phase, drawn)[0]
         some = lively(batch, tokenizer.member, tokenizer.score.curves, 6, drawn)
-        loss = loss + imitation(tokenizer.score, some, 3, 0.3, drawn)
+        loss = loss + imitation(tokenizer.score, some, 3, drawn)
     loss.backward()
     assert loss.isfinite()
     for name, weights in tokenizer.named_parameters():

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.evaluation.metrics import dtw
-from sfms_robot.learning.sfms.losses_dtw import keyframe_dtw, soft_dtw
+from sfms_robot.learning.sfms.soft_dtw import keyframe_dtw, soft_dtw
 
 
 def cost_of(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,12 +12,16 @@ from sfms_robot import config
 from sfms_robot.corpora import clips
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.errors import ConfigError
+from sfms_robot.evaluation.behaviour import behaviour
+from sfms_robot.evaluation.rollout import rollouts
+from sfms_robot.evaluation.sampling_calibration import calibrate
 from sfms_robot.frames import BLENDSHAPES, CHANNELS, FRAME_SAMPLES, POSE_CHANNELS
+from sfms_robot.learning.corpus import windows
 from sfms_robot.learning.job import Run
-from sfms_robot.learning.rollout import evaluate_rollout
-from sfms_robot.learning.sfms import predictor_training as listener
-from sfms_robot.learning.sfms import tokenizer
-from sfms_robot.learning.sfms.corpus import Corpus, fit_scales, gather, place_all, windows
+from sfms_robot.learning.sfms import predictor_trainer as listener
+from sfms_robot.learning.sfms import tokenizer_trainer as tokenizer
+from sfms_robot.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather
+from sfms_robot.learning.sfms.tokens import place_all
 from sfms_robot.listeners import checkpoint, sfms
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
@@ -71,9 +76,11 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     second = listener.train_listener(chosen, data, tmp_path)
     assert np.isfinite([first["loss"], first["mse"], second["loss"], second["held_out_loss"]]).all()
     assert (first["steps"], second["steps"]) == (30, 20)
-    loaded = sfms.load(tmp_path)
-    own, people, motions = evaluate_rollout(loaded, [dyad("c", 160, seed=2)])
-    assert motions[0].shape == (160, 58) and np.isfinite(motions[0]).all()
+    calibrate(chosen, data, tmp_path)
+    unseen = dyad("c", 160, seed=2)
+    (one,) = rollouts(sfms.load(tmp_path), [unseen], seed=1)
+    assert one.motion.shape == (1, 160, 58) and np.isfinite(one.motion).all()
+    own, people = behaviour([one.motion[0]], [unseen]), behaviour([unseen.listener], [unseen])
     assert people.blinks >= 0 and own.jerk_deg_s3 > 0
 
 
@@ -119,7 +126,7 @@ WRITTEN = {"tokenizer": tokenizer.WEIGHTS, "listener": checkpoint.WEIGHTS}
 )
 def test_a_phase_interrupted_and_resumed_writes_the_same_bytes(data, tmp_path, phase, placement, stop):
     looks = {"steps": 30, "batch": 8, "learning_rate": 5e-3, "evaluate_every": 7}
-    fewer = looks | {"steps": 12, "calibration_rounds": 0}
+    fewer = looks | {"steps": 12}
     chosen = settings(placement, tokenizer=looks, predictor=fewer)
     alone, broken = tmp_path / "alone", tmp_path / "broken"
     if phase == "listener":
@@ -153,7 +160,7 @@ def test_the_weight_of_class_0_is_taken_out_of_its_probability():
     assert [g.transition_bias for g in listener.corrected(weight).groups.values()] == [1.386, 1.386]
 
 
-def _corpus() -> Corpus:
+def _corpus() -> SfmsCorpus:
     return gather([dyad("a"), dyad("short", 40), dyad("b", 130, seed=1)], 48, ARKIT)
 
 
@@ -163,7 +170,15 @@ def test_windows_never_cross_from_one_dyad_into_the_next():
     starts = corpus.starts(48)
     assert len(starts) == (300 - 47) + (130 - 47)
     assert not ((starts < 300) & (starts + 48 > 300)).any()
-    assert torch.equal(windows(corpus.motion, starts[-1:], 48)[0], corpus.motion[-48:])
+    assert torch.equal(windows(corpus.frames.motion, starts[-1:], 48)[0], corpus.frames.motion[-48:])
+
+
+def test_steps_from_one_dyad_into_the_next_are_no_steps():
+    """Two people who sit still in different places: nobody moves, however many dyads there are."""
+    still = [replace(dyad(name), listener=np.full((300, 58), at, np.float32)) for name, at in (("a", 0.1), ("b", 0.9))]
+    model = SfmsModel(settings().listener)
+    fit_scales(model, gather([*still] * 40, 48, ARKIT), CHANNELS)
+    assert (model.motion_speed == LEAST_SPEED).all()
 
 
 def test_only_short_dyads_are_refused():
@@ -175,7 +190,7 @@ def test_only_short_dyads_are_refused():
 def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement):
     model, corpus = SfmsModel(settings(placement).listener), _corpus()
     fit_scales(model, corpus, CHANNELS)
-    mask = place_all(model.tokenizer, model.standardise(corpus.motion), corpus.lengths)
+    mask = place_all(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths)
     assert mask.mean(0) * 48 == pytest.approx(torch.tensor([8.0, 8.0]), rel=0.1)
     for part in mask.split(corpus.lengths):
         assert (part[:, 0].nonzero()[:, 0].diff() <= 48).all()

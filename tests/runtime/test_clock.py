@@ -4,17 +4,17 @@ import itertools
 
 import pytest
 
-from sfms_robot.runtime.clock import VirtualClock, beats
+from sfms_robot.runtime.clock import VirtualClock, tick_times
 
 
 def test_ticks_are_exact_multiples_of_the_period() -> None:
-    times = [beat.time_s for beat in itertools.islice(beats(VirtualClock(), 100, 0.0), 1000)]
+    times = [beat.time_s for beat in itertools.islice(tick_times(VirtualClock(), 100, 0.0), 1000)]
     assert times == [pytest.approx(i / 100, abs=1e-12) for i in range(1000)]
 
 
 def test_work_shorter_than_a_period_does_not_shift_the_next_tick() -> None:
     clock = VirtualClock()
-    ticks = beats(clock, 50, 0.0)
+    ticks = tick_times(clock, 50, 0.0)
     next(ticks)
     clock.wait_until(0.015)
     assert next(ticks).time_s == pytest.approx(0.020)
@@ -22,7 +22,7 @@ def test_work_shorter_than_a_period_does_not_shift_the_next_tick() -> None:
 
 def test_a_late_tick_is_reported_and_missed_ticks_are_skipped_not_chased() -> None:
     clock = VirtualClock()
-    ticks = beats(clock, 50, 0.0)
+    ticks = tick_times(clock, 50, 0.0)
     next(ticks)
     clock.wait_until(0.075)  # 75 ms of work in a 20 ms period
     late = next(ticks)
@@ -42,5 +42,5 @@ def test_virtual_time_never_runs_backwards() -> None:
 def test_ticks_go_on_from_where_the_clock_is() -> None:
     clock = VirtualClock()
     clock.wait_until(5.013)
-    assert next(beats(clock, 100, 5.0)).time_s == pytest.approx(0.02)
-    assert next(beats(clock, 100, 3.0)).time_s == pytest.approx(2.02)
+    assert next(tick_times(clock, 100, 5.0)).time_s == pytest.approx(0.02)
+    assert next(tick_times(clock, 100, 3.0)).time_s == pytest.approx(2.02)

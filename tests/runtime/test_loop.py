@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import HANGING, build_bus, build_motion, emulated
+from sfms_robot.app.session import build_bus, build_motion
+from sfms_robot.app.wiring import HANGING, emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ModelError, RobotError

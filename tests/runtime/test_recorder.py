@@ -1,6 +1,7 @@
 import base64
 import json
 import threading
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from mcap.reader import make_reader
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.runtime.recorder import RUN_FILE, Recorder, write_report
+from sfms_robot.runtime import recorder as recorder_module
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder, check_folder, parts_of, write_report
 
 JOINTS = ("neck_yaw", "jaw")
 
@@ -105,6 +107,8 @@ def test_the_file_says_what_it_is_about(tmp_path):
     Recorder(tmp_path, JOINTS, about={"head": "face28", "seed": "3"}).close()
     with (tmp_path / RUN_FILE).open("rb") as file:
         (record,) = make_reader(file).iter_metadata()
+    began = datetime.fromisoformat(record.metadata.pop("started_utc"))
+    assert began.tzinfo is not None and abs((datetime.now(UTC) - began).total_seconds()) < 3600
     assert record.metadata == {"head": "face28", "seed": "3", "joints": '["neck_yaw", "jaw"]'}
 
 
@@ -120,11 +124,50 @@ def test_a_folder_that_cannot_be_made_is_a_configuration_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="--record .*file/run: cannot be written to"):
         Recorder(tmp_path / "file" / "run", JOINTS)
-    with pytest.raises(ConfigError, match="--record .*cannot be written to"):
-        write_report(tmp_path / "file", {})
+
+
+def test_a_report_that_cannot_be_written_is_said_and_loses_nothing(tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    write_report(tmp_path / "file", {})
+    assert "the report cannot be written" in caplog.text
+
+
+def test_a_recording_is_not_overwritten_unasked(tmp_path):
+    check_folder(tmp_path)
+    Recorder(tmp_path, JOINTS).close()
+    with pytest.raises(ConfigError, match="holds a recording already .*--overwrite"):
+        check_folder(tmp_path)
+    check_folder(tmp_path, overwrite=True)
 
 
 def test_the_report_is_json(tmp_path):
     write_report(tmp_path / "new", {"version": 1})
     assert json.loads((tmp_path / "new" / "report.json").read_text()) == {"version": 1}
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["report.json"]
+
+
+def test_a_long_recording_goes_on_in_files_that_are_each_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "PART_MESSAGES", 10)
+    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    for k in range(14):
+        recorder.tick(tick(k / 100))
+    recorder.close()
+    parts = parts_of(tmp_path)
+    assert [part.name for part in parts] == ["run.mcap", "run-0002.mcap", "run-0003.mcap"]
+    times = []
+    for part in parts:
+        with part.open("rb") as file:
+            reader = make_reader(file)
+            times += [message.log_time for _, channel, message in reader.iter_messages(topics=["/joints"])]
+            assert reader.get_summary() is not None
+    assert times == [round(k / 100 * 1e9) for k in range(14)]
+
+
+def test_a_recording_that_is_replaced_leaves_no_part_of_the_old_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "PART_MESSAGES", 2)
+    first = Recorder(tmp_path, JOINTS, when_full="wait")
+    for k in range(5):
+        first.tick(tick(k / 100))
+    first.close()
+    Recorder(tmp_path, JOINTS).close()
+    assert [part.name for part in parts_of(tmp_path)] == ["run.mcap"]

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import build_bus, build_motion, emulated
+from sfms_robot.app.session import build_bus, build_motion
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame

@@ -1,32 +1,55 @@
-"""Signals become a flag, and easing is smooth at both ends."""
+"""Signals become a request to end, and easing is smooth at both ends."""
 
 import signal
 
 import pytest
 
-from sfms_robot.runtime.safety import interrupt_flag, realtime_priority, smooth
+from sfms_robot.runtime.safety import Interrupt, Released, realtime_priority, signals_to, smooth
+
+
+class NoBus:
+    """What an armed `Interrupt` releases: here nothing is plugged in, so it only counts."""
+
+    released = 0
+
+    def torque_off(self, policy: str) -> None:
+        self.released += 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_sets_the_flag_and_raises_nothing(number: signal.Signals) -> None:
-    ours = signal.default_int_handler
+def test_a_first_signal_is_a_request_and_a_second_releases(number: signal.Signals) -> None:
+    ours, bus = signal.default_int_handler, NoBus()
     before = signal.signal(number, ours)  # whatever the tests were started under
     try:
-        with interrupt_flag() as interrupted:
-            assert not interrupted()
+        interrupt = Interrupt()
+        interrupt.arm(bus)
+        with signals_to(interrupt):
+            assert not interrupt()
             signal.raise_signal(number)
-            assert interrupted()
+            assert interrupt() and bus.released == 0
+            with pytest.raises(Released):
+                signal.raise_signal(number)
+            assert bus.released == 1
         assert signal.getsignal(number) is ours
     finally:
         signal.signal(number, before)
 
 
+def test_ctrl_backslash_releases_at_once() -> None:
+    bus, interrupt = NoBus(), Interrupt()
+    interrupt.arm(bus)
+    with signals_to(interrupt), pytest.raises(Released):
+        signal.raise_signal(signal.SIGQUIT)
+    assert bus.released == 1
+
+
 def test_a_signal_that_is_ignored_stays_so() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with interrupt_flag() as interrupted:
+        interrupt = Interrupt()
+        with signals_to(interrupt):
             signal.raise_signal(signal.SIGHUP)
-            assert not interrupted()
+            assert not interrupt()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

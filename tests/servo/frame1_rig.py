@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sfms_robot.config import Faults, Safety, load_firmware_map
-from sfms_robot.emulator.protocol1 import Frame1Device
-from sfms_robot.emulator.protocol1_servo import Frame1Servo
+from sfms_robot.emulator.protocol1_chain import Protocol1Chain
+from sfms_robot.emulator.protocol1_servo import Protocol1Servo
 from sfms_robot.errors import BusError
 from sfms_robot.servo.chain.dynamixel1_bus import Dynamixel1Bus
 from sfms_robot.servo.chain.feetech_bus import FeetechBus
@@ -35,7 +35,7 @@ class Wire:
     `hears_itself`: a half-duplex adapter that echoes what it sends.
     """
 
-    device: Frame1Device
+    device: Protocol1Chain
     clock: Time
     baud: int
     name: str = "wire"
@@ -98,7 +98,7 @@ class Straight:
 
 @dataclass
 class Rig:
-    device: Frame1Device
+    device: Protocol1Chain
     clock: Time
     wire: Wire
     bus: Dynamixel1Bus | FeetechBus
@@ -106,7 +106,7 @@ class Rig:
     rejoined: set[str] = field(default_factory=set)
     goals: np.ndarray | None = None
 
-    def servo(self, servo_id: int) -> Frame1Servo:
+    def servo(self, servo_id: int) -> Protocol1Servo:
         servo = self.device.servo(servo_id)
         assert servo is not None
         return servo
@@ -163,7 +163,7 @@ def rig_of(
         {"id": i + 1, "model": each, "baud": servo_baud or baud, "start_ticks": ticks, "firmware": 3}
         for i, (each, ticks) in enumerate(zip(models, starts, strict=True))
     ]
-    device = Frame1Device.from_rows(rows, tables)
+    device = Protocol1Chain.from_rows(rows, tables)
     clock = Time()
     wire = Wire(device, clock, baud)
     conversion = Straight(tables[models[0]])

@@ -23,18 +23,33 @@ def goals_of(count=1) -> Goals:
     return Goals("face", [BusServo(f"joint{i}", i, table, -1.0, 1.0) for i in range(count)], Linear())
 
 
+FIRST, BOTH, NOBODY = np.array([0]), np.array([0, 1]), np.zeros(0, np.intp)
+
+
 @given(st.floats(1.01, 3.0), st.floats(0.0, 1.0))
 def test_way_out_closes_behind_a_joint_that_comes_in(outside, share):
     goals = goals_of()
     assert not goals.hold(0, outside)
     nearer = 1.0 + share * (outside - 1.0)
-    goals.check(np.array([outside]))
-    assert (goals.ticks(np.array([nearer]))[0] - 2048) * RAD == pytest.approx(nearer, abs=RAD)
+    assert (goals.ticks(np.array([nearer]), FIRST)[0] - 2048) * RAD == pytest.approx(nearer, abs=RAD)
     with pytest.raises(ValueError, match="goal of joint0"):
-        goals.check(np.array([nearer + 0.01]))
+        goals.ticks(np.array([nearer + 0.01]), FIRST)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.1, -1.1])
 def test_goal_that_is_no_goal_is_named(bad):
-    with pytest.raises(ValueError, match="goal of joint1 = "):
-        goals_of(2).check(np.array([0.0, bad]))
+    with pytest.raises(ValueError, match="goal of joint1 "):
+        goals_of(2).ticks(np.array([0.0, bad]), BOTH)
+
+
+def test_a_joint_that_is_not_sent_is_not_judged_and_its_way_in_stays_open():
+    goals = goals_of(2)
+    goals.hold(1, 2.0)
+    goals.ticks(np.array([0.0, 0.0]), FIRST)  # the face goes on while joint1 is away
+    goals.ticks(np.array([0.0, 9.0]), FIRST)
+    assert goals.ticks(np.array([0.0, 2.0]), BOTH)[1] == round(2048 + 2.0 / RAD)
+
+
+def test_whoever_is_away_is_still_asked_for_nothing_that_is_not_finite():
+    with pytest.raises(ValueError, match="goal of joint1 is not finite"):
+        goals_of(2).ticks(np.array([0.0, np.nan]), NOBODY)

@@ -11,8 +11,9 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.tracks import Track, write_track
-from sfms_robot.sources.recording import Recording, shipped_speaker, speakers
+from sfms_robot.sources.recording import Recording
 from sfms_robot.sources.registry import open_source
+from sfms_robot.sources.speakers import shipped_speaker, speakers
 
 
 def voice(frames):

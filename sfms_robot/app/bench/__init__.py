@@ -2,7 +2,9 @@
 
 | name | measured | peer |
 |---|---|---|
-| help | process start of `sfms-robot --help` | the same Python doing nothing |
+| startup.help, .wrong_port, .wrong_head | until the process is over | the same Python doing nothing |
+| startup.first_goal, .exit, .resident | `run` typed to first goal; last byte to the end; memory | the same |
+| memory.growth | resident memory that a run gains per virtual hour, after the first | resident memory after it |
 | bus.write, bus.tick | our sync write; write and read of a head (CPU time) | the vendor SDK's own group calls |
 | bus.cpu_share, bus.wire_use, bus.one_silent | of a core; of the line; ticks with one servo dead | the same |
 | retarget.tick | mapping, limits, calibration of a head (CPU time) | a plain matrix product of the mapping's size |
@@ -14,12 +16,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 from sfms_robot.app.bench.adversary import adversarial
 from sfms_robot.app.bench.bus import bus
 from sfms_robot.app.bench.lead import lead
 from sfms_robot.app.bench.listener import listener
-from sfms_robot.app.bench.measure import HEAD, Row
+from sfms_robot.app.bench.measure import HEAD, Row, beside
+from sfms_robot.app.bench.memory import HOURS, memory
 from sfms_robot.app.bench.retarget import retarget
 from sfms_robot.app.bench.startup import startup
 from sfms_robot.errors import ConfigError
@@ -33,11 +37,23 @@ PARTS: Mapping[str, Callable[[], dict[str, Row]]] = {
 }
 
 
-def run_bench(name: str, head: str | None = None, frames: int | None = None) -> dict[str, Row]:
+def run_bench(
+    name: str,
+    head: str | None = None,
+    frames: int | None = None,
+    against: Path | None = None,
+    hours: float = HOURS,
+) -> dict[str, Row]:
     """Measure `name`, or everything for "all". A row has median, p99, unit, peer, peer_median and ratio.
 
-    `head`: another one for "lead", and for "retarget" with wild `frames`. Raises ConfigError where they mean nothing.
+    `head`: another one for "lead", and for "retarget" with wild `frames`. `against`: a folder with another
+    installation, which becomes the peer; the two run in turn. `hours`: of "memory". Raises ConfigError where they mean
+    nothing.
     """
+    if name == "memory":
+        return memory(hours)
+    if against is not None:
+        return startup(against) if name == "startup" else beside(name, against)
     if frames is not None and name != "retarget":
         raise ConfigError(f"--frames {frames}: only 'bench retarget' takes wild frames")
     if head is not None and name != "lead" and frames is None:

@@ -22,10 +22,11 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from sfms_robot.app.bench.measure import HEAD, Row, row, times
-from sfms_robot.app.session import build_bus, emulated
+from sfms_robot.app.session import build_bus
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.runtime.clock import RealClock, beats
+from sfms_robot.runtime.clock import RealClock, tick_times
 
 RATE_HZ: Final = 100.0
 DEADLINE_MS: Final = 8.0
@@ -128,7 +129,7 @@ def _paced(host: Host, clock: Callable[[], float]) -> tuple[list[float], list[fl
     """(ticks a second, seconds of `clock` a second) at 100 Hz, window by window; ticks that are missed are missed."""
     pace = RealClock()
     rates, shares = [], []
-    ticks = beats(pace, RATE_HZ, pace.now_s())
+    ticks = tick_times(pace, RATE_HZ, pace.now_s())
     for _ in range(_PACED_TICKS // _WINDOW):
         began_s, used_s = pace.now_s(), clock()
         for _ in range(_WINDOW):

@@ -21,7 +21,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.session import build_bus, emulated
+from sfms_robot.app.session import build_bus
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.faults import KINDS
 from sfms_robot.emulator.launch import Chain, launch

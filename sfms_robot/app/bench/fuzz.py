@@ -19,7 +19,9 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app import session as heads
+from sfms_robot.app import wiring
 from sfms_robot.app.bench.campaign import FAMILIES, RECOVERY_S, Judge, Rig, head_of
+from sfms_robot.app.calibrated_head import BOARDS
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.motion.calibration import Calibration
@@ -117,7 +119,7 @@ class NoisyPort:
 def fuzz_one(family: str, count: int = BYTES, seed: int = 0) -> Fuzzed:
     """`count` bytes at the bus of one family, and then calm."""
     head, clock = head_of(family), VirtualClock()
-    with launch(heads.emulated(head)["main"], virtual=True) as chain:
+    with launch(wiring.emulated(head)["main"], virtual=True) as chain:
         noise = Noise(random.Random(seed))
         rig = Rig(head, chain, clock, _bus(head, chain, clock, noise))
         try:
@@ -134,7 +136,7 @@ def _bus(head: Head, chain: Chain, clock: VirtualClock, noise: Noise) -> Bus:
     servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in head.joints.items()]
     turns = np.array([maps[joint.model].ticks_per_revolution for joint in head.joints.values()])
     wire = partial(VirtualTimePort, chain.device, chain.control, config.baud, clock)
-    board = config.family in heads.BOARDS
+    board = config.family in BOARDS
     more: dict[str, Any] = {"confirmed": True} if board else {"faults": head.faults}
     module, kind = heads.FAMILIES[config.family].split(":")
     build = getattr(import_module(module), kind)

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.app.bench.measure import HEAD
-from sfms_robot.app.listen.run import RunOptions, run_head
-from sfms_robot.listeners.remote import threads
-from sfms_robot.sources.recording import DEFAULT_SPEAKER
+from sfms_robot.app.session import RunOptions, run
+from sfms_robot.listeners.process import threads
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 
 RUN_S: Final = 8.0
 VOICE: Final = "katie"
@@ -26,7 +26,7 @@ def in_run(folder: Path, duration_s: float = RUN_S) -> dict[str, Any]:
     options = RunOptions(
         head=HEAD, listener=str(folder), audio=DEFAULT_SPEAKER, agent_audio=VOICE, duration_s=duration_s
     )
-    report = run_head(options)
+    report = run(options)
     step_ms = report["listener_step_ms"]
     return {
         "head": HEAD,

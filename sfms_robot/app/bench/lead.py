@@ -8,21 +8,25 @@ emulated angle is highest, between two ticks by a parabola. It counts all there 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.bench.measure import HEAD, Row, row
-from sfms_robot.app.session import build_bus, build_motion, emulated
+from sfms_robot.app.head.pose import NobodyThere
+from sfms_robot.app.session import build_bus, build_motion
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock, Tick
 from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.feed import IDLE_FEED
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 
@@ -77,22 +81,8 @@ class Waves:
         times_s = made_at_s + FRAME_S * np.arange(1.0, HORIZON + 1)
         return [Plan(made_at_s, times_s, self.face(times_s))]
 
-    def step_times_ms(self) -> Sequence[float]:
-        return []
-
-    def unheard(self) -> int:
-        return 0
-
-    def close(self) -> None: ...
-
-
-class Nobody:
-    """`ports.Source` of a speaker who is not there."""
-
-    duration_s: float | None = None
-
-    def read(self, now_s: float) -> Sequence[SpeakerFrame]:
-        return []
+    def statistics(self) -> Mapping[str, Any]:
+        return IDLE_FEED
 
     def close(self) -> None: ...
 
@@ -148,7 +138,15 @@ def _delays(head: Head, rate_hz: float, leads_s: Doubles, duration_s: float) -> 
         bus.connect()
         seen = Onlooker(head, chains, clock)
         parts = Parts(
-            Nobody(), waves, motion.timeline, motion.retargeter, motion.limiter, bus, [seen], leads_s, motion.rest_rad
+            NobodyThere(),
+            waves,
+            motion.timeline,
+            motion.retargeter,
+            motion.limiter,
+            bus,
+            [seen],
+            leads_s,
+            motion.rest_rad,
         )
         log = RunLog(motion.retargeter.joints, 1.0 / rate_hz, motion.audit)
         drive(parts, clock, log, rate_hz=rate_hz, duration_s=duration_s, interrupted=lambda: False)

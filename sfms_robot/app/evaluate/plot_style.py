@@ -13,11 +13,6 @@ if TYPE_CHECKING:
 
 INK, FAINT, RULE, TRUTH, KEY = "#2a2d34", "#7d828c", "#e4e9ec", "#9aa3ad", "#c8553d"
 SERIES: Final = ("#1f6f9c", "#c29a2e", "#5b8c5a", "#c8553d", "#7a5c99")
-KINDS: Final = {
-    "sparse": (SERIES[3], "sparse keyframes"),
-    "dense": (SERIES[0], "dense, codes every frame"),
-    "grouped": (SERIES[1], "grouped, codes every 8 frames"),
-}
 _DPI: Final = 110
 
 

@@ -14,10 +14,10 @@ from rich.progress import Progress
 from torch import Tensor
 
 from sfms_robot import config
-from sfms_robot.app.train.training import device_of
+from sfms_robot.app.train.train_runs import device_of
 from sfms_robot.corpora.takes import Take
 from sfms_robot.evaluation.paper.recipes import SizeName, recipes
-from sfms_robot.evaluation.paper.train import train
+from sfms_robot.evaluation.paper.table_trainer import train
 from sfms_robot.learning import resume
 from sfms_robot.learning.job import Run
 from sfms_robot.learning.watch import Watch, progress_bar

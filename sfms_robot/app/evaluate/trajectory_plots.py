@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from sfms_robot.app.evaluate.plot_style import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain
-from sfms_robot.evaluation.paper.history import Look
-from sfms_robot.evaluation.paper.model import TableModel
-from sfms_robot.evaluation.paper.score import Windows
+from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
+from sfms_robot.evaluation.paper.restoration import Windows
+from sfms_robot.evaluation.paper.score_history import Snapshot
 from sfms_robot.frames import CHANNELS, FRAME_S, Floats
 
 if TYPE_CHECKING:
@@ -77,20 +77,22 @@ def _trajectory(
     plain(axes, 7)
 
 
-def scores_over_steps(looks: Sequence[Look]) -> Figure:
+def scores_over_steps(snapshots: Sequence[Snapshot]) -> Figure:
     """How the scores and the error of a few windows develop while the tokenizer learns, one window a column."""
-    windows = sorted({look.window for look in looks})
-    steps = sorted({look.step for look in looks})
+    windows = sorted({snapshot.window for snapshot in snapshots})
+    steps = sorted({snapshot.step for snapshot in snapshots})
     figure = new_figure(3.6 * len(windows), 1.35 * len(steps) + 0.9)
     grid = figure.subplots(len(steps), len(windows), squeeze=False, sharex=True)
-    for look in looks:
-        axes = grid[steps.index(look.step), windows.index(look.window)]
-        _look(axes, look)
-        if look.step == steps[0]:
-            axes.set_title(f"window {look.window + 1}: {CHANNELS[look.group]}", color=INK, fontsize=9, loc="left")
-        if look.window == windows[0]:
-            axes.set_ylabel(f"step {look.step}", color=INK, fontsize=8)
-        if look.step == steps[-1]:
+    for snapshot in snapshots:
+        axes = grid[steps.index(snapshot.step), windows.index(snapshot.window)]
+        _snapshot(axes, snapshot)
+        if snapshot.step == steps[0]:
+            axes.set_title(
+                f"window {snapshot.window + 1}: {CHANNELS[snapshot.group]}", color=INK, fontsize=9, loc="left"
+            )
+        if snapshot.window == windows[0]:
+            axes.set_ylabel(f"step {snapshot.step}", color=INK, fontsize=8)
+        if snapshot.step == steps[-1]:
             axes.set_xlabel("frame", color=INK, fontsize=8)
     figure.suptitle(
         "Log-probability of each frame as the first keyframe (line), keyframes (circles), error (area)",
@@ -99,12 +101,12 @@ def scores_over_steps(looks: Sequence[Look]) -> Figure:
     return figure
 
 
-def _look(axes: Axes, look: Look) -> None:
-    scores = np.array(look.scores)
+def _snapshot(axes: Axes, snapshot: Snapshot) -> None:
+    scores = np.array(snapshot.scores)
     axes.plot(scores, color=SERIES[0], linewidth=1.3)
-    axes.plot(look.keyframes, scores[look.keyframes], "o", color=KEY, markersize=4, markerfacecolor="none")
+    axes.plot(snapshot.keyframes, scores[snapshot.keyframes], "o", color=KEY, markersize=4, markerfacecolor="none")
     beside = axes.twinx()
-    beside.fill_between(range(len(look.errors)), look.errors, color=SERIES[1], alpha=0.35, linewidth=0)
+    beside.fill_between(range(len(snapshot.errors)), snapshot.errors, color=SERIES[1], alpha=0.35, linewidth=0)
     beside.set_ylim(bottom=0)
     plain(axes, 7)
     beside.tick_params(labelsize=6, colors=FAINT, length=2)

@@ -14,18 +14,13 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.app.calibrated_head import unit_head
-from sfms_robot.app.head.pose import Nobody
-from sfms_robot.app.session import SIM, Opened, build_bus, build_motion, devices, on_boards, plugged_in
+from sfms_robot.app.head.pose import NobodyThere
+from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head
-from sfms_robot.emulator.launch import launch
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats, Plan
-from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.runtime.recorder import Recorder
-from sfms_robot.runtime.safety import EASE_S, interrupt_flag, smooth
+from sfms_robot.runtime.recorder import FullPolicy, Recorder
+from sfms_robot.runtime.safety import EASE_S, Interrupt, smooth
 
 ALONE_S: Final = 1.6  # up and down again
 TOGETHER_S: Final = 1.0  # from one random face to the next
@@ -44,36 +39,18 @@ class Babbled:
 
 def babble(name: str, port: str, record: Path, *, minutes: float = 2.0, seed: int = 0, yes: bool = False) -> Babbled:
     """Move, and write DIR/run.mcap; on emulated servos in virtual time. Raises RobotError, the head at rest."""
-    head = unit_head(name, port)
-    if port != SIM and not yes and (jumping := on_boards(head)):
-        raise ConfigError(
-            f"head {head.name!r}: hobby servos jump to rest when they come on ({', '.join(jumping)}): --yes"
-        )
-    rate_hz = max(bus.rate_hz for bus in head.buses.values())
-    motion = build_motion(head, rate_hz)
-    clock = VirtualClock() if port == SIM else RealClock()
-    blind = set(motion.retargeter.blind_channels)
-    faces = Faces.of([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
     with ExitStack() as stack:
-        opened: Opened = {}
-        if port == SIM:
-            chains = plugged_in(name, head)
-            opened |= {bus: stack.enter_context(launch(chains[bus], True)) for bus in chains}
-        else:
-            opened |= devices(head, port)
-        bus = build_bus(head, opened, clock, confirmed=yes)
-        stack.callback(bus.close)
-        bus.connect()
-        recorder = Recorder(record, list(head.joints), "wait" if port == SIM else "drop", {"head": head.name})
+        opened = stack.enter_context(open_head(HeadOptions(name, port, fast=port == SIM, yes=yes)))
+        blind = set(opened.motion.retargeter.blind_channels)
+        faces = Faces.of([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
+        when_full: FullPolicy = "wait" if port == SIM else "drop"
+        recorder = Recorder(record, list(opened.config.joints), when_full, {"head": opened.config.name})
         stack.callback(recorder.close)
-        nobody = Nobody()
-        parts = Parts(
-            nobody, nobody, faces, motion.retargeter, motion.limiter, bus, [recorder], motion.leads_s, motion.rest_rad,
-        )  # fmt: skip
-        log = RunLog(motion.retargeter.joints, 1.0 / rate_hz, motion.audit)
-        with interrupt_flag() as interrupted:
-            exit_ = drive(parts, clock, log, rate_hz=rate_hz, duration_s=faces.duration_s, interrupted=interrupted)
-    return Babbled(head, exit_, faces.duration_s, log.audited.violations)
+        alone = NobodyThere()
+        drove = drive_head(opened, Programme(alone, alone, faces.duration_s, faces, observers=[recorder]), Interrupt())
+    if drove.error is not None:
+        raise drove.error
+    return Babbled(opened.config, drove.outcome, faces.duration_s, drove.log.audited.violations)
 
 
 class Faces:

@@ -17,7 +17,8 @@ from typing import Any, Final, Literal, Protocol
 
 from sfms_robot.app.calibrated_head import identify
 from sfms_robot.app.head.joint_probe import Probe, jumps, probe
-from sfms_robot.app.session import SIM, build_motion, devices, emulated
+from sfms_robot.app.session import build_motion
+from sfms_robot.app.wiring import SIM, devices, emulated
 from sfms_robot.config import Head, Joint, load_head
 from sfms_robot.config.overlay import (
     CalibrateLayer,

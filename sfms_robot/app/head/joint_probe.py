@@ -13,7 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.app.session import BOARDS, build_bus
+from sfms_robot.app.calibrated_head import BOARDS
+from sfms_robot.app.session import build_bus
 from sfms_robot.config import Head, Joint, load_firmware_map
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ServoError

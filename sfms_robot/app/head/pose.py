@@ -8,22 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.calibrated_head import unit_head
-from sfms_robot.app.session import SIM, Opened, build_bus, build_motion, devices, on_boards, plugged_in
-from sfms_robot.emulator.launch import launch
+from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.runtime.safety import EASE_S, interrupt_flag, smooth
+from sfms_robot.runtime.feed import IDLE_FEED
+from sfms_robot.runtime.safety import EASE_S, Interrupt, smooth
 
 RISE_S: Final = 0.5
 MOVED_DEG: Final = 0.1
@@ -97,47 +93,27 @@ def _value(channel: str, text: str) -> float:
 def pose_head(options: PoseOptions) -> dict[str, Any]:
     """Rise to the face, hold it, back to rest. Says how far each joint went. Raises RobotError, the head at rest."""
     face = parse_face(options.face)
-    if options.fast and options.port != SIM:
-        raise ConfigError(f"--port {options.port!r}: --fast needs emulated servos, time is virtual (sim)")
-    head = unit_head(options.head, options.port)
-    if options.port != SIM and not options.yes and (jumping := on_boards(head)):
-        named = ", ".join(jumping)
-        raise ConfigError(f"head {head.name!r}: hobby servos jump to rest when they come on ({named}): --yes")
-    rate_hz = max(bus.rate_hz for bus in head.buses.values())
-    motion = build_motion(head, rate_hz)
-    clock = VirtualClock() if options.fast else RealClock()
-    held = Held(face, options.hold_s)
-    furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
-    with ExitStack() as stack:
-        opened: Opened = {}
-        if options.port == SIM:
-            chains = plugged_in(options.head, head)
-            opened |= {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
-        else:
-            opened |= devices(head, options.port)
-        bus = build_bus(head, opened, clock, confirmed=options.yes)
-        stack.callback(bus.close)
-        bus.connect()
-        parts = Parts(
-            Nobody(), Nobody(), held, motion.retargeter, motion.limiter, bus, [furthest],
-            motion.leads_s, motion.rest_rad,
-        )  # fmt: skip
-        log = RunLog(motion.retargeter.joints, 1.0 / rate_hz, motion.audit)
-        with interrupt_flag() as interrupted:
-            outcome = drive(parts, clock, log, rate_hz=rate_hz, duration_s=held.duration_s, interrupted=interrupted)
+    held = HeldFace(face, options.hold_s)
+    with open_head(HeadOptions(options.head, options.port, options.fast, options.yes)) as opened:
+        motion = opened.motion
+        furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
+        alone = NobodyThere()
+        drove = drive_head(opened, Programme(alone, alone, held.duration_s, held, observers=[furthest]), Interrupt())
+    if drove.error is not None:
+        raise drove.error
     shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]
     return {
         "version": 1,
-        "head": head.name,
+        "head": opened.config.name,
         "face": list(options.face),
         "port": options.port,
-        "exit": outcome,
+        "exit": drove.outcome,
         "joints": furthest.moved(),
         "blind": [name for name in shown if name in motion.retargeter.blind_channels],
     }
 
 
-class Held:
+class HeldFace:
     """A timeline of one face: torque comes on and settles, the face rises, stays for `hold_s`, and falls."""
 
     def __init__(self, face: Floats, hold_s: float) -> None:
@@ -157,8 +133,8 @@ class Held:
         return (share[:, None] * self._face).astype(np.float32), None
 
 
-class Nobody:
-    """No speaker and no listener: a source and a feed of nothing."""
+class NobodyThere:
+    """The empty source and the empty feed: nobody speaks, nobody listens."""
 
     duration_s = None
 
@@ -171,11 +147,8 @@ class Nobody:
     def poll(self, now_s: float) -> Sequence[Plan]:
         return ()
 
-    def step_times_ms(self) -> Sequence[float]:
-        return ()
-
-    def unheard(self) -> int:
-        return 0
+    def statistics(self) -> Mapping[str, Any]:
+        return IDLE_FEED
 
     def close(self) -> None:
         """Nothing is open."""

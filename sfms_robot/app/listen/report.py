@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from sfms_robot.ports import Bus, PlanFeed
-from sfms_robot.runtime.log import RunLog, quantiles
-from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
+from sfms_robot.runtime.log import RunLog
 
 
 def run_report(
@@ -21,13 +18,16 @@ def run_report(
     port: str,
     seed: int,
     outcome: str,
+    error: Exception | None,
     rate_hz: float,
     elapsed_s: float | None,
     priority: str,
 ) -> dict[str, Any]:
     """Version 1 of the report. `elapsed_s` None means virtual time: wall-clock figures are null."""
     real = elapsed_s is not None
-    listened = np.asarray(log.pitch_rad), np.asarray(log.blink), np.asarray(log.smile)
+    heard = dict(feed.statistics())
+    timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
+    plans = _counts(timeline, ("held", "eased", "late", "refused"))
     return {
         "version": 1,
         "head": head,
@@ -36,22 +36,29 @@ def run_report(
         "seed": seed,
         "duration_s": round(log.listened_s, 4),
         "exit": outcome,
+        "error": None if error is None else str(error),
         "frames": log.frames,
-        "ticks": len(log.late_ms),
+        "ticks": log.ticks,
         "tick": log.tick_report(rate_hz, elapsed_s),
         "latency_ms": {
-            "frame_to_wire": quantiles(log.frame_to_wire_ms if real else (), p50=50, p99=99),
-            "speech_to_wire": quantiles(log.speech_to_wire_ms if real else (), p50=50, p95=95),
+            "frame_to_wire": log.frame_to_wire_ms.report(p50=50, p99=99) if real else {"p50": None, "p99": None},
+            "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},
         },
-        "listener_step_ms": quantiles(feed.step_times_ms(), p50=50, p99=99),
+        "listener_step_ms": heard.pop("step_ms"),
+        "listener_state": heard,
         "bus": dict(bus.statistics()),
-        "limits": {"violations": log.audited.violations, "clamped": log.audited.clamped},
-        "joints": log.joint_report(),
-        "motion": {
-            "nods": len(find_nods(listened[0], rate_hz)),
-            "blinks": len(find_blinks(listened[1], rate_hz)),
-            "smiles": len(find_smiles(listened[2], rate_hz)),
+        "limits": {
+            "violations": log.audited.violations if log.audited else 0,
+            "clamped": log.audited.clamped if log.audited else 0,
+            **_counts(limiter, ("chased", "refused")),
         },
-        "plans": {"refused": log.refused_plans, "unheard_frames": feed.unheard()},
+        "joints": log.joint_report(),
+        "motion": log.motion_report(),
+        "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
+        "observers_detached": dict(log.detached),
         "priority": priority,
     }
+
+
+def _counts(state: object, names: tuple[str, ...]) -> dict[str, int]:
+    return {name: int(getattr(state, name)) for name in names if hasattr(state, name)}

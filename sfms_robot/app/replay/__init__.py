@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from sfms_robot.app.evaluate.plot_style import checked_png
-from sfms_robot.app.replay.plot import plot
-from sfms_robot.app.replay.recording import RunRecording, read_recording, summary
-from sfms_robot.app.replay.sheet import sheet
+from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
+from sfms_robot.app.replay.run_plot import plot
+from sfms_robot.app.replay.run_sheet import sheet
 
 __all__ = ["RunRecording", "plot", "read_recording", "replay_run", "sheet", "summary"]
 

@@ -127,7 +127,7 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
             device = port or only_port()
             yield Line(None, device, device, family, baud, DEFAULT_RATE_HZ, {})
             return
-    from sfms_robot.app.session import devices, plugged_in  # slow to load, and only a head needs it
+    from sfms_robot.app.wiring import devices, plugged_in  # slow to load, and only a head needs it
 
     described = load_head(head)
     if port == SIM:

@@ -203,7 +203,7 @@ def open_wire(
     kind = _family(family)
     with ExitStack() as stack:
         if port == SIM:
-            from sfms_robot.app.session import plugged_in  # its numerics take longer to load than most tools to run
+            from sfms_robot.app.wiring import plugged_in  # its numerics take longer to load than most tools to run
 
             servos = next(iter(plugged_in(head, load_head(head)).values()))
             device, first = stack.enter_context(launch(servos)).device, servos[0].baud

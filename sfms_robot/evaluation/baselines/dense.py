@@ -2,7 +2,6 @@
 
 After "Finite Scalar Quantization as Facial Tokenizer for Dyadic Reaction Generation" ([10] of the SFMS paper), which
 published no code: a transformer reads the window, each frame is quantized, a second transformer restores the window.
-More codes a frame (`codes_at_once`) are ours, for comparisons at equal bits.
 """
 
 from __future__ import annotations
@@ -36,32 +35,31 @@ class Stack(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """width -> n codes -> width, one step of time at a time."""
+    """width -> a code -> width, one step of time at a time."""
 
     def __init__(self, settings: config.Baseline) -> None:
         super().__init__()
-        self.count = settings.codes_at_once
-        self.codebook = _codebook(settings.quantizer, settings.levels, self.count, settings.code_dims)
-        self.down = nn.Linear(settings.width, self.count * self.codebook.dims)
-        self.up = nn.Linear(self.count * self.codebook.dims, settings.width)
+        self.codebook = _codebook(settings.quantizer, settings.levels, settings.code_dims)
+        self.down = nn.Linear(settings.width, self.codebook.dims)
+        self.up = nn.Linear(self.codebook.dims, settings.width)
 
     def latent(self, x: Tensor) -> Tensor:
-        """(B, T, width) -> (B, T, n, D)."""
-        out: Tensor = self.down(x).unflatten(-1, (self.count, -1))
+        """(B, T, width) -> (B, T, 1, D)."""
+        out: Tensor = self.down(x)[..., None, :]
         return out
 
     def restore(self, codes: Tensor) -> Tensor:
-        """(B, T, n, D) -> (B, T, width)."""
+        """(B, T, 1, D) -> (B, T, width)."""
         out: Tensor = self.up(codes.flatten(2))
         return out
 
 
-def _codebook(kind: str, levels: Sequence[int], count: int, dims: int) -> Grid | Codebook:
-    return Grid([levels] * count) if kind == "fsq" else Codebook([math.prod(levels)] * count, dims)
+def _codebook(kind: str, levels: Sequence[int], dims: int) -> Grid | Codebook:
+    return Grid([levels]) if kind == "fsq" else Codebook([math.prod(levels)], dims)
 
 
 class DenseTokenizer(nn.Module):
-    """Motion (B, T, C), standardised <-> indices (B, T, n)."""
+    """Motion (B, T, C), standardised <-> indices (B, T, 1)."""
 
     def __init__(self, settings: config.Baseline, channels: int) -> None:
         super().__init__()
@@ -75,10 +73,10 @@ class DenseTokenizer(nn.Module):
     @property
     def bits_per_window(self) -> float:
         """Codes of a whole window; their places are known."""
-        return self.settings.window_frames * self.settings.codes_at_once * math.log2(self.settings.codes)
+        return self.settings.window_frames * math.log2(self.settings.codes)
 
     def encode(self, motion: Tensor) -> Tensor:
-        """(B, T, C) -> indices (B, T, n)."""
+        """(B, T, C) -> indices (B, T, 1)."""
         return self.bottleneck.codebook.indices(self.bottleneck.codebook.nearest(self.latent(motion)))
 
     def decode(self, indices: Tensor) -> Tensor:
@@ -86,11 +84,11 @@ class DenseTokenizer(nn.Module):
         return self.synthesise(self.bottleneck.codebook.codes(indices))
 
     def latent(self, motion: Tensor) -> Tensor:
-        """(B, T, C) -> (B, T, n, D), not yet codes."""
+        """(B, T, C) -> (B, T, 1, D), not yet codes."""
         return self.bottleneck.latent(self.encoder(self.read(motion)))
 
     def synthesise(self, codes: Tensor) -> Tensor:
-        """(B, T, n, D) -> (B, T, C)."""
+        """(B, T, 1, D) -> (B, T, C)."""
         out: Tensor = self.write(self.decoder(self.bottleneck.restore(codes)))
         return out
 

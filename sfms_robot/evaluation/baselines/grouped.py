@@ -2,7 +2,7 @@
 
 Ng et al. 2022, "Learning to Listen", as its published configuration describes it (evonneng/learning2listen @ a0825d58):
 three stages halve the time, one by a strided convolution and two by pooling, transformers stand on both sides of the
-codes, and 200 vectors are learned (the SFMS paper compares with 256). More codes a group are ours, for equal bits.
+codes, and 200 vectors are learned (the SFMS paper compares with 256).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SLOPE = 0.2  # of the leaky rectifiers between convolutions
 
 
 class GroupedTokenizer(DenseTokenizer):
-    """Motion (B, T, C), standardised <-> indices (B, T / 8, n); T a multiple of 8."""
+    """Motion (B, T, C), standardised <-> indices (B, T / 8, 1); T a multiple of 8."""
 
     def __init__(self, settings: config.Grouped, channels: int) -> None:
         super().__init__(settings, channels)
@@ -35,7 +35,7 @@ class GroupedTokenizer(DenseTokenizer):
         return super().bits_per_window / GROUP
 
     def latent(self, motion: Tensor) -> Tensor:
-        """(B, T, C) -> (B, T / 8, n, D), not yet codes."""
+        """(B, T, C) -> (B, T / 8, 1, D), not yet codes."""
         x = self.read(motion).transpose(1, 2)
         frames = x.shape[-1]
         for stage in self.shorten:
@@ -45,7 +45,7 @@ class GroupedTokenizer(DenseTokenizer):
         return self.bottleneck.latent(self.encoder(x.transpose(1, 2)))
 
     def synthesise(self, codes: Tensor) -> Tensor:
-        """(B, T / 8, n, D) -> (B, T, C)."""
+        """(B, T / 8, 1, D) -> (B, T, C)."""
         x = self.bottleneck.restore(codes).transpose(1, 2)
         for stage in self.lengthen:
             x = F.leaky_relu(stage(x.repeat_interleave(2, dim=-1)), SLOPE)

@@ -3,7 +3,7 @@
 FRRea, a distance between rendered images, is out of scope: nothing here renders faces for judging.
 """
 
-from sfms_robot.evaluation.metrics.dim import (
+from sfms_robot.evaluation.metrics.dim_metrics import (
     cluster_centres,
     frechet_distance,
     l2,
@@ -14,7 +14,7 @@ from sfms_robot.evaluation.metrics.dim import (
     sts,
     variance,
 )
-from sfms_robot.evaluation.metrics.react import (
+from sfms_robot.evaluation.metrics.react_metrics import (
     ccc,
     dtw,
     frc,

@@ -21,7 +21,6 @@ KEYFRAMES: Final = (3, 7, 10)  # of table III
 FSQ_256: Final = (4, 4, 4, 4)  # of many channels
 FSQ_256_SCALAR: Final = (256,)  # of one: four coarse digits of one number are harder to learn, and end twice as far off
 FSQ_1024: Final = (8, 5, 5, 5)
-MOST_KEYFRAMES: Final = 12  # of the adaptive tokenizer
 
 
 @dataclass(frozen=True)
@@ -61,8 +60,8 @@ def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, con
         }
         found[name] = _recipe(name, listener, training | more)
 
-    def baseline(name: str, kind: str, quantizer: str, levels: Sequence[int], at_once: int = 1) -> None:
-        settings = {"kind": kind, "quantizer": quantizer, "levels": list(levels), "codes_at_once": at_once,
+    def baseline(name: str, kind: str, quantizer: str, levels: Sequence[int]) -> None:
+        settings = {"kind": kind, "quantizer": quantizer, "levels": list(levels),
                     "width": chosen.width, "layers": chosen.baseline_layers}  # fmt: skip
         # The encoder term of Learning2Listen's published configuration weighs a quarter.
         found[name] = _recipe(name, settings, training | {"commitment": 0.25})
@@ -79,26 +78,7 @@ def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, con
     baseline("l2l-vq-200", "grouped", "vq", (200,))
     baseline("dense-fsq-1024", "dense", "fsq", FSQ_1024)
     sparse("sparse-all-k10-vq-256", "all", FSQ_256_SCALAR, 10, quantizer="vq")
-    sparse("sparse-all-adaptive", "all", FSQ_256_SCALAR, 10, "nested", keyframes_drawn=[1, MOST_KEYFRAMES])
-    for name, levels, k, placement in SPARSE_AT_BITS:
-        sparse(name, "all", (levels,), k, placement)
-    for n in (2, 4, 8):
-        baseline(f"dense-fsq-1024x{n}", "dense", "fsq", FSQ_1024, n)
-    for n in (4, 8, 16, 32, 64):
-        baseline(f"l2l-vq-256x{n}", "grouped", "vq", (256,), n)
     return found
-
-
-# Levels of a channel's code, keyframes, placement: chosen so that together they span 180 to 3,100 bits. Below about
-# 1,000 the places of keyframes cost more bits than they bring: evenly placed ones are known to the reader.
-SPARSE_AT_BITS: Final[tuple[tuple[str, int, int, str], ...]] = (
-    ("bits-all-3-k2-static", 3, 2, "static"),
-    ("bits-all-4-k3-static", 4, 3, "static"),
-    ("bits-all-8-k4-static", 8, 4, "static"),
-    ("bits-all-8-k6-static", 8, 6, "static"),
-    ("bits-all-8-k3", 8, 3, "exact"),
-    ("bits-all-32-k6", 32, 6, "exact"),
-)
 
 
 def _recipe(name: str, model: dict[str, Any], training: dict[str, Any]) -> config.Recipe:

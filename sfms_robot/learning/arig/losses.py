@@ -17,9 +17,9 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.config.arig import STATES
+from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
-from sfms_robot.listeners.arig.sound import MEL_WIDTH
 from sfms_robot.signals import mel
 
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
@@ -29,7 +29,7 @@ COLD = 0.5  # share of windows whose past is exact
 SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
 
 
-class Pupil(nn.Module):
+class Student(nn.Module):
     """The model, and the layer that reads motion off its coarse motion while it learns."""
 
     def __init__(self, model: ArigModel) -> None:
@@ -51,7 +51,13 @@ class Parts:
 
 
 def loss_parts(
-    pupil: Pupil, told: Dyad, states: Tensor, truth: Tensor, draws: int, generator: torch.Generator, previous: Tensor
+    student: Student,
+    told: Dyad,
+    states: Tensor,
+    truth: Tensor,
+    draws: int,
+    generator: torch.Generator,
+    previous: Tensor,
 ) -> Parts:
     """Losses of frames 1..N-1.
 
@@ -62,13 +68,13 @@ def loss_parts(
         draws: noise levels per frame.
         previous: (B, N) the states it is told, of which each frame gets the one before.
     """
-    model = pupil.model
+    model = student.model
     found = model.condition(told, previous)
     target = model.standardise(truth[:, 1:])
     to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]))
     z, wanted = (each.flatten(0, 1).repeat(draws, 1) for each in (found.z, to_draw))
     motion = model.head.loss(z, wanted, generator).mean()
-    coarse = (pupil.readout(found.outline) - target).square().mean()
+    coarse = (student.readout(found.outline) - target).square().mean()
     known = states[:, 1:] >= 0
     state = motion.new_zeros(())
     if found.states is not None and bool(known.any()):
@@ -88,11 +94,11 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     b, n = dyad.user_heard.shape
     device = dyad.agent_motion.device
 
-    def lot(share: float) -> Tensor:
+    def dropped(share: float) -> Tensor:
         return (torch.rand(b, 1, generator=generator) < share).to(device)
 
-    deaf, blind = lot(phase.drop_audio), lot(phase.drop_face)
-    mute = lot(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
+    deaf, blind = dropped(phase.drop_audio), dropped(phase.drop_face)
+    mute = dropped(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
     voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf], dim=-1)
     user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
     slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, model, phase, generator))
@@ -148,8 +154,8 @@ def _wander(
 
 
 def previous_states(states: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """(B, N) what the model is told: unlabelled ones count as `waiting`, a share is drawn by lot."""
+    """(B, N) what the model is told: unlabelled ones count as `waiting`, a share of them is drawn at random."""
     known = torch.where(states < 0, FIRST, states)
     drawn = torch.randint(len(STATES), states.shape, generator=generator).to(states.device)
-    by_lot = (torch.rand(states.shape, generator=generator) < share).to(states.device)
-    return torch.where(by_lot, drawn, known)
+    replaced = (torch.rand(states.shape, generator=generator) < share).to(states.device)
+    return torch.where(replaced, drawn, known)

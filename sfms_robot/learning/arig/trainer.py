@@ -12,8 +12,8 @@ from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
-from sfms_robot.learning.arig.corpus import SCENES, Corpus, fit_scales, gather, open_scenes
-from sfms_robot.learning.arig.losses import Parts, Pupil, augment, loss_parts, previous_states
+from sfms_robot.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
+from sfms_robot.learning.arig.losses import Parts, Student, augment, loss_parts, previous_states
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
@@ -37,16 +37,16 @@ def train_arig(
     """
     listener, phase = settings.listener, settings.training
     torch.manual_seed(settings.seed)
-    pupil = Pupil(ArigModel(listener))
-    space, width = MotionSpace.of(listener), pupil.model.sound_width
+    student = Student(ArigModel(listener))
+    space, width = MotionSpace.of(listener), student.model.sound_width
     corpus = gather(open_scenes(data, "train"), phase.window_frames, space, width)
     held_out = gather(open_scenes(data, "validation"), phase.window_frames, space, width)
-    fit_scales(pupil.model, corpus, listener.channels)
-    job = arig_job(settings, pupil, corpus, held_out, run.device)
+    fit_scales(student.model, corpus, listener.channels)
+    job = arig_job(settings, student, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     checkpoint.save_config(out, listener)
-    checkpoint.save_weights(out / checkpoint.WEIGHTS, pupil.model.cpu(), half=True)
-    parts = held_out_parts(pupil.to(run.device), held_out.to(run.device), phase)
+    checkpoint.save_weights(out / checkpoint.WEIGHTS, student.model.cpu(), half=True)
+    parts = held_out_parts(student.to(run.device), held_out.to(run.device), phase)
     return {
         **asdict(outcome),
         "held_out_noise": float(parts.motion),
@@ -56,30 +56,30 @@ def train_arig(
 
 
 def arig_job(
-    settings: config.ArigTraining, pupil: Pupil, corpus: Corpus, held_out: Corpus, device: torch.device
+    settings: config.ArigTraining, student: Student, corpus: ArigCorpus, held_out: ArigCorpus, device: torch.device
 ) -> Job:
     """The training as the loop takes it, on a model whose scales are set; moves it to `device`."""
     phase = settings.training
-    starts = corpus.starts(phase.window_frames)
+    starts = corpus.starts_by_scene(phase.window_frames)
     for stage in phase.stages:
         weights_of(stage, starts)
     fingerprint = corpus.fingerprint()
-    pupil.to(device)
+    student.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
 
     def loss_of(step: int, generator: torch.Generator) -> Tensor:
         chosen = draw(starts, weights_of(phase.stage(step), starts), phase.batch, generator)
-        dyad, states = corpus.cut(chosen.to(device), phase.window_frames)
-        told, truth = augment(dyad, pupil.model, phase, generator)
-        previous = previous_states(states, phase.state_noise, generator)
-        return loss_parts(pupil, told, states, truth, phase.draws, generator, previous).total(phase)
+        dyad = cut(corpus, chosen.to(device), phase.window_frames)
+        told, truth = augment(dyad, student.model, phase, generator)
+        previous = previous_states(dyad.states, phase.state_noise, generator)
+        return loss_parts(student, told, dyad.states, truth, phase.draws, generator, previous).total(phase)
 
     return Job(
         name="arig",
-        model=pupil,
-        optimizers=[optimizer(pupil.parameters(), phase.learning_rate, phase.weight_decay)],
+        model=student,
+        optimizers=[optimizer(student.parameters(), phase.learning_rate, phase.weight_decay)],
         loss_of=loss_of,
-        held_out=lambda: float(held_out_parts(pupil, held_out, phase).total(phase)),
+        held_out=lambda: float(held_out_parts(student, held_out, phase).total(phase)),
         frames_per_step=phase.batch * phase.window_frames,
         phase=phase,
         seed=settings.seed,
@@ -110,16 +110,16 @@ def draw(starts: Mapping[str, Tensor], weights: Tensor, count: int, generator: t
 
 
 @torch.no_grad()
-def held_out_parts(pupil: Pupil, corpus: Corpus, phase: config.ArigPhase) -> Parts:
+def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase) -> Parts:
     """Losses on windows drawn with a fixed seed as the last stage draws them, without augmentation."""
-    pupil.eval()
+    student.eval()
     generator = torch.Generator().manual_seed(0)
-    starts = corpus.starts(phase.window_frames)
+    starts = corpus.starts_by_scene(phase.window_frames)
     chosen = draw(starts, weights_of(phase.stages[-1], starts), HELD_OUT_WINDOWS, generator)
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
-        dyad, states = corpus.cut(some.to(corpus.states.device), phase.window_frames)
-        previous = previous_states(states, phase.state_noise, generator)
-        found.append(loss_parts(pupil, dyad, states, dyad.agent_motion, phase.draws, generator, previous))
+        dyad = cut(corpus, some.to(corpus.frames.states.device), phase.window_frames)
+        previous = previous_states(dyad.states, phase.state_noise, generator)
+        found.append(loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase.draws, generator, previous))
     mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
     return Parts(**mean)

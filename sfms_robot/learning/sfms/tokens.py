@@ -2,17 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from sfms_robot.learning.sfms.corpus import Corpus, place_all
-from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.learning.sfms.features import SfmsCorpus
+from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
+
+STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
 
 
 @torch.no_grad()
-def tokenise(model: SfmsModel, corpus: Corpus) -> Tensor:
+def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
+    """Keyframe masks (N, G) of all dyads, placed stretch by stretch so that busy seconds may borrow from quiet ones."""
+    size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
+    masks = []
+    for dyad in torch.split(motion, list(lengths)):
+        for stretch in torch.split(dyad, _stretches(len(dyad), size, tokenizer.window)):
+            masks.append(tokenizer.place(stretch[None])[0])
+    return torch.cat(masks)
+
+
+def _stretches(frames: int, size: int, least: int) -> list[int]:
+    """Lengths that add up to `frames`, none under `least` unless there is only one."""
+    whole, rest = divmod(frames, size)
+    sizes = [size] * whole
+    if rest and (rest >= least or not sizes):
+        sizes.append(rest)
+    elif rest:
+        sizes[-1] += rest
+    return sizes
+
+
+@torch.no_grad()
+def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Tokens (N, G) of every listener in the corpus."""
-    motion = model.standardise(corpus.motion)
+    motion = model.standardise(corpus.frames.motion)
     mask = place_all(model.tokenizer, motion, corpus.lengths)
     parts = zip(torch.split(motion, 4096), torch.split(mask, 4096), strict=True)
     return torch.cat([model.tokenizer.encode(m[None], k[None])[0] for m, k in parts])

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot.config.arig import STATES
-from sfms_robot.listeners.arig.parts import LayerNorm, Linear, Look, Part
+from sfms_robot.listeners.arig.parts import CrossAttention, LayerNorm, Linear, Part
 
 FIRST: Final = STATES.index("waiting")  # of a stream: nobody has spoken yet
 
@@ -32,7 +32,7 @@ class StateUnderstanding(Part):
         super().__init__()
         self.previous = nn.Embedding(len(STATES), width)
         self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
-        self.look = Look(width, hidden, heads, slots=3)
+        self.look = CrossAttention(width, hidden, heads, slots=3)
         self.norm = LayerNorm(width)
         self.classify = Linear(width, len(STATES))
 

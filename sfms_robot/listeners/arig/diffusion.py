@@ -4,7 +4,7 @@ Training: noise prediction, equation (3). Sampling: equation (4) over evenly spr
 Nichol and Dhariwal 2021, as the paper trains and samples with different step counts), or DDIM (Song et al. 2021).
 The sampler draws nothing itself: noise is an argument, so one seed gives one motion wherever it is drawn.
 
-The schedule is a cosine that ends at a signal share of 0.03 (of amplitude) instead of 0: predicting noise says nothing
+The schedule is a cosine that ends at a signal amplitude of 0.03 instead of 0: predicting noise says nothing
 about motion where there is none, and with 15 steps the first of them would be wasted on that.
 """
 
@@ -23,13 +23,13 @@ from sfms_robot.listeners.arig.parts import Linear, Modulation, modulated
 from sfms_robot.listeners.layers import sinusoidal
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
-COSINE_END = 0.98  # share of the quarter turn that the schedule goes
+COSINE_END = 0.98  # part of the quarter circle that the schedule goes
 
 
-def signal_share(levels: int) -> Tensor:
+def cosine_alpha_bar(levels: int) -> Tensor:
     """alpha-bar of every noise level (levels,), float64, falling from nearly 1."""
-    turn = torch.arange(1, levels + 1, dtype=torch.float64) / levels
-    return torch.cos(turn * COSINE_END * math.pi / 2) ** 2
+    angle = torch.arange(1, levels + 1, dtype=torch.float64) / levels
+    return torch.cos(angle * COSINE_END * math.pi / 2) ** 2
 
 
 class Denoiser(nn.Module):
@@ -37,8 +37,8 @@ class Denoiser(nn.Module):
 
     low: Tensor
     high: Tensor
-    share: Tensor
-    warmth: Tensor
+    alpha_bar: Tensor
+    temperature: Tensor
     places: Tensor
 
     def __init__(self, names: Sequence[str], condition: int, settings: config.Diffusion) -> None:
@@ -47,11 +47,11 @@ class Denoiser(nn.Module):
         self.settings = settings
         self.register_buffer("low", torch.full((channels,), -8.0))  # standardised motion that is possible at all
         self.register_buffer("high", torch.full((channels,), 8.0))
-        self.register_buffer("share", signal_share(settings.train_steps).float(), persistent=False)
+        self.register_buffer("alpha_bar", cosine_alpha_bar(settings.train_steps).float(), persistent=False)
         first, last = torch.tensor([settings.temperature_of(name) for name in names]).unbind(-1)
         late = torch.linspace(0, 1, max(1, settings.steps - 1))[:, None]
-        warmth = first + late * (last - first)  # (K - 1, C)
-        self.register_buffer("warmth", warmth, persistent=False)
+        temperature = first + late * (last - first)  # (K - 1, C)
+        self.register_buffer("temperature", temperature, persistent=False)
         self.register_buffer("places", sinusoidal(settings.train_steps, width), persistent=False)
         self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))
         self.condition = Linear(condition, width)
@@ -88,8 +88,8 @@ class Denoiser(nn.Module):
         n = len(motion)
         t = torch.randint(0, self.settings.train_steps, (n,), generator=generator).to(motion.device)
         noise = torch.randn(motion.shape, generator=generator).to(motion.device)
-        share = self.share[t][:, None]
-        noisy = share.sqrt() * motion + (1 - share).sqrt() * noise
+        alpha_bar = self.alpha_bar[t][:, None]
+        noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise
         found = self(noisy, self.modulate(z, self.level(t)))
         wrong: Tensor = (noise - found).square().mean(-1)
         return wrong
@@ -110,7 +110,7 @@ class Denoiser(nn.Module):
         # The modulation of every step in one product: (K, N, W) conditions, of a single sample (K, W).
         told = self.condition(z) + levels[:, None] if n > 1 else self.condition(z) + levels
         parts = [each.chunk(self.modulation.parts, -1) for each in self.modulation.linear(F.silu(told)).unbind(0)]
-        x, added = noise[:, 0], (noise[:, 1:] * self.warmth).unbind(1)
+        x, added = noise[:, 0], (noise[:, 1:] * self.temperature).unbind(1)
         low, high, weights = self.low, self.high, self._weights()
         for index, step in enumerate(self.table):
             found = _denoise(x, parts[k - 1 - index], weights)
@@ -155,10 +155,10 @@ def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
     M_0 is not clamped the two are the same. sigma^2 = (1 - alpha) (1 - ab_s) / (1 - ab_t).
     DDIM keeps what is not motion: M_s = sqrt(ab_s) M_0 + stay (M_t - sqrt(ab_t) M_0), stay^2 = (1 - ab_s) / (1 - ab_t).
     """
-    shares = signal_share(settings.train_steps)[list(levels)].tolist()
+    alpha_bars = cosine_alpha_bar(settings.train_steps)[list(levels)].tolist()
     out = []
-    for index in reversed(range(len(shares))):
-        now, after = shares[index], shares[index - 1] if index else 1.0
+    for index in reversed(range(len(alpha_bars))):
+        now, after = alpha_bars[index], alpha_bars[index - 1] if index else 1.0
         alpha = now / after
         denoise = (now**-0.5, -(((1 - now) / now) ** 0.5))
         if settings.sampler == "ddim":

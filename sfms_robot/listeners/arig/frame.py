@@ -32,7 +32,7 @@ class Frame(Part):
         seen: Tensor,
         first: Tensor,
         state: Tensor,
-        turn: Tensor,
+        rotary: Tensor,
         past: Tensor,
         agent_sound: Tensor,
         agent_behaviour: Tensor,
@@ -49,7 +49,7 @@ class Frame(Part):
             face: (1, C) standardised motion of the user; seen: (1,) bool.
             first: () bool, of the stream: chunks begin as its behaviour repeated (A.2).
             state: (1,) conversational state of the frame before.
-            turn, past: place and keys of `LongRange.step`.
+            rotary, past: place and keys of `LongRange.step`.
             agent_sound, ...: of `stream.Memory`.
 
         Returns:
@@ -64,7 +64,7 @@ class Frame(Part):
         user_behaviour = _after(user_behaviour, model.merge_user(user_sound, model.embed_face(face, seen)), first)
         sound_keys = push(sound_keys, model.progress.coarse.keys(now))
         summary = model.short(agent_behaviour, user_behaviour, now, user_sound)
-        cis, made = model.long.step(summary, past, turn)
+        cis, made = model.long.step(summary, past, rotary)
         feature, logits = None, cis[:, :0]
         if model.states is not None:
             feature, logits = model.states(model.states.condition(cis, voiced), state)

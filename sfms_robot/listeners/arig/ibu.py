@@ -155,10 +155,10 @@ class ContextLayer(Part):
         self.ffn_norm = LayerNorm(width)
         self.ffn = FeedForward(width, hidden)
 
-    def project(self, x: Tensor, turn: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """x (B, T, D), turn (2, T, D/h) -> queries, keys, values (B, h, T, D/h), turned to their places."""
+    def project(self, x: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """x (B, T, D), rotary (2, T, D/h) -> queries, keys, values (B, h, T, D/h), turned to their places."""
         qkv = split_heads(self.qkv(self.norm(x)), 3 * self.heads)
-        q, k = _turned(qkv.narrow(1, 0, 2 * self.heads), turn).chunk(2, dim=1)
+        q, k = _rotated(qkv.narrow(1, 0, 2 * self.heads), rotary).chunk(2, dim=1)
         return q, k, qkv.narrow(1, 2 * self.heads, self.heads)
 
     def forward(self, x: Tensor, own: tuple[Tensor, Tensor, Tensor], past: Tensor, seen: Tensor | None) -> Tensor:
@@ -198,7 +198,7 @@ class LongRange(nn.Module):
     def _layers(self) -> list[ContextLayer]:
         return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
 
-    def turn(self, chunks: Tensor) -> Tensor:
+    def rotary(self, chunks: Tensor) -> Tensor:
         """Rotary places (Su et al. 2021): chunk numbers (T,) -> cosines and sines (2, T, D/h).
 
         Computed in double precision: after days of running the angles still differ by what the chunks do.
@@ -217,20 +217,20 @@ class LongRange(nn.Module):
         whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
         behind = of[:, None] - of[whole]
         seen = (behind > 0) & (behind < self.capacity)  # (T, S)
-        turn, x = self.turn(of), summaries
+        rotary, x = self.rotary(of), summaries
         for layer in self._layers():
-            own = layer.project(x, turn)
+            own = layer.project(x, rotary)
             x = layer(x, own, torch.stack(own[1:])[:, :, :, whole], seen)
         out: Tensor = self.norm(x)
         return out
 
-    def step(self, summary: Tensor, past: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, summary: Tensor, past: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor]:
         """One frame of one stream.
 
         Args:
             summary: (1, D) of the chunk in progress.
             past: (L, 2, 1, h, S, D/h) keys and values of the S whole chunks in view, oldest first.
-            turn: (2, 1, D/h) of this chunk.
+            rotary: (2, 1, D/h) of this chunk.
 
         Returns:
             cis-token (1, D), and keys and values (L, 2, 1, h, 1, D/h) of this summary, should it be the last of its
@@ -238,14 +238,14 @@ class LongRange(nn.Module):
         """
         x, made = summary[None], []
         for layer, cached in zip(self._layers(), past, strict=True):
-            own = layer.project(x, turn)
+            own = layer.project(x, rotary)
             x = layer(x, own, cached, None)
             made.append(torch.stack(own[1:]))
         return self.norm(x)[0], torch.stack(made)
 
 
-def _turned(x: Tensor, turn: Tensor) -> Tensor:
+def _rotated(x: Tensor, rotary: Tensor) -> Tensor:
     """x (B, h, T, D/h) turned by (2, T, D/h): its halves are the two coordinates of each plane."""
     first, second = x.chunk(2, dim=-1)
-    cosine, sine = turn.unbind(0)
+    cosine, sine = rotary.unbind(0)
     return torch.addcmul(x * cosine, torch.cat([second, first], dim=-1), sine)

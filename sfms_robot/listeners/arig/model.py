@@ -26,13 +26,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
+from sfms_robot.listeners.arig.audio_frontend import WIDTHS
 from sfms_robot.listeners.arig.codes import CodeHead
 from sfms_robot.listeners.arig.csu import FIRST, StateUnderstanding
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
 from sfms_robot.listeners.arig.parts import Linear, windows
 from sfms_robot.listeners.arig.pmp import Progressive
-from sfms_robot.listeners.arig.sound import WIDTHS
 
 
 @dataclass(frozen=True)

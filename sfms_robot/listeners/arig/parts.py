@@ -100,7 +100,7 @@ def windows(x: Tensor, size: int) -> Tensor:
     return padded.unfold(1, size, 1).transpose(-1, -2)
 
 
-class Look(Part):
+class CrossAttention(Part):
     """A query looks at a few tokens, then a feed-forward; pre-norm, residual.
 
     Keys and values of a token do not depend on its slot: what a slot means is added to the finished key. So a stream

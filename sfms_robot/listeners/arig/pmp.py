@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sfms_robot.listeners.arig.parts import LayerNorm, Look, Part
+from sfms_robot.listeners.arig.parts import CrossAttention, LayerNorm, Part
 
 
 class Progressive(Part):
@@ -16,9 +16,9 @@ class Progressive(Part):
 
     def __init__(self, width: int, hidden: int, heads: int, sounds: int, motions: int, states: bool) -> None:
         super().__init__()
-        self.coarse = Look(width, hidden, heads, sounds)
-        self.fine = Look(width, hidden, heads, 2 + states)
-        self.temporal = Look(width, hidden, heads, motions)
+        self.coarse = CrossAttention(width, hidden, heads, sounds)
+        self.fine = CrossAttention(width, hidden, heads, 2 + states)
+        self.temporal = CrossAttention(width, hidden, heads, motions)
         self.norm = LayerNorm(width)
 
     def forward(

@@ -21,11 +21,11 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
-from sfms_robot.listeners.arig import fast, sound
+from sfms_robot.listeners.arig import audio_frontend, fast
+from sfms_robot.listeners.arig.audio_frontend import AudioState
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.frame import Draw, Frame, repeated
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.sound import Ears
 from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.space import MotionSpace
 
@@ -38,7 +38,7 @@ class Memory:
 
     Attributes:
         frames: how many have been heard.
-        user_ears, agent_ears: samples and phrase of both tracks.
+        user_voice, agent_voice: samples and phrase of both tracks.
         agent_sound: (1, D) embedded, of the agent's last frame.
         agent_behaviour, user_behaviour: (1, c, D) of the last c frames, the newest last.
         sound_keys: (1, 3, 2D) of the agent's last sounds; motion_keys: (1, 5, 2D) of its last motions.
@@ -49,8 +49,8 @@ class Memory:
     """
 
     frames: int
-    user_ears: Ears
-    agent_ears: Ears
+    user_voice: AudioState
+    agent_voice: AudioState
     agent_sound: Tensor
     agent_behaviour: Tensor
     user_behaviour: Tensor
@@ -104,8 +104,8 @@ class ArigListener:
         motion, silence = model.embed_motion(still), model.no_agent_sound[None]
         return Memory(
             frames=0,
-            user_ears=sound.start(),
-            agent_ears=sound.start(),
+            user_voice=audio_frontend.start(),
+            agent_voice=audio_frontend.start(),
             agent_sound=silence,
             agent_behaviour=torch.zeros(1, c, d),
             user_behaviour=torch.zeros(1, c, d),
@@ -152,18 +152,20 @@ class ArigListener:
 
     def _told(self, speaker: SpeakerFrame, memory: Memory) -> tuple[tuple[Tensor, ...], Memory]:
         """What `Frame` takes, and memory with both tracks heard."""
-        user, heard, user_ears = sound.hear(speaker.audio, memory.user_ears)
-        agent, says, agent_ears = sound.hear(sound.fit_frame(speaker.agent_audio), memory.agent_ears)
+        user, heard, user_voice = audio_frontend.hear(speaker.audio, memory.user_voice)
+        agent, says, agent_voice = audio_frontend.hear(
+            audio_frontend.fit_frame(speaker.agent_audio), memory.agent_voice
+        )
         face, seen = self._face(speaker)
         told = (
             torch.from_numpy(np.stack([user, agent])),
             torch.tensor([heard, says]),
-            torch.tensor([[agent_ears.voiced, user_ears.voiced]]),
+            torch.tensor([[agent_voice.voiced, user_voice.voiced]]),
             face,
             seen,
             torch.tensor(memory.frames == 0),
             torch.tensor([memory.state]),
-            self.model.long.turn(torch.tensor([memory.frames // self.settings.chunk_frames])),
+            self.model.long.rotary(torch.tensor([memory.frames // self.settings.chunk_frames])),
             self._in_view(memory),
             memory.agent_sound,
             memory.agent_behaviour,
@@ -172,7 +174,7 @@ class ArigListener:
             memory.motion,
             memory.motion_keys,
         )
-        return told, replace(memory, frames=memory.frames + 1, user_ears=user_ears, agent_ears=agent_ears)
+        return told, replace(memory, frames=memory.frames + 1, user_voice=user_voice, agent_voice=agent_voice)
 
     def _face(self, speaker: SpeakerFrame) -> tuple[Tensor, Tensor]:
         """(1, C) standardised, (1,) seen; what is not finite or beyond all faces is not: memory would keep it."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms.hearing import Hearing
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
@@ -20,4 +20,4 @@ def load(folder: Path) -> SfmsListener:
         raise ConfigError(f"{folder / checkpoint.CONFIG}: kind = {settings.kind!r} is not sfms")
     model = SfmsModel(settings)
     checkpoint.load_weights(folder / checkpoint.WEIGHTS, model)
-    return SfmsListener(settings, model, MotionSpace.of(settings, folder), Hearing.of(settings, folder)).settle()
+    return SfmsListener(settings, model, MotionSpace.of(settings, folder), AudioFrontend.of(settings, folder)).settle()

@@ -1,13 +1,10 @@
 """Keyframes chosen one after another by conditional scores, and each chosen anew once all are there.
 
 Algorithm 1 of the paper with one change: its lines 9 and 10 take the frame just chosen out of the same scores; here the
-scores are asked again at each of the k steps. Two uses of one network: told how many keyframes are to come it spends
-them as a whole (`learned`), not told it makes every prefix of the order a good code (`nested`).
+scores are asked again at each of the k steps, told how many keyframes are still to come.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,35 +13,16 @@ from sfms_robot.listeners.sfms.exact import mask_cost
 from sfms_robot.listeners.sfms.score import ConditionalScore, Tracks
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Keyframes of N tracks.
-
-    Attributes:
-        mask: (N, T), k ones each.
-        order: (N, K) frames, first chosen first; -1 behind a track's own k.
-    """
-
-    mask: Tensor
-    order: Tensor
-
-
 @torch.no_grad()
-def choose(score: ConditionalScore, track: Tracks, k: Tensor, *, told: bool = True) -> Choice:
-    """k (N,) keyframes of each track, one at a time, the highest score each time.
-
-    `told`: whether the scores know how many are to come.
-    """
+def choose(score: ConditionalScore, track: Tracks, k: Tensor) -> Tensor:
+    """Mask (N, T) of k (N,) keyframes of each track, one at a time, the highest score each time."""
     n, t, _ = track.curves.shape
     mask = track.curves.new_zeros(n, t)
-    order = torch.full((n, int(k.max())), -1, device=mask.device)
-    for step in range(order.shape[1]):
+    for step in range(int(k.max())):
         wanted = step < k
-        remaining = torch.where(wanted, k - step, 1) if told else torch.zeros_like(k)
-        picked = score(track, mask, remaining).argmax(1)
+        picked = score(track, mask, torch.where(wanted, k - step, 1)).argmax(1)
         mask = torch.where(wanted[:, None], mask.scatter(1, picked[:, None], 1.0), mask)
-        order[:, step] = torch.where(wanted, picked, -1)
-    return Choice(mask, order)
+    return mask
 
 
 @torch.no_grad()

@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from sfms_robot import config
 from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.sfms.model import SfmsModel
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, Predictor, Trail, trails
-from sfms_robot.listeners.sfms.reach import Reach
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, LastKeyframes, Predictor, last_keyframes
+from sfms_robot.listeners.sfms.reachable import Reach
 from sfms_robot.signals.phase import PHRASE_KNOTS_S, SILENCE_KNOTS_S, SPEECH_KNOTS_S
 
 # 1 at the hats of `phase.features` that stand for silence up to 1.6 s: their sum falls from 1 there to 0 at 3.2 s.
@@ -34,23 +34,23 @@ SILENCE_LATELY = torch.tensor(
 LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing, and sorting it takes time
 
 
-class Ahead(nn.Module):
+class FutureEncoder(nn.Module):
     """What is known of every future frame before any of them is drawn."""
 
-    def __init__(self, predictor: Predictor, nobody: Tensor | None) -> None:
+    def __init__(self, predictor: Predictor, absent: Tensor | None) -> None:
         super().__init__()
         self.predictor = predictor
-        self.register_buffer("nobody", nobody, persistent=False)
+        self.register_buffer("absent", absent, persistent=False)
 
     def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The parts of a Context -> slots (B, H, W), or (2, B, H, W) with the speaker and with nobody, and trails."""
+        """The parts of a Context -> slots (B, H, W), or (2, B, H, W), also without the speaker, and last keyframes."""
         context = Context(*seen)
-        past = trails(context.tokens)
-        slots = self.predictor(context, past, self.nobody)
-        return (slots if self.nobody is None else slots.unflatten(0, (2, -1))), past.tokens, past.at
+        past = last_keyframes(context.tokens)
+        slots = self.predictor(context, past, self.absent)
+        return (slots if self.absent is None else slots.unflatten(0, (2, -1))), past.tokens, past.at
 
 
-class Next(nn.Module):
+class FrameSampler(nn.Module):
     """One future frame drawn after those before it."""
 
     bias: Tensor
@@ -70,19 +70,19 @@ class Next(nn.Module):
 
         Args:
             slots: (B, W) of this frame, or (2, B, W) where a group is guided.
-            last, at: the trail (B, G, 2) of the frame before; frame: () its number.
+            last, at: the last keyframes (B, G, 2) up to the frame before; frame: () its number.
             guidance: (1 or B, G, 1); nucleus, chance: (1 or B, G), as `sample` takes them.
 
         Returns:
-            Tokens (B, G) and the trail (B, G, 2) after them.
+            Tokens (B, G) and the last keyframes (B, G, 2) after them.
         """
-        trail = Trail(last, at)
-        logits = self.predictor.classes(slots, trail, frame)
+        recent = LastKeyframes(last, at)
+        logits = self.predictor.classes(slots, recent, frame)
         if slots.dim() == 3:
             logits = guided(logits[0], logits[1], guidance)  # (B, G, V)
         too_soon = self.reach.too_soon(last[..., 0], frame + 1 - at[..., 0])
         drawn = sample(logits.masked_fill(too_soon, -torch.inf) / self.temperature, self.bias, nucleus, chance)
-        after = trail.then(drawn, frame + 1)
+        after = recent.then(drawn, frame + 1)
         return drawn, after.tokens, after.at
 
 
@@ -97,8 +97,10 @@ class Sampler:
         self._nucleus_in_silence = torch.tensor(alone)
         self._guidance = torch.tensor([group.guidance for group in groups])[:, None]
         guided = any(group.guidance != 1.0 for group in groups)
-        self._ahead = Ahead(model.predictor, model.predictor.nobody(settings.past_frames) if guided else None).eval()
-        self._next = Next(settings, model).eval()
+        self._ahead = FutureEncoder(
+            model.predictor, model.predictor.absent_speaker(settings.past_frames) if guided else None
+        ).eval()
+        self._next = FrameSampler(settings, model).eval()
         self._graphs: tuple[Callable[..., Any], Callable[..., Any]] | None = None
 
     @torch.inference_mode()

@@ -84,26 +84,18 @@ def segments(gram: Tensor) -> Segments:
 
 
 def best_frames(cost: Segments, count: int) -> Tensor:
-    """Frames (N, count) of the best `count` keyframes."""
-    return best_frames_each(cost, count, count)[0]
+    """Frames (N, count) of the best `count` keyframes.
 
-
-def best_frames_each(cost: Segments, least: int, most: int) -> list[Tensor]:
-    """Frames (N, k) of the best k keyframes, for every k from `least` to `most`, in one pass.
-
-    best[j] = min_i best[i] + inside[i, j], `most` - 1 times; the way back from the cheapest end gives the frames.
+    best[j] = min_i best[i] + inside[i, j], `count` - 1 times; the way back from the cheapest end gives the frames.
     """
-    best, parents, found = cost.before, [], []
-    for k in range(1, most + 1):
-        if k > 1:
-            best, parent = (best[:, :, None] + cost.inside).min(dim=1)
-            parents.append(parent)
-        if k >= least:
-            path = [(best + cost.after).argmin(dim=1, keepdim=True)]
-            for parent in reversed(parents):
-                path.append(parent.gather(1, path[-1]))
-            found.append(torch.cat(path[::-1], dim=1))
-    return found
+    best, parents = cost.before, []
+    for _ in range(count - 1):
+        best, parent = (best[:, :, None] + cost.inside).min(dim=1)
+        parents.append(parent)
+    path = [(best + cost.after).argmin(dim=1, keepdim=True)]
+    for parent in reversed(parents):
+        path.append(parent.gather(1, path[-1]))
+    return torch.cat(path[::-1], dim=1)
 
 
 def completion_errors(cost: Segments, chosen: Tensor, most: int) -> Tensor:

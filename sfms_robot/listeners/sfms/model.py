@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
-from sfms_robot.listeners.sfms.hearing import SHAPES
+from sfms_robot.listeners.sfms.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms.inpainter import Inpainter
 from sfms_robot.listeners.sfms.placement import Strategy, place
 from sfms_robot.listeners.sfms.predictor import Predictor
@@ -87,7 +87,7 @@ def _score_network(settings: config.Sfms) -> ScoreNetwork | ConditionalScore | N
     if settings.placement == "learned_paper":
         channels, groups = len(settings.channels), len(settings.groups)
         return ScoreNetwork(channels, groups, scores.width, scores.heads, scores.layers)
-    if settings.placement in ("learned", "nested"):
+    if settings.placement == "learned":
         largest = max(len(group.channels) for group in settings.groups.values())
         return ConditionalScore(largest, scores.width, scores.heads, scores.layers)
     return None

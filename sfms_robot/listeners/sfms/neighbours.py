@@ -15,7 +15,7 @@ POSITION_BITS = 6  # distances to the neighbouring keyframes up to 63 frames, as
 class Neighbours:
     """For every frame and group the keyframe before (or at) it and the one after.
 
-    Ahead of the first and behind the last keyframe the nearest one is held.
+    FutureEncoder of the first and behind the last keyframe the nearest one is held.
 
     Attributes:
         frame: (T, 1) number of each frame.

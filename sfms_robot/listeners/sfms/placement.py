@@ -1,11 +1,10 @@
-"""Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and six answers.
+"""Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and five answers.
 
     exact          the mask with the least error of linear interpolation, by dynamic programming
     static         evenly, centred
     static_paper   at every floor(N / k)-th frame, the paper's baseline, which leaves the window's end to extrapolation
     learned_paper  the paper's: one look of the score network, Gumbel top-k by Algorithm 1
     learned        ours: conditional scores, asked again at each of the k steps, then swept over (`choice`)
-    nested         the same scores not told how many are to come: the first k choices are a good code for every k
 
 Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T.
 """
@@ -22,7 +21,7 @@ from sfms_robot.listeners.sfms.choice import choose, sweep
 from sfms_robot.listeners.sfms.exact import best_frames, segments
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks
 
-Strategy = Literal["exact", "static", "static_paper", "learned_paper", "learned", "nested"]
+Strategy = Literal["exact", "static", "static_paper", "learned_paper", "learned"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 EPSILON = 1e-20  # a chosen frame falls back by 46: more than any two scores differ
 
@@ -52,7 +51,7 @@ def place(
         return place_learned(score(motion), k)[0]
     if not isinstance(score, ConditionalScore):
         raise ValueError(f"{strategy} placement needs a conditional score network")
-    return place_conditional(motion, k, member, score, told=strategy == "learned", sweeps=sweeps)
+    return place_conditional(motion, k, member, score, sweeps)
 
 
 def place_static(motion: Tensor, k: Sequence[int], *, centred: bool = True) -> Tensor:
@@ -105,7 +104,7 @@ def _top_k(scores: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def place_conditional(
-    motion: Tensor, k: Sequence[int], member: Tensor, score: ConditionalScore, *, told: bool, sweeps: int = 0
+    motion: Tensor, k: Sequence[int], member: Tensor, score: ConditionalScore, sweeps: int = 0
 ) -> Tensor:
     """Mask of the highest conditional scores, one keyframe after another, then `sweeps` rounds of second thoughts."""
     b, t, _ = motion.shape
@@ -113,20 +112,10 @@ def place_conditional(
         _check(count, t)
     track = tracks(motion, member, score.curves)
     counts = torch.tensor(k, device=motion.device).repeat(b)
-    mask = choose(score, track, counts, told=told).mask
-    for turn in range(sweeps if told else 0):  # a keyframe chosen anew would break the order of a nested code
-        mask = sweep(score, track, mask, together=1 + turn % 2)
+    mask = choose(score, track, counts)
+    for number in range(sweeps):
+        mask = sweep(score, track, mask, together=1 + number % 2)
     return mask.view(b, len(k), t).transpose(1, 2).contiguous()
-
-
-@torch.no_grad()
-def nested_order(motion: Tensor, most: int, member: Tensor, score: ConditionalScore) -> Tensor:
-    """Frames (B, most, G) in the order in which each group would have them: any first k are a code."""
-    _check(most, motion.shape[1])
-    track = tracks(motion, member, score.curves)
-    counts = torch.full((len(track.curves),), most, device=motion.device)
-    order = choose(score, track, counts, told=False).order
-    return order.view(len(motion), len(member), most).transpose(1, 2)
 
 
 def place_exact(motion: Tensor, k: Sequence[int], member: Tensor, max_gap: int | None = None) -> Tensor:

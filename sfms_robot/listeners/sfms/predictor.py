@@ -52,29 +52,29 @@ class Context:
         return tuple(getattr(self, field.name) for field in fields(self))
 
 
-class Trail(NamedTuple):
+class LastKeyframes(NamedTuple):
     """The last two keyframes of every group, the newer first: tokens (..., G, 2), 0 for none yet, and their frames."""
 
     tokens: Tensor
     at: Tensor
 
-    def then(self, drawn: Tensor, frame: Tensor | int) -> Trail:
+    def then(self, drawn: Tensor, frame: Tensor | int) -> LastKeyframes:
         """After the tokens (..., G) `drawn` for `frame`, a number."""
         drawn = drawn[..., None]
         key = drawn > 0
         newer = torch.cat([drawn, self.tokens[..., :1]], dim=-1)
         newer_at = torch.cat([torch.zeros_like(self.at[..., :1]) + frame, self.at[..., :1]], dim=-1)
-        return Trail(torch.where(key, newer, self.tokens), torch.where(key, newer_at, self.at))
+        return LastKeyframes(torch.where(key, newer, self.tokens), torch.where(key, newer_at, self.at))
 
 
-def trails(tokens: Tensor) -> Trail:
-    """Tokens (B, T, G) -> the trail at every frame, that frame included; -1 is before the first frame."""
+def last_keyframes(tokens: Tensor) -> LastKeyframes:
+    """Tokens (B, T, G) -> the last keyframes at every frame, that frame included; -1 is before the first frame."""
     frame = torch.arange(tokens.shape[1], device=tokens.device)[None, :, None]
     last = torch.where(tokens > 0, frame, -1).cummax(1).values
     earlier = torch.cat([torch.full_like(last[:, :1], -1), last[:, :-1]], dim=1)  # of the frame before
     before = torch.where(last < 0, -1, earlier.gather(1, last.clamp(min=0)))
     found = [torch.where(at < 0, 0, tokens.gather(1, at.clamp(min=0))) for at in (last, before)]
-    return Trail(torch.stack(found, dim=-1), torch.stack([last, before], dim=-1))
+    return LastKeyframes(torch.stack(found, dim=-1), torch.stack([last, before], dim=-1))
 
 
 class Predictor(nn.Module):
@@ -122,24 +122,25 @@ class Predictor(nn.Module):
         self.phase_size = 0 if speaker.phase_in is None else speaker.phase_in.in_features
         self.phase_in = nn.Linear(self.phase_size, width) if self.phase_size else None
         self.decoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
+        # Weights keep the name that they were first saved under.
         self.trail_in = nn.Linear(described, width) if sequential else None
         self.chain = FeedForward(width) if sequential else None
         self.norm = nn.LayerNorm(width)
         self.classify = nn.Linear(width, int(classes.sum()))
 
-    def forward(self, context: Context, trail: Trail | None = None, nobody: Tensor | None = None) -> Tensor:
+    def forward(self, context: Context, recent: LastKeyframes | None = None, absent: Tensor | None = None) -> Tensor:
         """What is known about every future frame without knowing those before it: (B', H, W).
 
-        `trail`: what `trails` finds in the context's tokens, for those who need it themselves.
-        `nobody` (1, 2P, W), what `nobody` gives: (2B', H, W), and the second half knows the listener's own tokens only.
+        `recent`: what `last_keyframes` finds in the context's tokens, for those who need it themselves.
+        `absent` (1, 2P, W), what `absent_speaker` gives: (2B', H, W), the second half knows the listener's tokens only.
         """
         c = context
         speaker = self.speaker(c.face, c.face_known, c.voice, c.heard, c.phase)
-        own = self._own(c.tokens, trails(c.tokens) if trail is None else trail)
+        own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent)
         newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(len(own), -1)
         speaker = speaker.expand(len(own), -1, -1)
-        if nobody is not None:
-            speaker, own = torch.cat([speaker, nobody.expand_as(speaker)]), own.repeat(2, 1, 1)
+        if absent is not None:
+            speaker, own = torch.cat([speaker, absent.expand_as(speaker)]), own.repeat(2, 1, 1)
             newest = torch.cat([newest, torch.zeros_like(newest)])
         speaker = speaker + self.role[:2].repeat_interleave(c.heard.shape[1], dim=0)
         memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B', 2P + P + H, W)
@@ -150,7 +151,7 @@ class Predictor(nn.Module):
             x = block(x, memory=memory)
         return x
 
-    def nobody(self, frames: int) -> Tensor:
+    def absent_speaker(self, frames: int) -> Tensor:
         """(1, 2 * frames, W): the speaker where there is none, neither heard nor seen; the same at all times."""
         away = torch.zeros(1, frames, dtype=torch.bool, device=self.slots.device)
         face, voice, phase = (
@@ -160,28 +161,28 @@ class Predictor(nn.Module):
         out: Tensor = self.speaker(face, away, voice, away, phase)
         return out
 
-    def _own(self, tokens: Tensor, trail: Trail) -> Tensor:
-        """Tokens (B, P + H, G) and their trail -> (B, P + H, W)."""
-        features = torch.cat([self.describe(trail, _frames(tokens)), (tokens > 0).float()], dim=-1)
+    def _own(self, tokens: Tensor, recent: LastKeyframes) -> Tensor:
+        """Tokens (B, P + H, G) and their last keyframes -> (B, P + H, W)."""
+        features = torch.cat([self.describe(recent, _frames(tokens)), (tokens > 0).float()], dim=-1)
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
         x = x + sinusoidal(x.shape[1], x.shape[2]).to(x)
         for block in self.own:
             x = block(x)
         return x
 
-    def describe(self, trail: Trail, frame: Tensor | int) -> Tensor:
-        """A trail (..., G) as seen at `frame`: both codes and how long ago they were, (..., G * (2D + 2))."""
-        codes = self.codes[self.group, trail.tokens]  # (..., G, 2, D)
-        ages = torch.log1p((frame - trail.at) / AGE_SCALE_FRAMES)
+    def describe(self, recent: LastKeyframes, frame: Tensor | int) -> Tensor:
+        """Last keyframes (..., G) as seen at `frame`: both codes and how long ago they were, (..., G * (2D + 2))."""
+        codes = self.codes[self.group, recent.tokens]  # (..., G, 2, D)
+        ages = torch.log1p((frame - recent.at) / AGE_SCALE_FRAMES)
         return torch.cat([codes.flatten(-2), ages], dim=-1).flatten(-2)
 
-    def classes(self, slots: Tensor, trail: Trail | None = None, frame: Tensor | int = 0) -> Tensor:
+    def classes(self, slots: Tensor, recent: LastKeyframes | None = None, frame: Tensor | int = 0) -> Tensor:
         """Logits (..., G, V) of slots (..., W), V the most classes of a group, -inf for those that it lacks.
 
-        A sequential predictor needs the trail (..., G) of the frame before each, and the number of that frame.
+        A sequential predictor needs the last keyframes (..., G) up to the frame before each, and that frame's number.
         """
-        if self.trail_in is not None and self.chain is not None and trail is not None:
-            slots = slots + self.trail_in(self.describe(trail, frame))
+        if self.trail_in is not None and self.chain is not None and recent is not None:
+            slots = slots + self.trail_in(self.describe(recent, frame))
             slots = slots + self.chain(slots)
         logits = self.classify(self.norm(slots))
         logits = nn.functional.pad(logits, (0, 1), value=-torch.inf).index_select(-1, self.place)
@@ -191,8 +192,8 @@ class Predictor(nn.Module):
         """Logits (B, H, G, V) of every future frame, told the true ones (B, H, G) before it where it is sequential."""
         told = torch.cat([context.tokens[:, : -self.future], target], dim=1)
         before = slice(-self.future - 1, -1)
-        trail = Trail(*(part[:, before] for part in trails(told)))
-        return self.classes(self(context), trail, _frames(told)[:, before])
+        recent = LastKeyframes(*(part[:, before] for part in last_keyframes(told)))
+        return self.classes(self(context), recent, _frames(told)[:, before])
 
 
 def _frames(tokens: Tensor) -> Tensor:

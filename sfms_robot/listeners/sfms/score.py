@@ -100,7 +100,7 @@ class ConditionalScore(nn.Module):
     def forward(self, track: Tracks, chosen: Tensor, remaining: Tensor) -> Tensor:
         """Logits (N, T), minus infinity where a frame is already `chosen` (N, T).
 
-        `remaining` (N,): keyframes still to choose, this one included; 0: not known, any prefix must be good.
+        `remaining` (N,): keyframes still to choose, this one included.
         """
         logits: Tensor = self.network(_features(track, chosen, remaining))[..., 0]
         return logits.masked_fill(chosen > 0.5, -torch.inf)
@@ -119,9 +119,8 @@ def _features(track: Tracks, chosen: Tensor, remaining: Tensor) -> Tensor:
     total = left.sum(1, keepdim=True).clamp(min=STILL)
     gain = torch.where(now.isfinite(), now - then, then) / total
     rest = torch.where(now.isfinite(), then / now.clamp(min=STILL), 0.0).clamp(max=2.0)
-    known = (remaining > 0).float()
-    count = remaining.float().clamp(min=1.0)
-    told = (1 - known, known * count.log() / 2, known / count)
+    count = remaining.float()
+    told = (torch.zeros_like(count), count.log() / 2, 1 / count)  # the first is always 0: weights have a row for it
     frames = [chosen, rms.log().expand_as(chosen) / 3, *(one.float()[..., 0] for one in place)]
     frames += [one[:, None].expand_as(chosen) for one in told]
     frames += [torch.asinh(3 * gain), rest]

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from sfms_robot import config
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, Plan, SpeakerFrame
 from sfms_robot.listeners.graphs import graph
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
 from sfms_robot.listeners.sfms.draw import Sampler
-from sfms_robot.listeners.sfms.hearing import Ears, Hearing
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.space import MotionSpace
@@ -34,15 +34,15 @@ NEUTRAL_STRIDE = 8  # frames between the keyframes of the neutral face a stream 
 
 
 @dataclass(frozen=True)
-class Heard:
+class SpeakerState:
     """The speaker's last P frames, the newest last, as `predictor.Context` wants them (no batch).
 
     Attributes:
-        ears: what unfinished features still need.
+        audio: what unfinished features still need.
         rows: (R, bins) sound of the newest frame, standardised.
     """
 
-    ears: Ears
+    audio: AudioState
     rows: Tensor
     voice: Tensor
     heard: Tensor
@@ -64,7 +64,7 @@ class Memory:
     """
 
     frames: int
-    speaker: Heard
+    speaker: SpeakerState
     tokens: Tensor
     path: Tensor
     random: Tensor
@@ -98,12 +98,12 @@ class SfmsListener:
         settings: config.Sfms,
         model: SfmsModel,
         space: MotionSpace | None = None,
-        hearing: Hearing | None = None,
+        frontend: AudioFrontend | None = None,
     ) -> None:
         self.settings = settings
         self.model = model.eval()
         self.space = space or MotionSpace.of(settings)
-        self.hearing = hearing or Hearing.of(settings)
+        self.frontend = frontend or AudioFrontend.of(settings)
         self.sampler = Sampler(settings, self.model)
         head = [float(channel in HEAD) for channel in settings.channels]
         self._smoothing = settings.sampling.smoothing * torch.tensor(head)
@@ -130,12 +130,12 @@ class SfmsListener:
     def start(self, seed: int) -> Memory:
         """Memory of a stream that has heard nothing and looked neutral so far."""
         p = self.settings.past_frames
-        speaker = Heard(
-            ears=self.hearing.start(),
-            rows=torch.zeros(self.hearing.shape),
+        speaker = SpeakerState(
+            audio=self.frontend.start(),
+            rows=torch.zeros(self.frontend.shape),
             voice=torch.zeros(p, self.settings.predictor_width),
             heard=torch.zeros(p, dtype=torch.bool),
-            phase=torch.zeros(p, self.hearing.phase_features),
+            phase=torch.zeros(p, self.frontend.phase_features),
             face=torch.zeros(p, self.space.dim),
             face_known=torch.zeros(p, dtype=torch.bool),
         )
@@ -193,20 +193,20 @@ class SfmsListener:
         decoded = (self._decode_one if len(tokens) == 1 else self._decode)(tokens)
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
-    def _hear(self, speaker: SpeakerFrame, before: Heard) -> Heard:
+    def _hear(self, speaker: SpeakerFrame, before: SpeakerState) -> SpeakerState:
         """With the newest frame in place of the oldest."""
         present = len(speaker.audio) > 0
         if present and len(speaker.audio) != FRAME_SAMPLES:
             raise ValueError(f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(speaker.audio)}")
-        sound, phase, ears = self.hearing.step(speaker.audio, before.ears)
+        sound, phase, audio = self.frontend.step(speaker.audio, before.audio)
         rows = self.model.standardise_sound(torch.from_numpy(sound)) * present
         face = torch.zeros(1, self.space.dim)
         known = speaker.face is not None and bool(np.isfinite(speaker.face.motion).all())
         if speaker.face is not None and known:
             face = self.model.standardise(torch.from_numpy(self.space.encode(speaker.face.motion[None])))
         voice = self.model.predictor.speaker.listen(torch.cat([before.rows, rows])[None])[0]
-        return Heard(
-            ears,
+        return SpeakerState(
+            audio,
             rows,
             voice=_push(before.voice, voice),
             heard=_push(before.heard, torch.tensor([present])),
@@ -236,7 +236,7 @@ def _push(queue: Tensor, new: Tensor) -> Tensor:
     return torch.cat([queue[len(new) :], new])
 
 
-def _context(speaker: Heard, tokens: Tensor) -> Context:
+def _context(speaker: SpeakerState, tokens: Tensor) -> Context:
     """A batch of one speaker."""
     s = speaker
     return Context(s.face[None], s.face_known[None], s.voice[None], s.heard[None], s.phase[None], tokens)

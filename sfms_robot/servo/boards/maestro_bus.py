@@ -1,10 +1,13 @@
-"""A Pololu Maestro as a bus. The rules of every hobby board are in `hobby`; these are the Maestro's own.
+"""A Pololu Maestro as a bus. What all boards have in common is in `pulse_bus`; this is the Maestro's own.
 
-1. Asking for its errors clears them, and shows that it is there. One that detects its baud rate hears nothing before
-   the byte AA, which is sent only when it does not answer: to one that is running, AA alone may be a protocol error.
+1. Get Errors (A1) clears them, and shows that the board is there. One in the serial mode "UART, detect baud rate"
+   takes nothing before the baud indication byte AA, which is sent only when it does not answer: to one that is
+   running, AA alone may be a protocol error.
 2. Any error sends the channels to their home, which from the factory is no pulses at all. So after an error that it
    reports all goals are sent anew.
-3. All but the 6 channel board take the targets of neighbours in one command.
+3. All but the Micro Maestro (6 channels) take the targets of neighbouring channels in one Set Multiple Targets (9F).
+
+Source: Pololu Maestro Servo Controller User's Guide, pololu.com/docs/0J40, sections 4.a, 4.e and 5.e.
 """
 
 from __future__ import annotations
@@ -16,8 +19,8 @@ from typing import Final
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import TickConversion
-from sfms_robot.servo.boards.board import Ask, Health, pulses_beyond
-from sfms_robot.servo.boards.pulse_bus import HobbyBus
+from sfms_robot.servo.boards.board_protocol import BoardStatus, Exchange, pulses_beyond
+from sfms_robot.servo.boards.pulse_bus import PulseBus
 from sfms_robot.servo.codecs import maestro
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -30,29 +33,33 @@ _MICRO: Final = 6  # channels of the one board without "set multiple targets"
 
 
 class _Maestro:
-    """`hobby.Dialect` of a Maestro."""
+    """`board_protocol.BoardProtocol` of a Maestro."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
         self._groups = (table.channels or 0) > _MICRO
 
-    answer_length = 2
+    status_length = 2
 
-    def question(self, lost: bool) -> bytes:
-        return bytes([maestro.BAUD_INDICATION] * lost) + maestro.get_errors()
+    def status_request(self, restarted: bool) -> bytes:
+        return bytes([maestro.BAUD_INDICATION] * restarted) + maestro.get_errors()
 
-    def health(self, answer: bytes) -> Health | None:
+    def decode_status(self, answer: bytes) -> BoardStatus | None:
         bits = int.from_bytes(answer, "little")
         if bits >> (max(self._table.faults, default=15) + 1):
             return None
-        return Health(self._table.fault_names(bits), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
+        return BoardStatus(self._table.fault_names(bits), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
 
-    def pulses(self, ask: Ask, channels: Sequence[int]) -> dict[int, int] | None:
-        answers = {channel: ask(maestro.get_position(channel), 2) for channel in channels}
-        told = {channel: int.from_bytes(data, "little") for channel, data in answers.items() if data is not None}
-        return told if len(told) == len(answers) else None
+    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
+        pulses = {}
+        for channel in channels:
+            answer = exchange(maestro.get_position(channel), 2)
+            if answer is None:
+                return None
+            pulses[channel] = int.from_bytes(answer, "little")
+        return pulses
 
-    def goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+    def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
         if not self._groups:
             return b"".join(maestro.set_target(channel, target) for channel, target in sorted(ticks.items()))
         return b"".join(
@@ -62,8 +69,9 @@ class _Maestro:
             for run in _runs(sorted(ticks))
         )
 
-    def off(self, channels: Sequence[int]) -> bytes:
-        return b"".join(maestro.set_target(channel, maestro.OFF) for channel in channels)
+    def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
+        off = b"".join(maestro.set_target(channel, maestro.OFF) for channel in channels)
+        return bytes([maestro.BAUD_INDICATION] * restarted) + off
 
 
 def _runs(channels: Sequence[int]) -> list[list[int]]:
@@ -77,8 +85,8 @@ def _runs(channels: Sequence[int]) -> list[list[int]]:
     return runs
 
 
-class MaestroBus(HobbyBus):
-    """One Maestro with the compact protocol, as `ports.Bus`; see `hobby.HobbyBus` for what is true of it."""
+class MaestroBus(PulseBus):
+    """One Maestro with the compact protocol, as `ports.Bus`; see `pulse_bus.PulseBus` for what is true of it."""
 
     def __init__(
         self,
@@ -96,7 +104,7 @@ class MaestroBus(HobbyBus):
         table = Table.of(servos[0].map)
         super().__init__(
             name, servos, conversion, open_port, baud, read_deadline_s,
-            dialect=_Maestro(table), confirmed=confirmed, rest_rad=rest_rad, config=config,
+            protocol=_Maestro(table), confirmed=confirmed, rest_rad=rest_rad, config=config,
         )  # fmt: skip
         if wide := pulses_beyond(servos, conversion, table, maestro.FACTORY_PULSE_US):
             log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, ", ".join(wide))

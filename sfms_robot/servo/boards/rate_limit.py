@@ -1,7 +1,7 @@
 """A port that knows when its bytes have left, and questions on it whose answers have no frame.
 
-On a wire of 9600 baud a command is on its way for a fifth of a second while `write` has long returned. Whoever sends
-more before that only fills a buffer; so the wire says until when it is busy.
+At 9600 baud a command is on its way for a fifth of a second while `write` has long returned. Whoever sends more before
+that only fills a buffer; so the port says until when it is busy.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from sfms_robot.servo.port import Port
 _CHUNK = 4096
 
 
-class SlowWire:
-    """One open port; the wire owns it.
+class RateLimitedPort:
+    """One open port, which this owns.
 
     Args:
         patience_s: how long an answer may take beyond the time of its bytes.
 
     Attributes:
         busy_until_s: when the last byte sent will have left.
-        listening: a question is open.
+        awaiting: a request is open.
     """
 
     def __init__(self, port: Port, baud: int, patience_s: float) -> None:
         self.port = port
         self.busy_until_s = port.now_s()
-        self.listening = False
+        self.awaiting = False
         self._byte_s = 10.0 / baud
         self._patience_s = patience_s
         self._answer = bytearray()
@@ -44,30 +44,30 @@ class SlowWire:
         return start_s
 
     def wait(self, until_s: float) -> None:
-        """Block. What comes in meanwhile answers nothing."""
+        """Block until then; what comes in meanwhile is dropped."""
         while self.port.now_s() < until_s and self.port.read(_CHUNK, until_s):
             pass
 
-    def question(self, request: bytes, length: int) -> None:
-        """Ask for `length` bytes; `heard` says what came."""
+    def request(self, request: bytes, length: int) -> None:
+        """Ask for `length` bytes, without waiting; `answer` says what came."""
         self.port.discard_input()
         self.send(request)
-        self.listening = True
+        self.awaiting = True
         self._answer.clear()
         self._length = length
         self._until_s = self.busy_until_s + length * self._byte_s + self._patience_s
 
-    def heard(self, block: bool = False) -> bytes | None:
+    def answer(self, block: bool = False) -> bytes | None:
         """The answer; b"" when it did not come, or has another length; None while it may still come."""
         deadline_s = self._until_s if block else self.port.now_s()
         while len(self._answer) < self._length and (data := self.port.read(_CHUNK, deadline_s)):
             self._answer += data
         if len(self._answer) < self._length and not block and self.port.now_s() < self._until_s:
             return None
-        self.listening = False
+        self.awaiting = False
         return bytes(self._answer) if len(self._answer) == self._length else b""
 
-    def ask(self, request: bytes, length: int) -> bytes | None:
-        """Question and answer in one; None when there is none."""
-        self.question(request, length)
-        return self.heard(block=True) or None
+    def exchange(self, request: bytes, length: int) -> bytes | None:
+        """Request and answer in one; None when there is none. Blocks until the answer is overdue at most."""
+        self.request(request, length)
+        return self.answer(block=True) or None

@@ -1,4 +1,4 @@
-"""A Lynxmotion SSC-32 as a bus. The rules of every hobby board are in `hobby`; these are the SSC-32's own.
+"""A Lynxmotion SSC-32 as a bus. What all boards have in common is in `pulse_bus`; these are the SSC-32's own.
 
 Its wire is slow (9600 baud unless its jumpers say otherwise), so goals arrive a few times a second. Each group move is
 therefore given the time since the one before it: the board draws a straight line between goals instead of steps.
@@ -12,8 +12,8 @@ from typing import Final
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.frames import Doubles
 from sfms_robot.ports import TickConversion
-from sfms_robot.servo.boards.board import Ask, Health
-from sfms_robot.servo.boards.pulse_bus import HobbyBus
+from sfms_robot.servo.boards.board_protocol import BoardStatus, Exchange
+from sfms_robot.servo.boards.pulse_bus import PulseBus
 from sfms_robot.servo.codecs import ssc32
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -24,31 +24,32 @@ _LONGEST_LINE_S: Final = 0.5
 
 
 class _Ssc32:
-    """`hobby.Dialect` of an SSC-32, which has no error word: it answers, or it does not."""
+    """`board_protocol.BoardProtocol` of an SSC-32, which has no error word: it answers, or it does not."""
 
-    answer_length = 1
+    status_length = 1
 
-    def question(self, lost: bool) -> bytes:
-        """When it was lost, a carriage return in front ends whatever line noise had begun."""
-        return b"\r" * lost + ssc32.query_moving()
+    def status_request(self, restarted: bool) -> bytes:
+        """After a restart, a carriage return in front ends whatever line noise had begun."""
+        return b"\r" * restarted + ssc32.query_moving()
 
-    def health(self, answer: bytes) -> Health | None:
-        return Health() if answer in (ssc32.DONE, ssc32.MOVING) else None
+    def decode_status(self, answer: bytes) -> BoardStatus | None:
+        return BoardStatus() if answer in (ssc32.DONE, ssc32.MOVING) else None
 
-    def pulses(self, ask: Ask, channels: Sequence[int]) -> dict[int, int] | None:
+    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
         """None: it tells its pulses in steps of 10 us, and for a channel that it never moved nobody says what."""
         return None
 
-    def goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+    def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
         line_s = min(interval_s, _LONGEST_LINE_S) if interval_s > _PULSE_FRAME_S else 0.0
         return ssc32.group_move({channel: ssc32.Move(us) for channel, us in ticks.items()}, round(line_s * 1e3))
 
-    def off(self, channels: Sequence[int]) -> bytes:
-        return ssc32.outputs_low(channels)
+    def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
+        """A carriage return in front always: another thread may have been in the middle of a line."""
+        return b"\r" + ssc32.outputs_low(channels)
 
 
-class Ssc32Bus(HobbyBus):
-    """One SSC-32, as `ports.Bus`; see `hobby.HobbyBus` for what is true of it."""
+class Ssc32Bus(PulseBus):
+    """One SSC-32, as `ports.Bus`; see `pulse_bus.PulseBus` for what is true of it."""
 
     def __init__(
         self,
@@ -65,5 +66,5 @@ class Ssc32Bus(HobbyBus):
     ) -> None:
         super().__init__(
             name, servos, conversion, open_port, baud, read_deadline_s,
-            dialect=_Ssc32(), confirmed=confirmed, rest_rad=rest_rad, config=config,
+            protocol=_Ssc32(), confirmed=confirmed, rest_rad=rest_rad, config=config,
         )  # fmt: skip

@@ -21,7 +21,7 @@ from sfms_robot.config import Faults
 from sfms_robot.errors import BusError
 from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.recovery import AGAIN_S, ATTEMPTS, Recovery
-from sfms_robot.servo.chain.startup import Contact
+from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.policy import BusServo, LoadWatch, Measured, Voice, torque_register
 from sfms_robot.servo.registers import Table
 
@@ -70,7 +70,7 @@ class Care:
         self._telemetry = telemetry
         self._loads = LoadWatch(servos)
         self._recovery = Recovery()
-        self._shake: Contact[Any] | None = None
+        self._shake: Startup[Any] | None = None
         self._link: RegisterLink | None = None
         self._bits = [0] * len(servos)
         self._faulty: list[list[str]] = [[] for _ in servos]  # faults that count
@@ -86,7 +86,7 @@ class Care:
         """Every fault so far, `joint: fault`, in the order of appearance."""
         return self._voice.said
 
-    def attach(self, link: RegisterLink, shake: Contact[Any]) -> None:
+    def attach(self, link: RegisterLink, shake: Startup[Any]) -> None:
         """The wire in use from now on."""
         self._link, self._shake = link, shake
 

@@ -30,7 +30,7 @@ from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.care import Care, Told
 from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.roster import Roster
-from sfms_robot.servo.chain.startup import Contact
+from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.policy import Absences, BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field, Table
@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 
 READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
 _STOP_PATIENCE_S: Final = 0.02
+_NOBODY: Final = np.zeros(0, np.intp)
 
 
 class State(Told, Protocol):
@@ -104,15 +105,15 @@ class ChainBus(WireBus[L], Generic[L, S]):
     def _state(self) -> S: ...
 
     @abstractmethod
-    def _shake(self, link: L, tries: int = 3) -> Contact[L]: ...
+    def _shake(self, link: L, tries: int = 3) -> Startup[L]: ...
 
     @property
     @abstractmethod
     def _listed(self) -> Roster: ...
 
     @abstractmethod
-    def _met(self, link: L, bits: Sequence[int]) -> None:
-        """Everybody is identified and prepared; latched faults in bus order."""
+    def _met(self, link: L, bits: Mapping[int, int]) -> None:
+        """Who answers is identified and prepared; latched faults by index."""
 
     @abstractmethod
     def _listen(self, link: L, now_s: float) -> bool:
@@ -129,7 +130,7 @@ class ChainBus(WireBus[L], Generic[L, S]):
         link = self._open()
         try:
             bits = self._shake(link).run()
-            self._read_deadline_s = link.adapt(self._servos[0].id, *self._telemetry.position)
+            self._read_deadline_s = link.adapt(self._servos[min(bits)].id, *self._telemetry.position)
             self._care.switched_off()
             self._care.attach(link, self._shake(link, tries=1))
             self._met(link, bits)
@@ -216,19 +217,20 @@ class ChainBus(WireBus[L], Generic[L, S]):
         While the port is gone nothing is sent and nothing is raised.
         """
         care = self._care
-        self._check(goals_rad, bool(care.wanted))
-        ticks = self._goals.ticks(goals_rad)
-        link = self._link
-        if link is None:
-            return
-        for index in [i for i in care.rejoining if care.near(i, int(ticks[i]))]:
-            del care.rejoining[index]
-            self._stale = True
+        self._check(bool(care.wanted))
+        if care.rejoining:
+            near = self._goals.ticks(goals_rad, _NOBODY)
+            for index in [i for i in care.rejoining if care.near(i, int(near[i]))]:
+                if self._goals.allows(index, goals_rad[index]):
+                    del care.rejoining[index]
+                    self._stale = True
         if self._stale:
             chosen = [i for i in sorted(care.wanted) if i not in care.away and i not in care.rejoining]
             self._places = np.array(chosen, np.intp)
             self._stale = False
-        if not len(self._places):
+        link = self._link
+        ticks = self._goals.ticks(goals_rad, _NOBODY if link is None else self._places)
+        if link is None or not len(self._places):
             return
         self._counts["writes"] += 1
         try:

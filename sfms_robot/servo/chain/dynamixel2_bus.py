@@ -22,7 +22,7 @@ from sfms_robot.ports import TickConversion
 from sfms_robot.servo.chain.chain_bus import READ_DEADLINE_S, ChainBus
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.chain.dynamixel2_poll import Sweep
-from sfms_robot.servo.chain.dynamixel2_startup import Handshake
+from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
 from sfms_robot.servo.chain.dynamixel2_telemetry import Telemetry, common
 from sfms_robot.servo.chain.roster import Roster
 from sfms_robot.servo.policy import BusServo as BusServo
@@ -66,20 +66,20 @@ class DynamixelBus(ChainBus[Dxl2Link, Telemetry]):
     def _open(self) -> Dxl2Link:
         return Dxl2Link(self._open_port(), self._baud, self._read_deadline_s)
 
-    def _shake(self, link: Dxl2Link, tries: int = 3) -> Handshake:
-        return Handshake(self.name, link, self._servos, self._tables, self._baud, tries)
+    def _shake(self, link: Dxl2Link, tries: int = 3) -> Dynamixel2Startup:
+        return Dynamixel2Startup(self.name, link, self._servos, self._tables, self._conversion, self._baud, tries)
 
     @property
     def _listed(self) -> Roster:
         return self._sweep.roster
 
-    def _met(self, link: Dxl2Link, bits: Sequence[int]) -> None:
+    def _met(self, link: Dxl2Link, bits: Mapping[int, int]) -> None:
         self._sweep.restart(link)
         self._armed, self._stalled, self._wrote_s = set(), False, math.inf
         self._watched = {i for i, table in enumerate(self._tables) if self._watchdog and table.watchdog == "stops"}
         now_s = link.port.now_s()
         self._sweep.measure(link, now_s)
-        for index, status in enumerate(bits):
+        for index, status in bits.items():
             self._care.take_bits(index, status, now_s)
 
     def statistics(self) -> Mapping[str, Any]:

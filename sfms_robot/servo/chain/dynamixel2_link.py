@@ -100,6 +100,12 @@ class Dxl2Link(RegisterLink):
         self._send(dxl2.encode_instruction(servo, dxl2.WRITE, address.to_bytes(2, "little") + data))
         return self._answer(servo, 0)
 
+    def refusal(self, answer: Answer) -> str:
+        """Bits 0..6 of the error byte are an error number; bit 7 only says that register 70 is worth a look."""
+        if not answer.error & ~dxl2.ALERT:
+            return ""
+        return dxl2.error_text(answer.error) + (", and reports a hardware error" if answer.error & dxl2.ALERT else "")
+
     def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """As `write`, but kept by the servo until `action`."""
         self._send(dxl2.encode_instruction(servo, dxl2.REG_WRITE, address.to_bytes(2, "little") + data))

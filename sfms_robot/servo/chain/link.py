@@ -66,6 +66,10 @@ class RegisterLink(ABC):
         """The acknowledgement, or None when there was none: the servo may have taken it all the same."""
 
     @abstractmethod
+    def refusal(self, answer: Answer) -> str:
+        """Why a request was refused, in words; empty when it was done, whatever else the servo complains of."""
+
+    @abstractmethod
     def reboot(self, servo: int) -> Answer | None: ...
 
     @abstractmethod

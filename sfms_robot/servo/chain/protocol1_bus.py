@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Final
 
 import numpy as np
@@ -23,7 +23,7 @@ from sfms_robot.servo.chain.chain_bus import READ_DEADLINE_S, ChainBus
 from sfms_robot.servo.chain.link import Answer
 from sfms_robot.servo.chain.protocol1_link import Family, Frame1Link
 from sfms_robot.servo.chain.protocol1_poll import GroupRead, InTurn, ask_together
-from sfms_robot.servo.chain.protocol1_startup import Frame1Handshake
+from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
 from sfms_robot.servo.chain.protocol1_telemetry import Frame1Telemetry
 from sfms_robot.servo.chain.roster import Roster
 from sfms_robot.servo.policy import BusServo
@@ -71,14 +71,14 @@ class Frame1Bus(ChainBus[Frame1Link, Frame1Telemetry]):
     def _open(self) -> Frame1Link:
         return Frame1Link(self._open_port(), self._baud, self._read_deadline_s, self.family)
 
-    def _shake(self, link: Frame1Link, tries: int = 3) -> Frame1Handshake:
-        return Frame1Handshake(self.name, link, self._servos, self._tables, self._baud, tries)
+    def _shake(self, link: Frame1Link, tries: int = 3) -> Protocol1Startup:
+        return Protocol1Startup(self.name, link, self._servos, self._tables, self._conversion, self._baud, tries)
 
     @property
     def _listed(self) -> Roster:
         return self._roster
 
-    def _met(self, link: Frame1Link, bits: Sequence[int]) -> None:
+    def _met(self, link: Frame1Link, bits: Mapping[int, int]) -> None:
         self._roster = Roster(list(self._index))
         self._group = self._tried(link, self._group_reader(link))
 

@@ -86,6 +86,10 @@ class Frame1Link(RegisterLink):
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
         return self._ask(servo, frame1.WRITE, bytes([address]) + data, 0)
 
+    def refusal(self, answer: Answer) -> str:
+        """Feetech has no bit that says so: its error byte is about the servo alone."""
+        return dxl1.refusal_text(answer.error) if self.family == "dynamixel" else ""
+
     def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """A write that the servo keeps until `action`."""
         return self._ask(servo, frame1.REG_WRITE, bytes([address]) + data, 0)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from sfms_robot.errors import ServoError
-from sfms_robot.servo.chain.startup import Contact, Silent, Steps
+from sfms_robot.servo.chain.startup import Silent, Startup, Steps
 
 EXCHANGES: Final = 6  # in one tick, all jobs together
 ATTEMPTS: Final = 3  # that may fail in a row before a servo is left alone
@@ -40,7 +40,7 @@ class Recovery:
     def __contains__(self, index: int) -> bool:
         return index in self._jobs
 
-    def begin(self, index: int, shake: Contact[Any], due_s: float, reboot: bool = False) -> None:
+    def begin(self, index: int, shake: Startup[Any], due_s: float, reboot: bool = False) -> None:
         """From the beginning, not before `due_s`."""
         self._jobs[index] = _Job(shake.bring_back(index, reboot), due_s)
 

@@ -1,39 +1,47 @@
-"""What first contact is made of: checked, repeated requests to the servos of a bus, and jobs in steps.
+"""Startup of the servos of a chain: identify, verify, prepare, enable.
 
-A job is a generator of *steps*: between two exchanges on the wire it yields how long it would like to wait. At
-start-up a job is run through at once; when a servo comes back while the bus is running, a tick takes a few steps and
-goes on with its own work. Whatever is written is read back.
+    identify   who answers, is it the model that the head's file names, of a firmware whose registers are known
+    verify     what the unit has stored against what the head's file reckons with (`stored_settings`); refused by name
+    prepare    mode, profile, torque limit and the registers of the head's file, each written and read back
+    enable     goal := present, then torque: no jump
+
+The same steps bring a servo back that was away. They are generators (`Steps`): between two exchanges on the wire they
+yield how long they would like to wait. At startup they are run through at once; while the bus is running, a tick takes
+a few and goes on with its own work.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Final, Generic, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.chain.link import Answer, Found, RegisterLink
+from sfms_robot.ports import TickConversion
+from sfms_robot.servo.chain.link import Found, RegisterLink
+from sfms_robot.servo.chain.verified_write import TRIES, finish, verified_write
+from sfms_robot.servo.chain.verified_write import Silent as Silent
+from sfms_robot.servo.chain.verified_write import Steps as Steps
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names, limits_count
 
-T = TypeVar("T")
 L = TypeVar("L", bound=RegisterLink)
-Steps = Generator[float, None, T]  # yields seconds to wait before it is asked to go on
 
-TRIES: Final = 3
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms
+LONGEST_READ: Final = 128
 
 
-class Silent(ServoError):
-    """A servo did not answer, as opposed to one that refuses."""
-
-
-class Contact(ABC, Generic[L]):
+class Startup(ABC, Generic[L]):
     """Requests to the servos of a bus. `index` counts servos in bus order.
 
     Args:
         bus: its name, for messages.
         tables: of each servo; a protocol whose servos tell their firmware replaces those of another layout.
+        conversion: joint angles (J,) <-> ticks (J,), which says how far the goals of each joint go.
         baud: for messages.
         tries: before a servo counts as silent; 1 beside a running bus.
 
@@ -44,53 +52,144 @@ class Contact(ABC, Generic[L]):
     can_reboot: ClassVar[bool]
 
     def __init__(
-        self, bus: str, link: L, servos: Sequence[BusServo], tables: list[Table], baud: int, tries: int = TRIES
+        self,
+        bus: str,
+        link: L,
+        servos: Sequence[BusServo],
+        tables: list[Table],
+        conversion: TickConversion,
+        baud: int,
+        tries: int = TRIES,
     ) -> None:
         self._bus = bus
         self._link = link
         self._servos = servos
         self.tables = tables
+        self._needs = needs_of(servos, conversion)
         self._baud = baud
         self._tries = tries
 
+    @property
     @abstractmethod
-    def run(self) -> list[int]:
-        """Identify and prepare every servo; latched faults as bits where the protocol has such a register, else 0.
+    def family(self) -> str:
+        """As `--family` takes it."""
 
-        Raises BusError listing the ids that do not answer, ServoError for one that is not what it should be.
+    # --- all together -------------------------------------------------------------------------------------------
+
+    def run(self) -> dict[int, int]:
+        """Identify, verify and prepare every servo; torque is left as it is.
+
+        Latched faults, as bits of the table's faults (0 where the protocol has no such register), by index of those
+        that answered. Each servo that does not costs `tries` times `PATIENCE_S`.
+
+        Raises BusError when nobody answers, ServoError for one that is not what the head's file says.
         """
-
-    @abstractmethod
-    def torque_on(self, index: int) -> Steps[int]:
-        """Goal := present, read back, torque on, read back; the position held, in ticks."""
-
-    @abstractmethod
-    def bring_back(self, index: int, reboot: bool) -> Steps[int]:
-        """A servo that was away, from the beginning: is it still the same, settings, torque on; the position held."""
+        bits: dict[int, int] = {}
+        with self._link.patient(PATIENCE_S):
+            for index, who in self._identify().items():
+                self._recognise(index, who)
+                try:
+                    bits[index] = finish(self.prepare(index))
+                except Silent:
+                    continue
+        if not bits:
+            absent = ", ".join(f"{servo.id} ({servo.joint})" for servo in self._servos)
+            raise BusError(
+                f"bus {self._bus!r} on {self._link.port.name} at {self._baud} baud: no answer from id {absent}; "
+                f"look for them: sfms-robot servo scan --port {self._link.port.name}"
+            )
+        return bits
 
     def switch_on(self, index: int) -> int:
-        """Torque on without a jump; the position held, in ticks."""
+        """`torque_on`, run through; the position held, in ticks."""
         with self._link.patient(PATIENCE_S):
             return finish(self.torque_on(index))
 
-    def _identify(self) -> None:
-        """Find everybody, and have a look at who it is."""
+    def _identify(self) -> dict[int, Found]:
+        """Who answers a ping, by index."""
         found: dict[int, Found] = {}
         for _ in range(self._tries):
             for index in range(len(self._servos)):
-                if index not in found and (who := self._meet(index)) is not None:
+                if index not in found and (who := self._ping(index)) is not None:
                     found[index] = who
-        absent = [f"{s.id} ({s.joint})" for i, s in enumerate(self._servos) if i not in found]
-        if absent:
-            there = ", ".join(str(self._servos[i].id) for i in sorted(found)) or "none"
-            raise BusError(
-                f"bus {self._bus!r} on {self._link.port.name} at {self._baud} baud: "
-                f"no answer from id {', '.join(absent)}; ids that answer: {there}"
-            )
-        for index, who in found.items():
-            self._recognise(index, who)
+        return {index: found[index] for index in sorted(found)}
 
-    def _meet(self, index: int) -> Found | None:
+    # --- one servo ----------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def prepare(self, index: int) -> Steps[int]:
+        """Verify what is stored, then settings, before torque; the latched faults. Torque is left as it is.
+
+        Raises ServoError for a stored value that contradicts the head's file.
+        """
+
+    @abstractmethod
+    def bring_back(self, index: int, reboot: bool) -> Steps[int]:
+        """A servo that was away, from the beginning: is it still the same, settings, torque on; the position held.
+
+        Raises Silent, and ServoError as `prepare` and `torque_on`.
+        """
+
+    def torque_on(self, index: int) -> Steps[int]:
+        """Goal := present, read back, torque on, read back; the position held, in ticks.
+
+        Raises ServoError for a servo that stands outside its own limits: its first goal would make it jump.
+        """
+        limits = self.own_limits(index)
+        yield 0.0
+        present = self.value(index, self._field(index, "present_position"))  # from here on without a pause
+        if limits is not None and not limits[0] <= present <= limits[1]:
+            raise self._error(
+                index,
+                f"stands at {present}, outside its own limits {limits[0]}..{limits[1]}: torque would make it jump; "
+                "turn it in by hand",
+            )
+        yield from self._write(index, self._field(index, "goal_position"), present)
+        yield from self._restore_torque(index)
+        yield from self._write(index, self._field(index, "torque_enable"), 1)
+        return present
+
+    @abstractmethod
+    def wanted(self, index: int) -> Mapping[str, int]:
+        """Registers and values that are to be in force as long as the bus runs: mode, profile, torque limit, and those
+        of the head's file. Raises ServoError for a register that the model does not have.
+        """
+
+    def _restore_torque(self, index: int) -> Steps[None]:
+        """What a servo took back when it shut down."""
+        yield from ()
+
+    def own_limits(self, index: int) -> tuple[int, int] | None:
+        """The position limits stored in the servo, ticks; None where it has none or they do not count."""
+        table = self.tables[index]
+        names = limit_names(table)
+        if names is None or not limits_count(table, self._needs[index]):
+            return None
+        low, high = (self.value(index, table[name]) for name in names)
+        return (low, high) if low < high else None
+
+    def _verify(self, index: int, values: Mapping[str, int]) -> list[Contradiction]:
+        """Contradictions that startup itself sets right or that do no harm. Raises ServoError for the others."""
+        found = contradictions(values, self.tables[index], self._needs[index])
+        for each in found:
+            if each.then == "refused":
+                raise self._error(
+                    index, f"has stored what contradicts the head's file: {each}{self._cure(index, each)}"
+                )
+        return found
+
+    def _cure(self, index: int, problem: Contradiction) -> str:
+        """What to type."""
+        port, servo = self._link.port.name, self._servos[index].id
+        if problem.register == self._name(index, "present_position"):
+            return "" if not problem.fixable else f" (sfms-robot doctor --port {port} --head HEAD --fix)"
+        family = "" if self.family == "dynamixel2" else f" --family {self.family}"
+        write = f"sfms-robot servo write {servo} {problem.register} {problem.wanted} --port {port}{family}"
+        return f" (sfms-robot doctor --port {port} --head HEAD --fix, or {write})"
+
+    # --- exchanges ----------------------------------------------------------------------------------------------
+
+    def _ping(self, index: int) -> Found | None:
         return self._link.ping(self._servos[index].id)
 
     def _recognise(self, index: int, found: Found) -> None:
@@ -101,20 +200,58 @@ class Contact(ABC, Generic[L]):
                 index, f"is model number {found.model_number}, the head says {table.model} ({table.model_number})"
             )
 
-    def _repeat(self, index: int, what: str, request: Callable[[], Answer | None]) -> Answer:
+    def _snapshot(self, index: int, end: int) -> Steps[dict[str, int]]:
+        """Values of all registers below address `end`, in as few reads as they take."""
+        memory = bytearray()
+        for start in range(0, end, LONGEST_READ):
+            memory += self._read(index, "its registers", start, min(LONGEST_READ, end - start))
+            yield 0.0
+        fields = self.tables[index].fields.values()
+        return {
+            each.name: each.from_bytes(memory[each.address :]) for each in fields if each.address + each.size <= end
+        }
+
+    def value(self, index: int, field: Field) -> int:
+        """One register. Raises Silent, ServoError when it is refused."""
+        return field.from_bytes(self._read(index, field.name, field.address, field.size))
+
+    def _read(self, index: int, what: str, address: int, length: int) -> bytes:
         for _ in range(self._tries):
-            answer = request()
+            answer = self._link.read(self._servos[index].id, address, length)
             if answer is not None:
                 break
         else:
-            raise Silent(self._about(index, f"does not answer to {what}"))
-        if refusal := self._refusal(answer):
-            raise self._error(index, f"refuses {what}: {refusal}")
-        return answer
+            raise Silent(self._about(index, f"does not answer when asked for {what}"))
+        if refusal := self._link.refusal(answer):
+            raise self._error(index, f"does not tell {what}: {refusal}")
+        if len(answer.data) != length:
+            raise self._error(index, f"gives no value for {what}")
+        return answer.data
 
-    @abstractmethod
-    def _refusal(self, answer: Answer) -> str:
-        """Why a request was refused, in words; empty when it was not."""
+    def _write(self, index: int, field: Field, value: int) -> Steps[None]:
+        """A verified write, through the lock of the EEPROM where there is one."""
+        servo, lock = self._servos[index], self.tables[index].role("lock")
+        about = f"{servo.joint} (id {servo.id})"
+        yield from verified_write(self._link, servo.id, field, value, lock=lock, tries=self._tries, about=about)
+
+    def _registers(self, index: int) -> dict[str, int]:
+        """Those of the head's file."""
+        table, own = self.tables[index], self._servos[index].safety.registers
+        for name in own:
+            if name not in table.fields:
+                raise self._error(index, f"is a {table.model}, which has no register {name}")
+        return dict(own)
+
+    def _field(self, index: int, role: str) -> Field:
+        field = self.tables[index].role(role)
+        if field is None:
+            raise self._error(index, f"is a {self.tables[index].model}, which has no register for {role}")
+        return field
+
+    def _name(self, index: int, role: str) -> str:
+        """Name of the register of a role; the role itself where the model has none."""
+        field = self.tables[index].role(role)
+        return role if field is None else field.name
 
     def _error(self, index: int, problem: str) -> ServoError:
         return ServoError(self._about(index, problem))
@@ -124,11 +261,16 @@ class Contact(ABC, Generic[L]):
         return f"{servo.joint} (id {servo.id}) {problem}"
 
 
-def finish(steps: Steps[T]) -> T:
-    """Run a job through, without the pauses it would like."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+def needs_of(servos: Sequence[BusServo], conversion: TickConversion) -> list[JointNeeds]:
+    """What each joint of a bus asks of its servo."""
+    ends: list[NDArray[np.int64]] = [
+        conversion.to_ticks(np.array([servo.min_rad for servo in servos])),
+        conversion.to_ticks(np.array([servo.max_rad for servo in servos])),
+    ]
+    ids = frozenset(servo.id for servo in servos)
+    return [
+        JointNeeds(
+            int(min(a, b)), int(max(a, b)), servo.stored, ids - {servo.id}, servo.safety.current_limit_mA is not None
+        )
+        for servo, a, b in zip(servos, *ends, strict=True)
+    ]

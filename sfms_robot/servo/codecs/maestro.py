@@ -16,30 +16,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-SET_TARGET: Final = 0x84
-SET_SPEED: Final = 0x87
-SET_ACCELERATION: Final = 0x89
-GET_POSITION: Final = 0x90
-GET_MOVING: Final = 0x93
-SET_TARGETS: Final = 0x9F  # the 12, 18 and 24 channel boards only
-GET_ERRORS: Final = 0xA1
+# Command bytes, named as in section 5.e of the guide; [0] is the command byte, data bytes follow from [1] on.
+SET_TARGET: Final = 0x84  # [1] channel, [2] target bits 0-6, [3] target bits 7-13
+SET_SPEED: Final = 0x87  # [1] channel, [2] speed bits 0-6, [3] speed bits 7-13
+SET_ACCELERATION: Final = 0x89  # [1] channel, [2] acceleration bits 0-6, [3] acceleration bit 7
+GET_POSITION: Final = 0x90  # [1] channel; answer [0] position low 8 bits, [1] position high 8 bits
+GET_MOVING: Final = 0x93  # Get Moving State; answer [0] 0 or 1
+SET_TARGETS: Final = 0x9F  # Set Multiple Targets (Mini Maestro 12, 18 and 24): [1] number, [2] first channel, words
+GET_ERRORS: Final = 0xA1  # answer [0] error bits 0-7, [1] error bits 8-15
 GO_HOME: Final = 0xA2
-MINI_SSC: Final = 0xFF
+MINI_SSC: Final = 0xFF  # [1] servo number, [2] target 0-254
 
 BAUD_INDICATION: Final = 0xAA
 DEFAULT_DEVICE: Final = 12
 OFF: Final = 0  # the target that switches pulses off
 MAX_WORD: Final = 0x3FFF
-FACTORY_PULSE_US: Final = (
-    992,
-    2000,
-)  # of every channel; wider ones are set over USB, and a board keeps to them silently
+FACTORY_PULSE_US: Final = (992, 2000)  # of every channel; wider is set over USB, and a board keeps to it silently
 
-# Bits of the error register.
-SIGNAL_ERROR: Final = 1 << 0
-CRC_ERROR: Final = 1 << 3
-PROTOCOL_ERROR: Final = 1 << 4
-TIMEOUT_ERROR: Final = 1 << 5
+# Bits of the error register, section 4.e; bits 6 to 8 are the script's.
+SIGNAL_ERROR: Final = 1 << 0  # Serial Signal Error: a stop bit was not where it should be
+CRC_ERROR: Final = 1 << 3  # Serial CRC Error (bits 1 and 2: overrun, buffer full)
+PROTOCOL_ERROR: Final = 1 << 4  # Serial Protocol Error: a command that is none, or one cut short
+TIMEOUT_ERROR: Final = 1 << 5  # Serial Timeout: no command for as long as its setting says
 WIRE_ERRORS: Final = 0x1F  # bytes were lost or damaged on the way: nothing is wrong with the board itself
 
 _DATA_LENGTH: Final = {
@@ -85,6 +83,7 @@ def from_word(data: bytes) -> int:
 
 
 def set_target(channel: int, quarter_us: int) -> bytes:
+    """`quarter_us` in quarter microseconds of pulse; 0 = no pulses."""
     return bytes([SET_TARGET, channel]) + word(quarter_us)
 
 
@@ -128,7 +127,10 @@ def mini_ssc(channel: int, value: int) -> bytes:
 
 
 def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
-    """A compact command in the Pololu protocol, for one of several boards on a wire."""
+    """A compact command in the Pololu protocol, for one of several boards on a wire.
+
+    [0] AA, [1] device number, [2] command byte with its top bit cleared, [3] on: its data.
+    """
     return bytes([BAUD_INDICATION, device, command[0] & 0x7F]) + command[1:]
 
 
@@ -151,7 +153,7 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
         if code == BAUD_INDICATION:
             if len(buffer) < 2:
                 return None
-            if buffer[1] >= 0x80:  # a second indication, or one sent alone
+            if buffer[1] >= 0x80:  # no device number: a second baud indication, or one sent alone
                 del buffer[0]
                 continue
             if len(buffer) < 3:
@@ -189,4 +191,5 @@ def _end(buffer: bytearray, code: int, start: int) -> int | None:
         return start + _DATA_LENGTH[code] if code in _DATA_LENGTH else -1
     if len(buffer) <= start:
         return None
+    # number of targets and first channel, then a word for each target
     return start + 2 + 2 * (buffer[start] & 0x7F)

@@ -17,18 +17,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-CHANNELS: Final = 32
-MIN_PULSE_US: Final = 500
+CHANNELS: Final = 32  # <ch> 0..31
+MIN_PULSE_US: Final = 500  # <pw>, "pulse width in microseconds, 500 - 2500"
 MAX_PULSE_US: Final = 2500
-MAX_TIME_MS: Final = 65535
+MAX_TIME_MS: Final = 65535  # <time>, "time in milliseconds to complete the move, 65535 maximum"
 MAX_LINE: Final = 1024  # bytes; a longer line is rubbish, and bounds what a reader holds
-DONE: Final = b"."
+DONE: Final = b"."  # answers to Q, Query Movement Status
 MOVING: Final = b"+"
 
-_CR: Final = 0x0D
-_ESC: Final = 0x1B
+_CR: Final = 0x0D  # <cr> starts the action of a command
+_ESC: Final = 0x1B  # <esc> cancels the current command
+# # <ch> P <pw> S <spd>, Servo Move; # <ch> <lvl> with H or L, Discrete Output
 _ITEM: Final = re.compile(r"#(\d{1,2})(?:P(\d{1,5})(?:S(\d{1,5}))?|([HL]))")
+# the same in any number and T <time> behind them all, Servo Group Move
 _GROUP: Final = re.compile(r"((?:#\d{1,2}(?:P\d{1,5}(?:S\d{1,5})?|[HL]))+)(?:T(\d{1,5}))?")
+# QP <arg>, Query Pulse Width; several channels in one command
 _QUERY: Final = re.compile(r"QP\s*\d{1,2}(?:\s+\d{1,2})*")
 
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from sfms_robot import config
 from sfms_robot.listeners.arig.codes import CodeHead
-from sfms_robot.listeners.arig.diffusion import Denoiser, signal_share, steps_of
+from sfms_robot.listeners.arig.diffusion import Denoiser, cosine_alpha_bar, steps_of
 
 
 def denoiser(**changes) -> Denoiser:
@@ -23,15 +23,15 @@ def denoiser(**changes) -> Denoiser:
 def test_sampling_is_equation_4_where_nothing_is_clamped():
     model = denoiser()
     z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
-    share = signal_share(40)[model.levels]
+    alpha_bar = cosine_alpha_bar(40)[model.levels]
     x = noise[:, 0]
     for step, level in enumerate(reversed(model.levels)):
         index = len(model.levels) - 1 - step
-        before = share[index - 1] if index else torch.tensor(1.0)
-        alpha = share[index] / before
+        before = alpha_bar[index - 1] if index else torch.tensor(1.0)
+        alpha = alpha_bar[index] / before
         found = model(x, model.modulate(z, model.level(torch.full((4,), level))))
-        mean = (x - (1 - alpha) / (1 - share[index]).sqrt() * found) / alpha.sqrt()
-        sigma = ((1 - alpha) * (1 - before) / (1 - share[index])).sqrt()
+        mean = (x - (1 - alpha) / (1 - alpha_bar[index]).sqrt() * found) / alpha.sqrt()
+        sigma = ((1 - alpha) * (1 - before) / (1 - alpha_bar[index])).sqrt()
         x = (mean + (sigma * noise[:, step + 1] if index else 0)).float()
     torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
 
@@ -40,13 +40,13 @@ def test_sampling_is_equation_4_where_nothing_is_clamped():
 def test_ddim_keeps_the_noise_it_found():
     model = denoiser(sampler="ddim")
     z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
-    share = signal_share(40)[model.levels].float()
+    alpha_bar = cosine_alpha_bar(40)[model.levels].float()
     x = noise[:, 0]
     for index in reversed(range(5)):
         level = model.level(torch.full((4,), model.levels[index]))
         found = model(x, model.modulate(z, level))
-        clean = (x - (1 - share[index]).sqrt() * found) / share[index].sqrt()
-        before = share[index - 1] if index else torch.tensor(1.0)
+        clean = (x - (1 - alpha_bar[index]).sqrt() * found) / alpha_bar[index].sqrt()
+        before = alpha_bar[index - 1] if index else torch.tensor(1.0)
         x = before.sqrt() * clean + (1 - before).sqrt() * found
     torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
 
@@ -84,8 +84,8 @@ def test_without_added_noise_the_start_decides(changes):
 def test_a_temperature_of_some_channels_scales_the_noise_that_is_added_to_them():
     model = denoiser(temperature=0.3, temperatures={"eye": 2.0, "jaw": (1.4, 0.2)})
     z, noise = torch.randn(2, 8), torch.randn(2, 5, 3)
-    warmth = torch.tensor([[1.4, 2.0, 2.0], [1.0, 2.0, 2.0], [0.6, 2.0, 2.0], [0.2, 2.0, 2.0]])
-    scaled = torch.cat([noise[:, :1], noise[:, 1:] * warmth], dim=1)
+    temperature = torch.tensor([[1.4, 2.0, 2.0], [1.0, 2.0, 2.0], [0.6, 2.0, 2.0], [0.2, 2.0, 2.0]])
+    scaled = torch.cat([noise[:, :1], noise[:, 1:] * temperature], dim=1)
     torch.testing.assert_close(model.sample(z, noise), denoiser().sample(z, scaled))
 
 
@@ -111,8 +111,8 @@ def test_the_last_step_returns_clean_motion(steps: int, sampler: str):
 
 @pytest.mark.parametrize("levels", [2, 40, 1000])
 def test_noise_grows_and_motion_never_quite_goes(levels: int):
-    share = signal_share(levels)
-    assert bool((share.diff() < 0).all()) and share[0] < 1 and share[-1] > 5e-4
+    alpha_bar = cosine_alpha_bar(levels)
+    assert bool((alpha_bar.diff() < 0).all()) and alpha_bar[0] < 1 and alpha_bar[-1] > 5e-4
 
 
 @torch.no_grad()
@@ -150,5 +150,5 @@ def test_codes_are_drawn_by_their_probability():
     drawn = head.sample(z.expand(4000, 8), torch.randn(4000, 1, 1))
     kinds, counts = drawn.unique(dim=0, return_counts=True)
     assert len(kinds) <= 6
-    share = torch.softmax(head.classify(z), -1)[0].sort().values
-    torch.testing.assert_close(counts.sort().values / 4000, share[-len(kinds) :], rtol=0, atol=0.03)
+    alpha_bar = torch.softmax(head.classify(z), -1)[0].sort().values
+    torch.testing.assert_close(counts.sort().values / 4000, alpha_bar[-len(kinds) :], rtol=0, atol=0.03)

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from tiny_arig import arig_model
 
 from sfms_robot.config.arig import STATES
+from sfms_robot.listeners.arig.audio_frontend import WIDTHS
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.ibu import LongRange
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.parts import windows
-from sfms_robot.listeners.arig.sound import WIDTHS
 
 ABLATIONS = [
     {},

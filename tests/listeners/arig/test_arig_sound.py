@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.frames import FRAME_SAMPLES
-from sfms_robot.listeners.arig import sound
+from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.signals import mel
 
 
@@ -14,10 +14,10 @@ def voice(frames: int) -> np.ndarray:
 
 def test_a_track_frame_by_frame_is_the_track_as_a_whole():
     samples = voice(64)
-    whole, voiced = sound.track(samples)
-    ears = sound.start()
+    whole, voiced = audio_frontend.track(samples)
+    ears = audio_frontend.start()
     for index, frame in enumerate(samples.reshape(64, FRAME_SAMPLES)):
-        features, present, ears = sound.hear(frame, ears)
+        features, present, ears = audio_frontend.hear(frame, ears)
         np.testing.assert_array_equal(features, whole[index])
         assert present and ears.voiced == voiced[index]
     assert 0 < voiced.mean() < 1
@@ -26,16 +26,16 @@ def test_a_track_frame_by_frame_is_the_track_as_a_whole():
 def test_mel_rows_stand_in_for_samples():
     samples = voice(64)
     rows = mel.log_mel(samples, mel.start())[0].reshape(64, 4, 128)
-    features, voiced = sound.of_mel(rows)
+    features, voiced = audio_frontend.of_mel(rows)
     assert features.shape == (64, 533)
     np.testing.assert_array_equal(features[:, :512], rows.reshape(64, 512))
-    assert (voiced == sound.track(samples)[1]).mean() > 0.8
+    assert (voiced == audio_frontend.track(samples)[1]).mean() > 0.8
 
 
 @pytest.mark.parametrize("samples", [None, np.zeros(0, np.float32)])
 def test_no_samples_are_silence_not_heard(samples):
-    features, present, _ = sound.hear(samples, sound.start())
-    silent, heard, _ = sound.hear(np.zeros(FRAME_SAMPLES, np.float32), sound.start())
+    features, present, _ = audio_frontend.hear(samples, audio_frontend.start())
+    silent, heard, _ = audio_frontend.hear(np.zeros(FRAME_SAMPLES, np.float32), audio_frontend.start())
     np.testing.assert_array_equal(features, silent)
     assert (present, heard) == (False, True)
 
@@ -43,10 +43,10 @@ def test_no_samples_are_silence_not_heard(samples):
 @pytest.mark.parametrize("samples", [1, 639, 640, 641, 2000])
 def test_a_frame_of_the_agent_is_cut_or_filled_up(samples: int):
     given = np.full(samples, 0.5, np.float32)
-    fitted = sound.fit_frame(given)
+    fitted = audio_frontend.fit_frame(given)
     assert len(fitted) == FRAME_SAMPLES and fitted.sum() == 0.5 * min(samples, FRAME_SAMPLES)
 
 
 def test_a_short_recording_has_no_frames():
-    features, voiced = sound.track(np.zeros(639, np.float32))
+    features, voiced = audio_frontend.track(np.zeros(639, np.float32))
     assert features.shape == (0, 533) and voiced.shape == (0,)

@@ -5,7 +5,7 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
-from sfms_robot.listeners.arig import sound
+from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.stream import ArigListener
 
@@ -71,8 +71,8 @@ def dyad_of(listener: ArigListener, speaker: list[SpeakerFrame], agent_motion: t
     def samples(track):
         return np.concatenate([s if s is not None and len(s) else silence for s in track])
 
-    user, user_voiced = sound.track(samples([frame.audio for frame in speaker] + [None]))
-    agent, agent_voiced = sound.track(samples([frame.agent_audio for frame in speaker]))
+    user, user_voiced = audio_frontend.track(samples([frame.audio for frame in speaker] + [None]))
+    agent, agent_voiced = audio_frontend.track(samples([frame.agent_audio for frame in speaker]))
     faces = [frame.face.motion if frame.face else np.zeros(58, np.float32) for frame in speaker]
     still = torch.tensor(listener.space.neutral, dtype=torch.float32)[None]
     return Dyad(

@@ -40,7 +40,7 @@ def test_guidance_of_1_is_none_bit_for_bit(tiny):
 @torch.no_grad()
 def test_what_is_known_of_nobody_is_what_a_silent_unseen_speaker_leaves():
     predictor = guided_listener(3.0).model.predictor
-    both = predictor(seen(True, True), nobody=predictor.nobody(40))
+    both = predictor(seen(True, True), absent=predictor.absent_speaker(40))
     torch.testing.assert_close(both[:3], predictor(seen(True, True)))
     torch.testing.assert_close(both[3:], predictor(seen(False, False)))
 

@@ -7,11 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.listeners.sfms.choice import choose, sweep
-from sfms_robot.listeners.sfms.exact import best_frames_each, completion_errors, mask_cost, segments
+from sfms_robot.listeners.sfms.exact import completion_errors, mask_cost, segments
 from sfms_robot.listeners.sfms.neighbours import Neighbours
 from sfms_robot.listeners.sfms.placement import (
     STRATEGIES,
-    nested_order,
     place,
     place_exact,
     place_learned,
@@ -155,13 +154,6 @@ def test_completion_errors_are_those_of_the_best_mask_through_the_chosen_frames(
             torch.testing.assert_close(found[k - 1, frame], best, rtol=1e-6, atol=1e-8)
 
 
-def test_one_pass_for_every_k_equals_one_pass_each():
-    motion = walk(3, 5, 12)
-    for k, frames in zip(range(2, 7), best_frames_each(cost_of(motion), 2, 6), strict=True):
-        mask = place_exact(motion.float(), [k], torch.ones(1, 1))[..., 0]
-        assert torch.equal(frames, mask.nonzero()[:, 1].view(5, k))
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.sets(st.integers(0, 8), min_size=1, max_size=6), st.integers(0, 10_000))
 def test_stretch_errors_tell_what_one_more_keyframe_changes(chosen, seed: int):
@@ -183,7 +175,7 @@ def test_stretch_errors_tell_what_one_more_keyframe_changes(chosen, seed: int):
 def test_a_sweep_keeps_k_and_never_makes_a_mask_worse(together: int, count: int):
     score = scores("learned")
     track = tracks(torch.randn(6, 16, 3).cumsum(1), MEMBER, score.curves)
-    start = choose(score, track, torch.full((12,), count)).mask
+    start = choose(score, track, torch.full((12,), count))
     swept = sweep(score, track, start, together)
     assert torch.equal(swept.sum(1), start.sum(1))
     assert (mask_cost(track.cost, swept) <= mask_cost(track.cost, start) + 1e-6).all()
@@ -196,16 +188,6 @@ def test_conditional_scores_never_choose_a_frame_twice_and_see_no_other_track():
     assert (mask[..., 0] == 1).all()
     alone = place(motion[2:3], [16, 3], "learned", member=MEMBER, score=score)
     assert torch.equal(alone[0], mask[2])
-
-
-@pytest.mark.parametrize("most", [2, 5, 9])
-def test_nested_keyframes_are_prefixes_of_one_order(most: int):
-    score = scores("nested")
-    motion = torch.randn(3, 16, 3).cumsum(1)
-    order = nested_order(motion, most, MEMBER, score)
-    for k in range(1, most + 1):
-        mask = place(motion, [k, k], "nested", member=MEMBER, score=score)
-        assert torch.equal(torch.zeros_like(mask).scatter(1, order[:, :k], 1.0), mask)
 
 
 @settings(max_examples=10, deadline=None)
@@ -221,7 +203,7 @@ def test_scores_do_not_depend_on_size_or_offset_of_the_motion(scale: float, seed
 
 
 @pytest.mark.parametrize(
-    "strategy, wrong", [("learned", "learned_paper"), ("nested", None), ("learned_paper", "nested")]
+    "strategy, wrong", [("learned", "learned_paper"), ("learned", None), ("learned_paper", "learned")]
 )
 def test_a_learned_placement_without_its_own_scores_is_refused(strategy, wrong):
     with pytest.raises(ValueError, match="score network"):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_sfms import tiny_listener
 
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, Trail, trails
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, LastKeyframes, last_keyframes
 from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)
@@ -101,15 +101,15 @@ def test_listening_in_chunks_equals_listening_at_once(rows: int, bins: int, chun
 
 def test_trails_are_the_last_two_keyframes_at_every_frame():
     tokens = torch.tensor([0, 3, 0, 5, 0])[None, :, None]
-    trail = trails(tokens)
-    assert trail.tokens[0, :, 0].tolist() == [[0, 0], [3, 0], [3, 0], [5, 3], [5, 3]]
-    assert trail.at[0, :, 0].tolist() == [[-1, -1], [1, -1], [1, -1], [3, 1], [3, 1]]
+    recent = last_keyframes(tokens)
+    assert recent.tokens[0, :, 0].tolist() == [[0, 0], [3, 0], [3, 0], [5, 3], [5, 3]]
+    assert recent.at[0, :, 0].tolist() == [[-1, -1], [1, -1], [1, -1], [3, 1], [3, 1]]
 
 
 def test_a_trail_grown_frame_by_frame_is_the_trail_of_the_whole():
     tokens = torch.randint(0, 3, (4, 30, 5), generator=torch.Generator().manual_seed(0))
-    whole = trails(tokens)
-    grown = Trail(*(part[:, 9] for part in whole))
+    whole = last_keyframes(tokens)
+    grown = LastKeyframes(*(part[:, 9] for part in whole))
     for frame in range(10, 30):
         grown = grown.then(tokens[:, frame], frame)
         for a, b in zip(grown, whole, strict=True):

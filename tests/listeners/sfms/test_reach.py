@@ -2,7 +2,7 @@ import torch
 from tiny_sfms import tiny_listener
 
 from sfms_robot.listeners.sfms.quantizer import indices_to_codes
-from sfms_robot.listeners.sfms.reach import Reach
+from sfms_robot.listeners.sfms.reachable import Reach
 
 
 def listener_with_speed(speed: float):

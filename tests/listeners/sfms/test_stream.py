@@ -29,12 +29,12 @@ def offline(listener, speaker, seed):
     """The same motion computed from whole arrays: features of everything first, then windows cut out of them."""
     model, settings = listener.model, listener.settings
     p, h, hop, n = settings.past_frames, settings.future_frames, settings.hop_frames, len(speaker)
-    audio, hearing = np.concatenate([frame.audio for frame in speaker]), listener.hearing
-    rows = model.standardise_sound(torch.from_numpy(hearing.rows(audio)))
-    voice = model.predictor.speaker.listen(torch.cat([torch.zeros(hearing.shape), rows])[None])[0]
+    audio, frontend = np.concatenate([frame.audio for frame in speaker]), listener.frontend
+    rows = model.standardise_sound(torch.from_numpy(frontend.rows(audio)))
+    voice = model.predictor.speaker.listen(torch.cat([torch.zeros(frontend.shape), rows])[None])[0]
     voice = torch.cat([torch.zeros(p, voice.shape[1]), voice])  # frame t at index p + t
-    place = torch.zeros(p + n, hearing.phase_features)
-    if hearing.phased:
+    place = torch.zeros(p + n, frontend.phase_features)
+    if frontend.phased:
         place[p:] = torch.from_numpy(phase.of_audio(audio))
     face = torch.from_numpy(np.stack([frame.face.motion for frame in speaker]))
     face = torch.cat([torch.zeros(p, 58), model.standardise(face)])
@@ -108,7 +108,7 @@ def test_memory_is_not_changed(tiny):
     np.testing.assert_array_equal(first.frames, second.frames)
     for one, other in ((before, memory), (before.speaker, memory.speaker)):
         for field in dataclasses.fields(one):
-            if field.name not in ("speaker", "ears"):
+            if field.name not in ("speaker", "audio"):
                 np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 

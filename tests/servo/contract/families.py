@@ -84,11 +84,11 @@ class Linear:
 
 SURE = {"confirmed": True}  # hobby servos jump to their first pose, and the tests know it
 FAMILIES = {
-    "dynamixel2": Family("dynamixel:DynamixelBus", "xl330-m288", other="xl330-m077"),
-    "dynamixel1": Family("dynamixel1:Dynamixel1Bus", "ax-12a", other="ax-18a"),
-    "dynamixel1-mx": Family("dynamixel1:Dynamixel1Bus", "mx-28-1.0", other="mx-64-1.0"),
-    "sts": Family("feetech:FeetechBus", "sts3215", other="sts3250"),
-    "scs": Family("feetech:FeetechBus", "scs0009"),
-    "maestro": Family("maestro:MaestroBus", "maestro-24", (0, 1, 2, 5), 115200, options=SURE),
-    "ssc32": Family("ssc32:Ssc32Bus", "ssc-32", (0, 1, 2, 5), 115200, options=SURE),
+    "dynamixel2": Family("chain.dynamixel2_bus:DynamixelBus", "xl330-m288", other="xl330-m077"),
+    "dynamixel1": Family("chain.dynamixel1_bus:Dynamixel1Bus", "ax-12a", other="ax-18a"),
+    "dynamixel1-mx": Family("chain.dynamixel1_bus:Dynamixel1Bus", "mx-28-1.0", other="mx-64-1.0"),
+    "sts": Family("chain.feetech_bus:FeetechBus", "sts3215", other="sts3250"),
+    "scs": Family("chain.feetech_bus:FeetechBus", "scs0009"),
+    "maestro": Family("boards.maestro_bus:MaestroBus", "maestro-24", (0, 1, 2, 5), 115200, options=SURE),
+    "ssc32": Family("boards.ssc32_bus:Ssc32Bus", "ssc-32", (0, 1, 2, 5), 115200, options=SURE),
 }

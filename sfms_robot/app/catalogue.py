@@ -1,0 +1,51 @@
+"""What there is to choose from: listeners, recorded people, serial ports. Each row has a name and a description."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sfms_robot.config.listener_kinds import load_listener
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.servo.discovery import ports_data
+from sfms_robot.sources.speakers import shipped_speaker, speakers
+
+
+def shipped_listeners() -> list[dict[str, Any]]:
+    """What `listener list` shows."""
+    folder = data_dir("configs") / "listeners"
+    rows = []
+    for name in shipped_names(folder, "config.yaml"):
+        config = load_listener(folder / name / "config.yaml")
+        rows.append(
+            {
+                "name": name,
+                "kind": config.kind,
+                "weights": (folder / name / "model.safetensors").is_file(),
+                "description": config.description,
+            }
+        )
+    return rows
+
+
+def shipped_speakers() -> list[dict[str, Any]]:
+    """What `speaker list` shows; the description is the title of SOURCE.md."""
+    import soundfile
+
+    rows = []
+    for name in speakers():
+        speaker = shipped_speaker(name)
+        title = (speaker.audio.parent / "SOURCE.md").read_text(encoding="utf-8").splitlines()[0]
+        rows.append(
+            {
+                "name": name,
+                "seconds": round(soundfile.info(speaker.audio).duration, 1),
+                "face": speaker.face is not None,
+                "description": title.partition(": ")[2],
+            }
+        )
+    return rows
+
+
+def serial_ports() -> list[dict[str, Any]]:
+    """What `port list` shows. `name` is what to give to --port."""
+    return ports_data()

@@ -1,0 +1,30 @@
+"""What a slip of the keyboard breaks, found before anything is loaded.
+
+Names, files and devices, by the very functions that the run will use; `session.run` looks at all the rest. Standard
+library only, so the answer takes as long as the interpreter does to start.
+"""
+
+from __future__ import annotations
+
+from sfms_robot.data import find
+from sfms_robot.errors import PortError
+from sfms_robot.servo.discovery import access_problem
+from sfms_robot.sources.speakers import recorded_files
+
+
+def check_names(
+    head: str,
+    listener: str,
+    port: str = "sim",
+    audio: str = "default",
+    face: str = "auto",
+    agent_audio: str = "none",
+) -> None:
+    """Are there such a head, listener, port and files? Raises ConfigError, PortError."""
+    find("heads", head, "head.yaml")
+    find("listeners", listener, "config.yaml")
+    recorded_files(audio, face, agent_audio)
+    for part in port.split(","):
+        device = part.rpartition("=")[2]
+        if device.startswith("/") and (problem := access_problem(device)):
+            raise PortError(f"{device}: {problem}")

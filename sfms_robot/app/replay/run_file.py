@@ -1,0 +1,224 @@
+"""DIR/run.mcap -> arrays. A file that lacks its end, because the run was killed, is read up to there."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Channel, Footer, Message, Metadata
+from mcap.stream_reader import StreamReader
+from numpy.typing import NDArray
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
+from sfms_robot.runtime.recorder import RUN_FILE
+
+_PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
+_FLOOR_DB, _BELOW_LOUD_DB = -50.0, 27.0
+
+
+@dataclass(frozen=True)
+class RunRecording:
+    """A run as arrays: N ticks, J joints, M speaker frames.
+
+    Attributes:
+        about: what the run wrote about itself (head, listener, seed, ...).
+        joints: (J,) names.
+        times_s: (N,) of the ticks. motion: (N, 58) the face asked for.
+        goals_rad, present_rad: (N, J) float32; present is NaN where no servo answered.
+        faults: (N, J) a named fault is there.
+        heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
+        energy_db: (M,). speaker: (M, 58) NaN where no face was seen.
+        plans: how many the listener made.
+        whole: the file has its end.
+    """
+
+    about: Mapping[str, str]
+    joints: tuple[str, ...]
+    times_s: Doubles
+    motion: Floats
+    goals_rad: Floats
+    present_rad: Floats
+    faults: NDArray[np.bool_]
+    heard_s: Doubles
+    audio: Floats
+    energy_db: Doubles
+    speaker: Floats
+    plans: int
+    whole: bool
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the last tick."""
+        return float(self.times_s[-1])
+
+    @property
+    def has_voice(self) -> bool:
+        """Something was heard."""
+        return bool(np.any(self.energy_db > _FLOOR_DB))
+
+    @property
+    def talking(self) -> NDArray[np.bool_]:
+        """(M,) the speaker is in a phrase: loud against his own level, pauses under 0.2 s closed."""
+        if not self.has_voice:
+            return np.zeros(len(self.heard_s), dtype=np.bool_)
+        loud = self.energy_db > max(_FLOOR_DB, float(np.percentile(self.energy_db, 95)) - _BELOW_LOUD_DB)
+        edges = np.flatnonzero(np.diff(loud.astype(int)))
+        for end, start in zip(edges[:-1], edges[1:], strict=True):
+            if loud[end] and start - end <= _PAUSE_FRAMES:
+                loud[end : start + 1] = True
+        return loud
+
+    def talks_at(self, times_s: Doubles) -> NDArray[np.bool_]:
+        """(N,) whether the speaker is in a phrase at some instants."""
+        if not len(self.heard_s):
+            return np.zeros(len(times_s), dtype=np.bool_)
+        frame = np.searchsorted(self.heard_s, np.asarray(times_s) - 1e-9)
+        out: NDArray[np.bool_] = self.talking[np.minimum(frame, len(self.heard_s) - 1)]
+        return out
+
+    @property
+    def title(self) -> str:
+        """One line: head, listener, speaker and length."""
+        parts = [self.about[key] for key in ("head", "listener", "audio") if self.about.get(key)]
+        cut = "" if self.whole else " (the file was cut off)"
+        return "  |  ".join([*parts, f"{self.duration_s:.1f} s{cut}"])
+
+
+def read_recording(folder: Path | str) -> RunRecording:
+    """Read what `run --record` wrote. Raises ConfigError, in one line, when there is nothing that can be read."""
+    file = Path(folder) / RUN_FILE
+    if not file.is_file():
+        what = f"has no {RUN_FILE}" if Path(folder).is_dir() else "is no folder"
+        raise ConfigError(f"{folder}: {what}: not what `sfms-robot run --record DIR` wrote")
+    found = _Found()
+    try:
+        for kind, value in _records(file):
+            found.take(kind, value)
+    except (EndOfFile, struct.error) as error:
+        if not found.ticks:
+            raise ConfigError(f"{file}: holds no tick: the file is cut off") from error
+    except McapError as error:
+        raise ConfigError(f"{file}: not a recorded run: {error}") from error
+    except Exception as error:  # a broken chunk: each compressor has errors of its own
+        raise ConfigError(f"{file}: damaged: {error}") from error
+    if not found.ticks:
+        raise ConfigError(
+            f"{file}: holds no tick: " + ("the run never began" if found.whole else "the file is cut off")
+        )
+    return found.recording()
+
+
+def summary(recording: RunRecording) -> dict[str, Any]:
+    """What is in a recording, for the command line."""
+    return {
+        **{key: value for key, value in recording.about.items() if key != "joints"},
+        "duration_s": round(recording.duration_s, 3),
+        "ticks": len(recording.times_s),
+        "speaker_frames": len(recording.heard_s),
+        "plans": recording.plans,
+        "joints": len(recording.joints),
+        "faults": int(recording.faults.any(axis=0).sum()),
+        "whole": recording.whole,
+    }
+
+
+def _records(file: Path) -> Iterator[tuple[str, Any]]:
+    """(topic, body), ("about", metadata) and, when the file has one, ("end", None)."""
+    topics: dict[int, str] = {}
+    with file.open("rb") as stream:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                yield topics[record.channel_id], json.loads(record.data)
+            elif isinstance(record, Metadata) and record.name == "run":
+                yield "about", record.metadata
+            elif isinstance(record, Footer):
+                yield "end", None
+
+
+class _Found:
+    """What was read so far, number by number: messages as they come take twenty times as much."""
+
+    def __init__(self) -> None:
+        self.about: dict[str, str] = {}
+        self.whole = False
+        self._joints: tuple[str, ...] = ()
+        self._plans = 0
+        self._times_s, self._heard_s, self._energy_db = (array("d") for _ in range(3))
+        self._motion, self._goals_rad, self._present_rad, self._speaker = (array("f") for _ in range(4))
+        self._faults, self._pcm16 = bytearray(), bytearray()
+
+    @property
+    def ticks(self) -> int:
+        """Whole ones: a cut may fall between the face and the joints of one."""
+        return min(len(self._times_s), len(self._motion) // MOTION_DIM)
+
+    def take(self, kind: str, value: Any) -> None:
+        """One record of `_records`."""
+        if kind == "about":
+            self.about = value
+            self._joints = tuple(json.loads(value["joints"]))
+        elif kind == "end":
+            self.whole = True
+        elif kind == "/plan":
+            self._plans += 1
+        elif kind == "/face":
+            self._motion.extend(_by_channel(value))
+        elif kind == "/joints":
+            self._tick(value["time_s"], [value["joints"][name] for name in self._joints])
+        elif kind == "/speaker":
+            self._heard_s.append(value["time_s"])
+            self._energy_db.append(value["energy_db"])
+            self._speaker.extend(_by_channel(value["face"]))
+            self._pcm16 += _samples(value)
+
+    def _tick(self, time_s: float, joints: Sequence[Mapping[str, Any]]) -> None:
+        self._times_s.append(time_s)
+        self._goals_rad.extend(joint["goal_rad"] for joint in joints)
+        self._present_rad.extend(_or_nan(joint["present_rad"]) for joint in joints)
+        self._faults += bytes(joint["fault"] is not None for joint in joints)
+
+    def recording(self) -> RunRecording:
+        count, ticks = len(self._joints), self.ticks
+        by_joint = [np.array(values, dtype=np.float32) for values in (self._goals_rad, self._present_rad)]
+        goals_rad, present_rad = (values.reshape(-1, count)[:ticks] for values in by_joint)
+        return RunRecording(
+            self.about,
+            self._joints,
+            np.array(self._times_s)[:ticks],
+            np.array(self._motion, dtype=np.float32).reshape(-1, MOTION_DIM)[:ticks],
+            goals_rad,
+            present_rad,
+            np.frombuffer(self._faults, dtype=np.bool_).reshape(-1, count)[:ticks],
+            np.array(self._heard_s),
+            np.frombuffer(self._pcm16, dtype="<i2").astype(np.float32) / np.float32(32767),
+            np.array(self._energy_db),
+            np.array(self._speaker, dtype=np.float32).reshape(-1, MOTION_DIM),
+            self._plans,
+            self.whole,
+        )
+
+
+def _by_channel(body: Mapping[str, float | None] | None) -> list[float]:
+    return [math.nan if body is None else _or_nan(body[name]) for name in CHANNELS]
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _samples(body: Mapping[str, Any]) -> bytes:
+    """The samples of one frame, always 640 of them, so that they stay in step with the clock."""
+    size = 2 * FRAME_SAMPLES
+    return base64.b64decode(body["audio_pcm16"])[:size].ljust(size, b"\0")

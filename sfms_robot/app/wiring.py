@@ -1,0 +1,77 @@
+"""Where the buses of a head are: emulated servos in a process of their own, or serial devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.config import Bus as BusConfig
+from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map
+from sfms_robot.config.emulate import load_stored
+from sfms_robot.emulator.launch import Chain, EmulatedServo
+from sfms_robot.errors import ConfigError
+from sfms_robot.motion.calibration import Calibration
+from sfms_robot.ports import Clock
+from sfms_robot.servo.discovery import list_ports, stable_name
+from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.port_choice import AUTO, choose_ports, parse_ports
+
+SIM: Final = "sim"
+HANGING: Final = 0.3  # where an emulated joint stands at power-up: this share of the way from rest to its lower end
+
+Opened = Mapping[str, Chain | str]  # per named bus: an emulated chain, or a serial device
+
+
+def devices(head: Head, port: str) -> dict[str, str]:
+    """What `--port` says -> device per named bus. Raises ConfigError, and PortError for `auto` without an adapter."""
+    return choose_ports(head.buses, list_ports()) if port == AUTO else parse_ports(head.buses, port)
+
+
+def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Port]:
+    """Opens the port of a bus, also again after its device was unplugged. Raises PortError."""
+    if isinstance(where, str):
+        return partial(SerialPort, stable_name(where), bus.baud, clock, bus.rs485)
+    if where.virtual:
+        return partial(VirtualTimePort, where.device, where.control, bus.baud, clock)
+    return partial(SerialPort, where.device, bus.baud, clock)
+
+
+def firmware_maps(joints: dict[str, Joint]) -> dict[str, FirmwareMap]:
+    return {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
+
+
+def calibration_of(joints: dict[str, Joint]) -> Calibration:
+    maps = firmware_maps(joints)
+    turns = np.array([maps[joint.model].ticks_per_revolution for joint in joints.values()])
+    return Calibration(joints, turns)
+
+
+def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
+    """Per bus, the servos of a head that was switched off: hanging a little from rest, torque off."""
+    by_bus: dict[str, list[EmulatedServo]] = {}
+    for name, joint in head.joints.items():
+        hanging = np.array([joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)])
+        ticks = int(calibration_of({name: joint}).to_ticks(hanging)[0])
+        baud = head.buses[joint.bus].baud
+        by_bus.setdefault(joint.bus, []).append(EmulatedServo(joint.id, joint.model, baud, ticks))
+    return by_bus
+
+
+def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
+    """As `emulated`, with what somebody has stored in the servos of head `name` and the supply that they run on.
+
+    Raises ConfigError for stored values of a joint that the head does not have.
+    """
+    stored = load_stored(name)
+    for joint in stored.joints:
+        if joint not in head.joints:
+            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
+    joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
+    return {
+        bus: [replace(servo, registers=stored.of(joints[bus, servo.id]), supply_v=stored.supply_v) for servo in servos]
+        for bus, servos in emulated(head).items()
+    }

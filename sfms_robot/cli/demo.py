@@ -1,0 +1,60 @@
+"""`sfms-robot demo`: what `make run` does."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from sfms_robot.cli import names
+
+# Of the ten seeds that `--seeds 10` tries, the one that nods most.
+DEFAULT_SEED = 6
+
+
+def demo(
+    head: str = typer.Option("face28", autocompletion=names.heads, help="Shipped head, or a folder with a head.yaml."),
+    listener: str = typer.Option("sfms-small", autocompletion=names.listeners, help="Shipped listener, or a folder."),
+    seed: int = typer.Option(DEFAULT_SEED, min=0, max=2**32 - 1, help="Two seeds listen differently."),
+    duration: float | None = typer.Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
+    fast: bool = typer.Option(False, "--fast", help="Virtual time: as fast as it goes."),
+    out: Path | None = typer.Option(
+        None, metavar="DIR", help="Where recording and pictures go; default: sfms-demo, sfms-demo-2, ..."
+    ),
+    seeds: int | None = typer.Option(
+        None, min=1, metavar="N", help="In virtual time: what seeds 0 to N - 1 show, without pictures."
+    ),
+    json: bool = typer.Option(False, "--json", help="Print what was seen as one JSON object, last line of stdout."),
+) -> None:
+    """A recorded person talks, an emulated head listens; then two pictures of it lie beside its recording."""
+    from sfms_robot.app.listen.preflight import check_names
+
+    check_names(head=head, listener=listener)
+    from sfms_robot.app.listen import demo as app
+    from sfms_robot.app.listen.progress import RunProgress
+
+    options = app.DemoOptions(head, listener, seed, duration, fast or seeds is not None, out)
+    if seeds is not None:
+        told = app.compare_seeds(options, seeds, lambda row: print(_line(row), file=sys.stderr))
+    else:
+        told = app.demo(options, RunProgress)
+    if json:
+        print(json_module.dumps(told))
+    elif seeds is None:
+        print(_line(told))
+        print(f"look at {' and '.join(told['pictures'])}" if told["pictures"] else f"recorded in {told['folder']}")
+        if told["missing"]:
+            print(told["missing"], file=sys.stderr)
+    if told.get("error"):
+        print(f"sfms-robot: {told['error']}", file=sys.stderr)
+    raise typer.Exit(told["exit_code"])
+
+
+def _line(seen: dict[str, Any]) -> str:
+    return (
+        f"{seen['head']} listened for {seen['duration_s']:.1f} s (seed {seen['seed']}): {seen['nods']} nods, "
+        f"{seen['blinks']} blinks, {seen['smiles']} smiles, {seen['neck_travel_deg']:.0f} degrees of neck travel"
+    )

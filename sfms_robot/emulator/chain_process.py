@@ -1,0 +1,311 @@
+"""The process of an emulated chain: a pseudo terminal for the host, a control socket beside it.
+
+Started by `launch`, which writes one JSON line on stdin and reads one line back, `ready {"device": ..., ...}`. It ends
+on SIGTERM, or when stdin closes because its parent is gone.
+
+In real time bytes are answered when the wire says. In virtual time they wait in the terminal until a client of the
+control socket says how many there are and what time it is. Control requests and answers are one line each:
+
+    sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  take BYTES in total at SECONDS, then send LENGTH bytes of reply, those
+                                                 due by UNTIL; what came by SECONDS for bytes before FROM is lost
+    time SECONDS                     ok          only that; what happens by itself by then happens
+    digest                           digest SHA256 COUNT  of every byte the host sent
+    kill ID | revive ID              ok          the servo falls silent, or answers again
+    fault ID BITS                    ok          latch hardware errors
+    turn ID TICKS                    ok          somebody turns the shaft by hand
+    state ID                         json {...}  what an onlooker sees: position, goal, torque, ...
+    inject SPEC                      ok          a fault (see `faults`), from now on unless it says
+    clear                            ok          no more faults
+    supply VOLTS                     ok          of all servos
+    hangup | return                  ok          the adapter is unplugged, or plugged in again: same link, new terminal
+    stats | stamps | faults          json {...}  counts; the last replies, due and sent; faults that last or are to come
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import select
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from sfms_robot.emulator.device import Device
+from sfms_robot.emulator.emulated_wire import EmulatedWire
+from sfms_robot.emulator.faults import parse_fault
+from sfms_robot.emulator.pseudo_terminal import PseudoTerminal
+from sfms_robot.errors import ConfigError
+from sfms_robot.servo.registers import Table
+
+_CHUNK: Final = 4096
+_PATIENCE_S: Final = 1.0  # for bytes that a client said it had written
+_IDLE_S: Final = 0.25  # the longest that motors are left alone in real time
+_DEVICES: Final = {  # (family, protocol) -> class; imported only when something of it is plugged in
+    ("dynamixel", 2): "sfms_robot.emulator.dynamixel2_chain:Dynamixel2Chain",
+    ("dynamixel", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
+    ("feetech", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
+    ("maestro", None): "sfms_robot.emulator.pulse_boards:MaestroBoard",
+    ("ssc32", None): "sfms_robot.emulator.pulse_boards:Ssc32Board",
+}
+
+
+@dataclass
+class _Client:
+    """One connection to the control socket. Counts bytes from the moment it was opened."""
+
+    connection: socket.socket
+    buffer: bytearray = field(default_factory=bytearray)
+    taken: int = 0
+    wanted_from: int = 0
+
+
+class Server:
+    """Moves bytes between the terminal, the control socket and the wire."""
+
+    def __init__(self, wire: EmulatedWire, virtual: bool, folder: str, link: str) -> None:
+        self._wire = wire
+        self._virtual = virtual
+        self._terminal: PseudoTerminal | None = PseudoTerminal(link)
+        self._link = link
+        self.control = os.path.join(folder, "control")
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(self.control)
+        self._listener.listen()
+        self._clients: dict[int, _Client] = {}
+        self._start_s = time.monotonic()
+        self._now_s = 0.0
+        self._idled_s = 0.0
+
+    def run(self) -> None:
+        """Serve until stdin closes."""
+        stdin, listener = sys.stdin.fileno(), self._listener.fileno()
+        while True:
+            watched = [stdin, listener, *self._clients]
+            if self._terminal is not None and not self._virtual:
+                watched.append(self._terminal.fd)
+            ready = select.select(watched, [], [], self._patience_s())[0]
+            for fd in ready:
+                if self._terminal is not None and fd == self._terminal.fd:
+                    self._wire.receive(os.read(fd, _CHUNK), self._terminal.baud(), self._now())
+                elif fd == listener:
+                    connection, _ = self._listener.accept()
+                    self._clients[connection.fileno()] = _Client(connection)
+                elif fd == stdin:
+                    if not os.read(stdin, _CHUNK):
+                        return
+                elif fd in self._clients:
+                    self._serve(self._clients[fd])
+            if not self._virtual:
+                self._deliver()
+
+    def _patience_s(self) -> float | None:
+        return None if self._virtual else min(max(0.0, self._wire.next_s - self._now()), _IDLE_S)
+
+    def _now(self) -> float:
+        if not self._virtual:
+            self._now_s = time.monotonic() - self._start_s
+        return self._now_s
+
+    def _deliver(self) -> None:
+        """In real time: send what is due. A wire does not wait: what the host leaves lying is lost."""
+        self._wire.advance(self._now())
+        if self._now_s - self._idled_s >= _IDLE_S:
+            self._idled_s = self._now_s
+            self._wire.idle(self._now_s)
+        self._plug()
+        outs = self._wire.take(self._now_s)
+        if outs and self._terminal is not None:
+            self._terminal.send(b"".join(out.data for out in outs), 0.0)
+            self._wire.sent(outs, self._now())
+
+    def _plug(self) -> None:
+        """Hang up, or come back, as the wire says."""
+        if self._wire.hung and self._terminal is not None:
+            self._terminal.close()
+            self._terminal = None
+        elif not self._wire.hung and self._terminal is None:
+            self._terminal = PseudoTerminal(self._link)
+
+    # --- control ------------------------------------------------------------------------------------------------
+
+    def _serve(self, client: _Client) -> None:
+        try:
+            data = client.connection.recv(_CHUNK)
+        except ConnectionError:
+            data = b""
+        client.buffer += data
+        while (end := client.buffer.find(b"\n")) >= 0:
+            words = client.buffer[:end].decode(errors="replace").split()
+            del client.buffer[: end + 1]
+            try:
+                self._request(client, words)
+            except (ValueError, IndexError, KeyError):
+                self._tell(client, f"error not understood: {' '.join(words)}")
+            except ConfigError as error:
+                self._tell(client, f"error {error}")
+        if not data:
+            del self._clients[client.connection.fileno()]
+            client.connection.close()
+
+    def _request(self, client: _Client, words: list[str]) -> None:
+        if words[0] == "sync":
+            now_s = float(words[3])
+            self._sync(client, int(words[1]), int(words[2]), now_s, float(words[4]) if len(words) > 4 else None)
+        else:
+            self._tell(client, self._command(words))
+
+    def _tell(self, client: _Client, answer: str) -> None:
+        try:
+            client.connection.sendall(answer.encode() + b"\n")
+        except OSError:
+            client.buffer.clear()  # it is gone; the end of its connection is seen next
+
+    def _sync(self, client: _Client, count: int, wanted_from: int, now_s: float, until_s: float | None) -> None:
+        self._now_s = now_s
+        self._wire.advance(now_s)
+        self._plug()
+        terminal = self._terminal
+        if terminal is None:
+            self._tell(client, "error the adapter is unplugged")
+            return
+        data = bytearray()
+        while client.taken + len(data) < count:
+            if not select.select([terminal.fd], [], [], _PATIENCE_S)[0]:
+                break
+            data += os.read(terminal.fd, count - client.taken - len(data))
+        unwanted = max(0, wanted_from - client.taken)
+        client.taken += len(data)
+        baud = terminal.baud()
+        if unwanted:
+            self._wire.receive(bytes(data[:unwanted]), baud, now_s)
+        if wanted_from > client.wanted_from:
+            self._wire.take(now_s, all_but_late=True)
+            client.wanted_from = wanted_from
+        if data[unwanted:]:
+            self._wire.receive(bytes(data[unwanted:]), baud, now_s)
+        if until_s is None:
+            outs = self._wire.take(now_s, all_but_late=True)
+        else:
+            outs = self._wire.take(max(now_s, until_s))
+        reply = b"".join(out.data for out in outs)
+        self._tell(client, f"ack {len(reply)}")
+        terminal.send(reply, _PATIENCE_S)
+        self._wire.sent(outs, None)
+
+    def _command(self, words: list[str]) -> str:
+        wire, name = self._wire, words[0]
+        if name == "time":
+            self._now_s = float(words[1])
+        now_s = self._now()
+        if name == "digest":
+            return "digest {} {}".format(*wire.digest())
+        if name == "stats":
+            return f"json {json.dumps(wire.statistics())}"
+        if name == "stamps":
+            return f"json {json.dumps(wire.stamps())}"
+        if name == "faults":
+            return f"json {json.dumps(wire.faults(now_s))}"
+        if name in ("time", "inject", "clear", "supply", "hangup", "return"):
+            self._happen(words, now_s)
+            wire.advance(now_s)
+            self._plug()
+            return "ok"
+        if name not in ("kill", "revive", "fault", "turn", "state"):
+            return f"error unknown request {name}"
+        servo = wire.servo(int(words[1]))
+        if servo is None:
+            return f"error no such servo: {' '.join(words)}"
+        servo.advance(now_s)
+        if name == "state":
+            return f"json {json.dumps(servo.state(now_s))}" if hasattr(servo, "state") else "error it has no state"
+        if name in ("kill", "revive"):
+            servo.dead = name == "kill"
+        elif name == "fault":
+            servo.fail(int(words[2]), now_s)
+        elif hasattr(servo, "turn"):
+            servo.turn(float(words[2]), now_s)
+        else:
+            servo.plant.position = float(words[2])
+        return "ok"
+
+    def _happen(self, words: list[str], now_s: float) -> None:
+        if words[0] == "inject":
+            self._wire.inject(words[1], now_s)
+        elif words[0] == "clear":
+            self._wire.clear(now_s)
+        elif words[0] == "supply":
+            self._wire.set_supply(float(words[1]), now_s)
+        elif words[0] in ("hangup", "return"):
+            self._wire.hung = words[0] == "hangup"
+
+    def close(self) -> None:
+        for client in self._clients.values():
+            client.connection.close()
+        self._listener.close()
+        if self._terminal is not None:
+            self._terminal.close()
+
+
+def _wire(description: Mapping[str, Any]) -> EmulatedWire:
+    """Every protocol's servos are one device; every board is one."""
+    tables = {name: Table.from_plain(plain) for name, plain in description["tables"].items()}
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in description["servos"]:
+        table = tables[row["model"]]
+        where = _DEVICES[table.family, table.protocol]
+        groups.setdefault((where, "" if table.channels is None else table.model), []).append(row)
+    devices = [_device(where, rows, tables, description["behind_silent"]) for (where, _), rows in groups.items()]
+    faults = [parse_fault(text) for text in description["faults"]]
+    return EmulatedWire(devices, description["timing"], faults, description["seed"])
+
+
+def _device(where: str, rows: list[dict[str, Any]], tables: Mapping[str, Table], behind_silent: str) -> Device:
+    module, _, name = where.partition(":")
+    kind: Any = getattr(importlib.import_module(module), name)
+    if tables[rows[0]["model"]].channels is not None:
+        board: Device = kind(tables[rows[0]["model"]], rows)
+        return board
+    servos: Device = kind.from_rows(rows, tables, behind_silent != "skip")
+    return servos
+
+
+def main() -> None:
+    """Read the description from stdin, say `ready`, serve."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the host, which still has to stop its servos
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    line = b""
+    while not line.endswith(b"\n"):  # unbuffered: run() watches the same descriptor
+        part = os.read(sys.stdin.fileno(), 1 << 16)
+        if not part:
+            return
+        line += part
+    description = json.loads(line)
+    try:
+        wire = _wire(description)
+    except ConfigError as error:
+        sys.stdout.write(f"refused {error}\n")
+        return
+    folder = tempfile.mkdtemp(prefix="sfms-robot-")
+    link = description["link"] or os.path.join(folder, "device")
+    try:
+        server = Server(wire, description["virtual"], folder, link)
+        ready = json.dumps({"device": link, "control": server.control, "folder": folder})
+        sys.stdout.write(f"ready {ready}\n")
+        sys.stdout.flush()
+        try:
+            server.run()
+        finally:
+            server.close()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main()

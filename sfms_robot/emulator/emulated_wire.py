@@ -1,0 +1,229 @@
+"""One emulated wire: devices hear what the host sends, their answers leave in time, and faults come between.
+
+In `instant` timing an answer leaves at once. In `wire` timing the line is a line: the request takes 10 bits a byte to
+arrive, each servo waits its return delay, and its answer takes 10 bits a byte; an answer is due when its last bit is
+through. What leaves later than it was due is the emulator's own doing, and is counted as `emulator_late`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+from sfms_robot.emulator.device import Device, Reply, replies_of, servos_of
+from sfms_robot.emulator.faults import Fault, Faults, parse_fault
+from sfms_robot.errors import ConfigError
+
+Timing = Literal["instant", "wire"]
+LATE_S: Final = 0.001
+_BITS: Final = 10  # of a byte, with start and stop
+_STAMPS: Final = 4096
+_USUAL_BITS: Final = {"overload": 0x20, "overheating": 0x04}  # of a status byte, where a servo has no names
+
+
+class Out(NamedTuple):
+    """Bytes on their way to the host. `late`: a fault holds them back."""
+
+    due_s: float
+    number: int
+    servos: tuple[int, ...]
+    data: bytes
+    late: bool
+
+
+class EmulatedWire:
+    """Devices, faults and the line between. Times are seconds of the emulator's clock.
+
+    Attributes:
+        hung: the adapter is unplugged; the server closes the terminal meanwhile.
+    """
+
+    def __init__(
+        self, devices: Sequence[Device], timing: Timing = "instant", faults: Iterable[Fault] = (), seed: int = 0
+    ) -> None:
+        self.hung = False
+        self._devices = list(devices)
+        self._on_the_wire = timing == "wire"
+        self._faults = Faults(seed=seed)
+        self._outbox: list[Out] = []
+        self._number = 0
+        self._free_s = 0.0  # until then the line is busy
+        self._before_brownout: dict[int, float] = {}
+        self._seen = hashlib.sha256()
+        self._stamps: deque[tuple[tuple[int, ...], float, float]] = deque(maxlen=_STAMPS)
+        self._counts = {"bytes_in": 0, "bytes_out": 0, "replies": 0, "emulator_late": 0}
+        self._busy_s = 0.0
+        for fault in faults:
+            self.add(fault)
+
+    def servo(self, servo_id: int) -> Any:
+        """The servo or channel of that id on any device, or None."""
+        found = (device.servo(servo_id) for device in self._devices)
+        return next((servo for servo in found if servo is not None), None)
+
+    def digest(self) -> tuple[str, int]:
+        """SHA-256 and number of all bytes the host ever sent, at whatever baud."""
+        return self._seen.hexdigest(), self._counts["bytes_in"]
+
+    # --- traffic ------------------------------------------------------------------------------------------------
+
+    def receive(self, data: bytes, baud: int | None, now_s: float) -> None:
+        """Take bytes that the host sent at `baud` (None = unknown); the answers wait in the outbox."""
+        self.advance(now_s)
+        self._seen.update(data)
+        self._counts["bytes_in"] += len(data)
+        if self.hung:
+            return
+        faults = self._faults
+        heard_s = self._occupy(now_s, len(data), baud)
+        if faults.echoes(now_s):
+            self._post(Reply((), data), heard_s, 0.0)
+        for device in self._devices:
+            for reply in replies_of(device, data, baud, now_s):
+                start_s = max(now_s, self._free_s) + (reply.pause_s if self._on_the_wire else 0.0)
+                due_s = self._occupy(start_s, len(reply.data), baud)
+                for spoilt, late_s in faults.spoil(reply, now_s):
+                    self._post(reply._replace(data=spoilt), due_s, late_s)
+        if noise := faults.noise(now_s):
+            self._post(Reply((), noise), self._free_s if self._on_the_wire else now_s, 0.0)
+
+    def take(self, until_s: float, all_but_late: bool = False) -> list[Out]:
+        """What is due by `until_s`, in order; with `all_but_late` also what no fault holds back."""
+        if not self._outbox:
+            return []
+        out = sorted(each for each in self._outbox if each.due_s <= until_s or (all_but_late and not each.late))
+        self._outbox = [each for each in self._outbox if each not in out]
+        return out
+
+    def sent(self, outs: Iterable[Out], now_s: float | None) -> None:
+        """Stamp what has just left; None = in virtual time, where nothing is late."""
+        for out in outs:
+            at_s = out.due_s if now_s is None else now_s
+            self._stamps.append((out.servos, out.due_s, at_s))
+            self._counts["replies"] += 1
+            self._counts["bytes_out"] += len(out.data)
+            self._counts["emulator_late"] += self._on_the_wire and at_s - out.due_s > LATE_S
+
+    @property
+    def next_s(self) -> float:
+        """When something happens by itself: an answer is due, a fault begins or ends."""
+        due_s = min((out.due_s for out in self._outbox), default=math.inf)
+        return min(due_s, self._faults.next_s)
+
+    def statistics(self) -> dict[str, Any]:
+        """Counts since the start; how late answers left [ms] and how long the line was busy [s]."""
+        late = sorted(1e3 * (at_s - due_s) for _, due_s, at_s in self._stamps)
+        spread = {f"p{q}": late[min(len(late) - 1, len(late) * q // 100)] if late else None for q in (50, 99)}
+        spread["max"] = late[-1] if late else None
+        return {**self._counts, "busy_s": self._busy_s, "late_ms": spread}
+
+    def stamps(self) -> list[dict[str, Any]]:
+        """The last answers: who, when due, when gone."""
+        return [{"ids": ids, "due_s": due_s, "sent_s": at_s} for ids, due_s, at_s in self._stamps]
+
+    def _occupy(self, start_s: float, count: int, baud: int | None) -> float:
+        """Fill the line with `count` bytes from `start_s` on; when the last one is through."""
+        seconds = _BITS * count / baud if baud else 0.0
+        self._busy_s += seconds
+        if not self._on_the_wire:
+            return start_s
+        self._free_s = max(start_s, self._free_s) + seconds
+        return self._free_s
+
+    def _post(self, reply: Reply, due_s: float, late_s: float) -> None:
+        if reply.data:
+            self._number += 1
+            self._outbox.append(Out(due_s + late_s, self._number, reply.servos, reply.data, late_s > 0.0))
+
+    # --- faults -------------------------------------------------------------------------------------------------
+
+    def add(self, fault: Fault) -> None:
+        """Raises ConfigError when nobody here can have that fault."""
+        concerned = [s for s in self._servos(fault) if hasattr(s, "set_supply") or fault.kind != "voltage"]
+        if fault.kind not in ("echo", "noise", "hangup") and not concerned:
+            raise ConfigError.at("emulate", "fault", fault.text, "concerns no servo of this wire")
+        self._faults.add(fault)
+
+    def inject(self, text: str, now_s: float) -> None:
+        """A fault by its spec, from now on unless it says. Raises ConfigError."""
+        self.add(parse_fault(text, now_s))
+        self.advance(now_s)
+
+    def clear(self, now_s: float) -> None:
+        self._faults.clear(now_s)
+        self.advance(now_s)
+
+    def faults(self, now_s: float) -> list[str]:
+        return self._faults.texts(now_s)
+
+    def advance(self, now_s: float) -> None:
+        """Let begin and end what is due."""
+        if self._faults.next_s <= now_s:
+            for time_s, fault, began in self._faults.edges(now_s):
+                self._happen(fault, began, time_s)
+
+    def idle(self, now_s: float) -> None:
+        """Move everything on, so that nobody has to make up for a long silence."""
+        self.advance(now_s)
+        for device in self._devices:
+            device.advance(now_s)
+
+    def set_supply(self, volts: float, now_s: float) -> None:
+        for device in self._devices:
+            for servo in servos_of(device):
+                if hasattr(servo, "set_supply"):
+                    servo.set_supply(volts, now_s)
+
+    def _servos(self, fault: Fault) -> list[Any]:
+        everyone = [servo for device in self._devices for servo in servos_of(device)]
+        return [servo for servo in everyone if fault.ids is None or servo.id in fault.ids]
+
+    def _happen(self, fault: Fault, began: bool, now_s: float) -> None:
+        kind = fault.kind
+        if kind == "hangup":
+            self.hung = began
+            self._outbox.clear()
+        elif kind == "brownout":
+            self._brown_out(fault, began, now_s)
+        for servo in self._servos(fault):
+            if kind == "silent":
+                servo.dead = began
+            elif kind in ("stuck", "load"):
+                servo.advance(now_s)
+                setattr(servo.plant, kind, began if kind == "stuck" else fault.value * began)
+            elif kind in ("overload", "overheat") and began:
+                _fail(servo, "overheating" if kind == "overheat" else kind, now_s)
+            elif kind == "voltage":
+                _feed(servo, self._before_brownout, fault.value, began, now_s)
+
+    def _brown_out(self, fault: Fault, began: bool, now_s: float) -> None:
+        """The supply drops: everybody falls silent, and starts anew when it is back."""
+        for device in self._devices:
+            for servo in servos_of(device):
+                if hasattr(servo, "set_supply"):
+                    _feed(servo, self._before_brownout, fault.value, began, now_s)
+                    continue
+                servo.dead = began
+                if not began and hasattr(servo, "power_cycle"):
+                    servo.power_cycle(now_s)
+            if hasattr(device, "restart"):
+                device.restart(now_s)  # without a supply there are no pulses either
+
+
+def _feed(servo: Any, before: dict[int, float], volts: float, began: bool, now_s: float) -> None:
+    """Another supply voltage, or the one from before."""
+    if began:
+        before.setdefault(servo.id, servo.supply_v)
+        servo.set_supply(volts, now_s)
+    else:
+        servo.set_supply(before.pop(servo.id, servo.supply_v), now_s)
+
+
+def _fail(servo: Any, fault: str, now_s: float) -> None:
+    if hasattr(servo, "fail_named"):
+        servo.fail_named(fault, now_s)
+    else:
+        servo.fail(_USUAL_BITS[fault], now_s)

@@ -1,0 +1,274 @@
+"""Emulated hobby-servo boards: bytes of the host in, bytes of the board out. Opens nothing.
+
+A board makes pulses; the servos behind it only follow them and tell nobody where they are. So each channel is two
+things: the pulse, which the board knows and moves under its speed limits, and a shaft, which a plant moves and only a
+test can see. Nothing about the shaft ever reaches the wire.
+
+Every row of a description is one channel with a servo on it; a board all of whose channels are dead is unplugged.
+
+Not modelled: the script, serial timeout, PWM output and daisy chain of a Maestro; the inputs, sequencer and offsets
+of an SSC-32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from sfms_robot.emulator.plant import MotorCommand, Plant
+from sfms_robot.servo.codecs import maestro, ssc32
+from sfms_robot.servo.registers import Table
+
+_NO_LIMIT: Final = 1e9  # ticks/s; a profile without a speed still needs one to have an acceleration
+_MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
+_MINI_SSC_NEUTRAL: Final = 127
+_MINI_SSC_STEP: Final = 15  # quarter microseconds: 476.25 us / 127
+_NEUTRAL: Final = 6000
+
+
+class Channel:
+    """One output: its pulse in ticks, and the shaft of the servo behind it, which starts at `start_ticks`."""
+
+    def __init__(self, number: int, board: Board, start_ticks: int) -> None:
+        self.id = number
+        self.dead = False
+        self.on = False
+        self.goal = 0.0
+        self.speed = 0.0  # ticks/s, 0 = no limit
+        self.acceleration = 0.0  # ticks/s^2, 0 = no limit
+        self.plant = Plant(float(start_ticks), reference=float(start_ticks))
+        self._board = board
+
+    def send(self, goal: float, now_s: float) -> None:
+        """Pulses at `goal` ticks. Where there were none the board knows no speed limit: the pulse is there at once."""
+        self.advance(now_s)
+        if not self.on:
+            self.plant.reference = goal
+        self.on, self.goal = True, goal
+
+    def off(self, now_s: float) -> None:
+        self.advance(now_s)
+        self.on = False
+
+    def advance(self, now_s: float) -> None:
+        """Move pulse and shaft on to `now_s`."""
+        speed = self.speed or (_NO_LIMIT if self.acceleration else 0.0)
+        drive = MotorCommand(self.goal, self._board.table.top_speed_ticks_s, speed, self.acceleration)
+        self.plant.advance(now_s, drive if self.on else None)
+
+    def fail(self, bits: int, now_s: float) -> None:
+        """Latch bits in the error word of the board."""
+        self._board.fail(bits, now_s)
+
+    def turn(self, ticks: float, now_s: float) -> None:
+        """Somebody turns the shaft by hand."""
+        self.advance(now_s)
+        self.plant.position = ticks
+
+    def state(self, now_s: float) -> dict[str, Any]:
+        """What an onlooker sees, whatever the wire says."""
+        self.advance(now_s)
+        return {
+            "position": self.plant.position,
+            "goal": self.goal if self.on else None,
+            "pulse": self.pulse,
+            "torque": self.on,
+            "faults": self._board.table.fault_names(self._board.errors),
+        }
+
+    @property
+    def pulse(self) -> int:
+        """Ticks of the pulse sent now; 0 when there is none."""
+        if not self.on:
+            return 0
+        return round(self.plant.reference if self.speed or self.acceleration else self.goal)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a limit still holds the pulse back."""
+        return self.on and bool(self.speed or self.acceleration) and self.plant.reference != self.goal
+
+
+class Board:
+    """What the boards have in common. `rows` are plain: `id` is the channel; `baud`, `start_ticks`."""
+
+    def __init__(self, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
+        if table.channels is None or table.pulse_us is None or table.tick_us is None:
+            raise ValueError(f"{table.model} is no servo board")
+        self.table = table
+        self.errors = 0
+        self._plugged = {int(row["id"]) for row in rows}
+        starts = {int(row["id"]): int(row["start_ticks"]) for row in rows}
+        self.channels = [Channel(i, self, starts.get(i, table.center_ticks)) for i in range(table.channels)]
+        self.limits = [self._ticks(*table.pulse_us) for _ in self.channels]  # shortest and longest pulse, ticks
+        self._buffer = bytearray()
+
+    @property
+    def servos(self) -> Sequence[Channel]:
+        """Channels with a servo plugged in."""
+        return [self.channels[i] for i in sorted(self._plugged)]
+
+    def servo(self, channel: int) -> Channel | None:
+        """The channel, where a servo is plugged in."""
+        return self.channels[channel] if channel in self._plugged else None
+
+    def kill(self, channel: int) -> None:
+        self.channels[channel].dead = True
+
+    def revive(self, channel: int) -> None:
+        self.channels[channel].dead = False
+
+    def advance(self, now_s: float) -> None:
+        for channel in self.channels:
+            channel.advance(now_s)
+
+    def fail(self, bits: int, now_s: float) -> None:
+        """Latch bits in the error word."""
+        self.errors |= bits
+
+    def restart(self, now_s: float) -> None:
+        """The supply came back: no pulses, nothing remembered."""
+        self._buffer.clear()
+        self.errors = 0
+        for channel in self.channels:
+            channel.off(now_s)
+            channel.speed = channel.acceleration = 0.0
+
+    @property
+    def unplugged(self) -> bool:
+        return bool(self._plugged) and all(self.channels[i].dead for i in self._plugged)
+
+    def _ticks(self, shortest_us: float, longest_us: float) -> tuple[float, float]:
+        tick_us = self.table.tick_us or 1.0
+        return shortest_us / tick_us, longest_us / tick_us
+
+    def _send(self, channel: Channel, goal: float, now_s: float) -> None:
+        """Target 0 is no pulses; any other is brought inside the limits of the channel."""
+        shortest, longest = self.limits[channel.id]
+        if goal == 0:
+            channel.off(now_s)
+        else:
+            channel.send(min(max(goal, shortest), longest), now_s)
+
+
+class MaestroBoard(Board):
+    """A Pololu Maestro as it leaves the factory: it detects its baud rate, home is off, an error sends all home."""
+
+    def __init__(self, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
+        super().__init__(table, rows)
+        self.baud: int | None = None
+        self.limits = [self._ticks(*maestro.FACTORY_PULSE_US) for _ in self.channels]
+
+    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
+        """Take what the host sent at `baud` (None = unknown); what the board answers."""
+        if self.unplugged or not data or baud is None:
+            return b""
+        if self.baud is None:
+            start = data.find(maestro.BAUD_INDICATION)
+            if start < 0:
+                return b""
+            self.baud, data = baud, data[start:]
+        if baud != self.baud:
+            self.fail(maestro.SIGNAL_ERROR, now_s)
+            return b""
+        self._buffer += data
+        out = b""
+        while (command := maestro.maybe_command(self._buffer)) is not None:
+            out += self._obey(command, now_s)
+        return out
+
+    def restart(self, now_s: float) -> None:
+        super().restart(now_s)
+        self.baud = None
+
+    def fail(self, bits: int, now_s: float) -> None:
+        """Latch error bits; every error sends all channels home, and home is off."""
+        super().fail(bits, now_s)
+        self._home(now_s)
+
+    def _home(self, now_s: float) -> None:
+        for channel in self.channels:
+            if channel.on:
+                channel.off(now_s)
+
+    def _obey(self, command: maestro.Command, now_s: float) -> bytes:
+        code, data, error = command
+        if error:
+            self.fail(error, now_s)
+        elif code == maestro.GET_ERRORS:
+            errors, self.errors = self.errors, 0
+            return errors.to_bytes(2, "little")
+        elif code == maestro.GET_MOVING:
+            self.advance(now_s)
+            return bytes([any(channel.moving for channel in self.channels)])
+        elif code == maestro.GO_HOME:
+            self._home(now_s)
+        elif code == maestro.SET_TARGETS:
+            self._targets(data, now_s)
+        elif data[0] >= len(self.channels):
+            self.fail(maestro.PROTOCOL_ERROR, now_s)
+        else:
+            return self._to_channel(self.channels[data[0]], code, data[1:], now_s)
+        return b""
+
+    def _to_channel(self, channel: Channel, code: int, data: bytes, now_s: float) -> bytes:
+        channel.advance(now_s)
+        if code == maestro.GET_POSITION:
+            return channel.pulse.to_bytes(2, "little")
+        if code == maestro.SET_TARGET:
+            self._send(channel, maestro.from_word(data), now_s)
+        elif code == maestro.MINI_SSC:
+            self._send(channel, _NEUTRAL + (data[0] - _MINI_SSC_NEUTRAL) * _MINI_SSC_STEP, now_s)
+        elif code == maestro.SET_SPEED:
+            channel.speed = maestro.from_word(data) * 100.0  # per 10 ms
+        elif code == maestro.SET_ACCELERATION:
+            channel.acceleration = maestro.from_word(data) * 1250.0  # per 10 ms per 80 ms
+        return b""
+
+    def _targets(self, data: bytes, now_s: float) -> None:
+        count, first = data[0], data[1]
+        if len(self.channels) <= _MICRO or first + count > len(self.channels):
+            self.fail(maestro.PROTOCOL_ERROR, now_s)
+            return
+        for i in range(count):
+            self._send(self.channels[first + i], maestro.from_word(data[2 + 2 * i : 4 + 2 * i]), now_s)
+
+
+class Ssc32Board(Board):
+    """A Lynxmotion SSC-32 with its rate set by jumpers: that of the first row."""
+
+    def __init__(self, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
+        super().__init__(table, rows)
+        self.baud: int = rows[0]["baud"]
+
+    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
+        """Take what the host sent at `baud` (None = unknown); what the board answers."""
+        if self.unplugged or baud != self.baud:
+            return b""
+        self._buffer += data
+        out = b""
+        while (command := ssc32.maybe_command(self._buffer)) is not None:
+            if isinstance(command, ssc32.Group):
+                self._group(command, now_s)
+            elif isinstance(command, ssc32.Query):
+                out += self._answer(command, now_s)
+        return out
+
+    def _group(self, group: ssc32.Group, now_s: float) -> None:
+        for number, move in group.moves.items():
+            channel = self.channels[number]
+            channel.advance(now_s)
+            gap = abs(move.pulse_us - channel.plant.reference)
+            limits = (float(move.speed_us_s), gap * 1e3 / group.time_ms if group.time_ms else 0.0)
+            channel.speed = min((limit for limit in limits if limit > 0.0), default=0.0)
+            self._send(channel, move.pulse_us, now_s)
+        for number in group.levels:
+            self.channels[number].off(now_s)
+
+    def _answer(self, query: ssc32.Query, now_s: float) -> bytes:
+        self.advance(now_s)
+        if query.kind == "Q":
+            return ssc32.MOVING if any(channel.moving for channel in self.channels) else ssc32.DONE
+        if query.kind == "QP":
+            return bytes(min(255, round(self.channels[number].pulse / 10)) for number in query.channels)
+        return b"SSC32 EMULATED\r"

@@ -1,0 +1,148 @@
+"""A listener left to itself: what it does while the speaker of a dyad is heard.
+
+`rollout` goes frame by frame as `run` does, with any listener. `offline_rollout` is the same from arrays, for SFMS: the
+features of a dyad are worked out once and serve all streams, and speaker and plans stay in the model's motion space, so
+that data in DECA or FaceVerse coefficients, with mel in place of a waveform, are answered in their own terms. That both
+give the same motion is a law of the tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import pad
+
+from sfms_robot.corpora.clips import Dyad
+from sfms_robot.corpora.states import UNKNOWN
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
+from sfms_robot.learning.sfms.features import frames_of
+from sfms_robot.listeners.arig.stream import Memory as ArigMemory
+from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.sfms.stream import SfmsListener, passed
+from sfms_robot.ports import Listener
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """S streams that heard the same N frames; what a plan shows counts until the next one.
+
+    Attributes:
+        motion: (S, N, 58) faces.
+        states: (S, N) int8 conversational states, -1 before the first and of listeners without.
+    """
+
+    motion: Floats
+    states: NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class OfflineRollout:
+    """S streams that heard one dyad of N frames: motion (S, N, C) in the model's space, tokens (S, N', G) as drawn."""
+
+    motion: Tensor
+    tokens: Tensor
+
+
+def speaker_frames(audio: Floats | None, face: Floats, agent_audio: Floats | None = None) -> list[SpeakerFrame]:
+    """Sound (N * 640,) and face (N, 58) as a source gives them, and the agent's own voice (N * 640,) one frame early.
+
+    A face of NaN is None; no sound at all is no microphone.
+    """
+    heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
+    frames = []
+    for index, row in enumerate(face):
+        time_s = (index + 1) * FRAME_S
+        now, following = (slice(at * FRAME_SAMPLES, (at + 1) * FRAME_SAMPLES) for at in (index, index + 1))
+        said = None if agent_audio is None else agent_audio[following]
+        if said is not None and len(said) < FRAME_SAMPLES:
+            said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
+        seen = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
+        frames.append(SpeakerFrame(time_s, heard[now], seen, said))
+    return frames
+
+
+def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
+    """Both tracks of a dyad as a source gives them."""
+    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio)
+
+
+@runtime_checkable
+class ManyStreams(Protocol):
+    """A listener that steps several streams of one speaker at once."""
+
+    def step_many(self, speaker: SpeakerFrame, memories: Sequence[Any]) -> tuple[Sequence[Plan | None], Sequence[Any]]:
+        """`Listener.step` of streams that have heard the same from the start; no plans between hops."""
+
+
+def rollout(listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence[int]) -> Rollout:
+    """What the listener does while `speaker` is heard, once for every seed; side by side where the listener can."""
+    memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
+    motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
+    states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
+    for index, frame in enumerate(speaker):
+        plans, memories = _step(listener, frame, memories)
+        for row, plan in enumerate(plans):
+            if plan is not None:
+                motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
+        for row, memory in enumerate(memories):
+            if isinstance(memory, ArigMemory):
+                states[row, index + 1] = memory.state
+    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)])
+
+
+def _step(
+    listener: Listener, frame: SpeakerFrame, memories: Sequence[Any]
+) -> tuple[Sequence[Plan | None], Sequence[Any]]:
+    if isinstance(listener, ManyStreams):
+        return listener.step_many(frame, memories)
+    stepped = [listener.step(frame, memory) for memory in memories]
+    return [plan for plan, _ in stepped], [memory for _, memory in stepped]
+
+
+def rollouts(
+    listener: Listener, dyads: Sequence[Dyad], seed: int, each: Callable[[], object] = lambda: None
+) -> list[Rollout]:
+    """One stream through every dyad from its beginning, each with a seed of its own; `each()` after every one."""
+    found = []
+    for number, dyad in enumerate(dyads):
+        found.append(rollout(listener, frames_of_dyad(dyad), [seed + number]))
+        each()
+    return found
+
+
+@torch.inference_mode()
+def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) -> OfflineRollout:
+    """`rollout` from arrays. Raises ConfigError when the dyad is in a space that cannot become the listener's."""
+    model, past, ahead = listener.model, listener.settings.past_frames, listener.horizon
+    heard = frames_of(dyad, listener.space, listener.frontend)
+    frames = len(heard.motion)
+    sound = model.standardise_sound(torch.cat([torch.zeros_like(heard.sound[:1]), heard.sound]).float())
+    sound = torch.where(pad(heard.heard, (1, 0))[:, None, None], sound, 0.0)
+    voice = model.predictor.speaker.listen(sound.flatten(0, 1)[None])[0]
+    face, voice, phase = (pad(part, (0, 0, past, 0)) for part in (model.standardise(heard.face), voice, heard.phase))
+    known, audible = (pad(part, (past, 0)) for part in (heard.face_known, heard.heard))  # frame t at index past + t
+    tokens, path = (part.expand(len(seeds), *part.shape) for part in listener.at_rest())
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    drawn = []
+    shown = path[:, :1].expand(-1, frames + ahead + 1, -1).clone()
+    for now in range(0, frames, listener.hop):  # the newest frame heard
+        tokens, path = passed(tokens, path, listener.hop if now else 1)
+        window = slice(now + 1, now + 1 + past)
+        seen = Context(
+            face=face[None, window],
+            face_known=known[None, window],
+            voice=voice[None, window],
+            heard=audible[None, window],
+            phase=phase[None, window],
+            tokens=tokens,
+        )
+        tokens, path = listener.plan(seen, path, generators)
+        shown[:, now + 1 : now + 1 + ahead] = listener.shown(path)
+        drawn.append(tokens[:, -listener.hop :])
+    return OfflineRollout(model.restore(shown[:, :frames]), torch.cat(drawn, dim=1))

@@ -1,0 +1,85 @@
+"""What the model hears of one track: 533 numbers per frame, and whether it is speech. One path offline and streaming.
+
+Four log-mel rows (512) tell what the voice does in these 40 ms, `signals.phase` (21) how long it has spoken or been
+silent. wav2vec2 features (768), where the data brings them, take the place of the mel rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.frames import FRAME_SAMPLES, Floats
+from sfms_robot.signals import mel, phase, voice_activity
+
+MEL_WIDTH: Final = mel.ROWS_PER_FRAME * mel.MEL_BINS
+WIDTHS: Final = {"mel": MEL_WIDTH + phase.FEATURES, "wav2vec2": 768 + phase.FEATURES}  # numbers per frame
+
+
+@dataclass(frozen=True)
+class AudioState:
+    """What a stream remembers of one track: samples that unfinished mel rows need, and the phrase."""
+
+    past: Floats
+    phase: phase.State
+
+    @property
+    def voiced(self) -> bool:
+        """Whether the newest frame is speech."""
+        return self.phase.ear.active
+
+
+def start() -> AudioState:
+    """Silence so far."""
+    return AudioState(mel.start(), phase.start())
+
+
+def hear(samples: Floats | None, before: AudioState) -> tuple[Floats, bool, AudioState]:
+    """One frame: (640,) samples, or none when nothing can be heard -> features (533,), present, and the next state.
+
+    Samples that are not finite are silence. Raises ValueError for another length.
+    """
+    present = samples is not None and len(samples) > 0
+    if samples is None or not present:
+        samples = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+    if len(samples) != FRAME_SAMPLES:
+        raise ValueError(f"a frame at 16000 Hz has {FRAME_SAMPLES} samples or none, got {len(samples)}")
+    clean = _finite(samples)
+    rows, past = mel.log_mel(clean, before.past)
+    spoken, state = phase.step(clean, before.phase)
+    return np.concatenate([rows.reshape(-1), spoken]), present, AudioState(past, state)
+
+
+def track(samples: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """A whole recording (n,) -> features (N, 533) and speech (N,), N = n // 640: frame by frame what `hear` gives."""
+    frames = len(samples) // FRAME_SAMPLES
+    clean = _finite(samples[: frames * FRAME_SAMPLES])
+    rows = mel.log_mel(clean, mel.start())[0].reshape(frames, MEL_WIDTH)
+    voiced = phase.hear(voice_activity.levels_db(clean))
+    return np.concatenate([rows, phase.features(phase.times(voiced))], axis=1), np.array(voiced, dtype=np.bool_)
+
+
+def of_mel(rows: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Natural log-mel (N, 4, 128) of a recording, for data without samples -> as `track`."""
+    voiced = phase.hear(voice_activity.mel_levels_db(rows))
+    features = np.concatenate([rows.reshape(len(rows), -1), phase.features(phase.times(voiced))], axis=1)
+    return features, np.array(voiced, dtype=np.bool_)
+
+
+def _finite(samples: Floats) -> Floats:
+    return np.where(np.isfinite(samples), samples, np.float32(0))
+
+
+def fit_frame(samples: Floats | None) -> Floats | None:
+    """Samples of the agent's track cut or filled up with silence to one frame, or None.
+
+    Its clock is not the microphone's: at 200 ppm a frame has a sample too many or too few every 8 s.
+    """
+    if samples is None or not len(samples):
+        return None
+    out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+    out[: min(len(samples), FRAME_SAMPLES)] = samples[:FRAME_SAMPLES]
+    return out

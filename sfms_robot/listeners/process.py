@@ -1,0 +1,335 @@
+"""A listener in a process of its own: the same `step`, frames one way, plans the other, over two pipes.
+
+In one process torch and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
+model and its threads (cores - 1), and the servo process never loads torch. The child is a plain interpreter, not a
+copy of this program: a script, a notebook and a thread may all start it. It ends when its pipe does, so it never
+outlives its parent, whatever killed that.
+
+The child says of every frame that it is done. One that is silent for `HUNG_S` is named as hung; after `RESTART_S`, or
+when it died, it is started anew and listens from then on, while the head goes on by itself. Too many of those in a
+minute and it stays down.
+
+A machine that cannot keep up must not answer what was said seconds ago: when more than half a second is waiting, the
+listener goes on at the newest frame. What it did not hear is counted, and said once.
+
+    parent -> child    pickle: (name, seed), then SpeakerFrame after SpeakerFrame
+    child -> parent    pickle: (kind, value, number) of KINDS below
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import IO, Any, Final
+
+from sfms_robot.errors import ModelError, RobotError
+from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
+from sfms_robot.ports import Listener
+from sfms_robot.signals.quantiles import Quantiles
+
+MOST_WAITING: Final = FRAME_HZ // 2  # frames
+NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
+START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
+CLOSE_LIMIT_S: Final = 0.2
+HUNG_S: Final = 1.0
+RESTART_S: Final = 3.0
+RESTARTS: Final = 5  # in a minute; more than that is no accident
+_MINUTE_S: Final = 60.0
+# ready: it listens. done: a frame was taken. plan: a frame was taken, this is the answer, it took so many ms.
+# skipped: so many frames were left out. error: it cannot listen, and why.
+KINDS: Final = ("ready", "done", "plan", "skipped", "error")
+
+log = logging.getLogger(__name__)
+
+
+class ListenerProcess:
+    """`ports.PlanFeed` over a child process that starts at once; `wait_ready` waits until it listens.
+
+    Args:
+        name: what `registry.load_listener` takes: a shipped listener, a folder, or a kind of another package.
+        seed: of the stream.
+    """
+
+    def __init__(self, name: str, seed: int) -> None:
+        self._name, self._seed = name, seed
+        self._step_ms = Quantiles()
+        self._skipped = 0
+        self._restarted_s: list[float] = []
+        self._restarts = 0
+        self._state = "starting"
+        self._waits_since_s: float | None = None  # for the answer to the oldest frame that has none yet
+        self._unanswered = 0
+        self._child = _Child(name, seed)
+
+    def wait_ready(self, limit_s: float = START_LIMIT_S) -> None:
+        """Block until the listener is loaded. Raises ModelError with its own message when it cannot be."""
+        if self._state != "starting":
+            return
+        kind, value, _ = self._child.next(limit_s)
+        if kind == "ready":
+            self._state = "listening"
+            return
+        self.close()
+        raise ModelError(value or f"the listener process was not ready after {limit_s:g} s")
+
+    def push(self, frame: SpeakerFrame, now_s: float) -> None:
+        """Never blocks; what a child that does not listen leaves behind is dropped, oldest first, and counted."""
+        if self._state == "given up":
+            return
+        self._skipped += self._child.send(frame)
+        self._unanswered += 1
+        self._waits_since_s = now_s if self._waits_since_s is None else self._waits_since_s
+
+    def poll(self, now_s: float) -> Sequence[Plan]:
+        """Plans that came. Never blocks, never raises: a child that died or hangs is started anew."""
+        plans = []
+        while (message := self._child.message()) is not None:
+            plan = self._take(*message, now_s)
+            if plan is not None:
+                plans.append(plan)
+        self._supervise(now_s)
+        return plans
+
+    def statistics(self) -> Mapping[str, Any]:
+        """`state` (starting, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms` p50 and p99."""
+        return {
+            "state": self._state,
+            "restarts": self._restarts,
+            "skipped_frames": self._skipped,
+            "step_ms": self._step_ms.report(p50=50, p99=99),
+        }
+
+    def close(self) -> None:
+        """End the child; blocks for `CLOSE_LIMIT_S` at most. Idempotent."""
+        self._child.close()
+
+    def _take(self, kind: str, value: Any, number: float, now_s: float) -> Plan | None:
+        if kind == "error":
+            log.error("the listener cannot go on: %s", value)
+        elif kind == "skipped":
+            if not self._skipped:
+                log.warning("the listener is slower than the person: it leaves frames out to keep up")
+            self._skipped += int(number)
+            self._answered(int(number), now_s)
+        elif kind == "ready":
+            log.warning("the listener is back")
+            self._state = "listening"
+        else:
+            self._answered(1, now_s)
+            if self._state == "hung":
+                log.warning("the listener goes on")
+                self._state = "listening"
+            if kind == "plan":
+                self._step_ms.add(number)
+                return value  # type: ignore[no-any-return]
+        return None
+
+    def _answered(self, frames: int, now_s: float) -> None:
+        self._unanswered = max(0, self._unanswered - frames)
+        self._waits_since_s = now_s if self._unanswered else None
+
+    def _supervise(self, now_s: float) -> None:
+        if self._state == "given up":
+            return
+        if self._child.ended:
+            self._restart("died", now_s)
+        elif self._state != "starting" and self._waits_since_s is not None:
+            silent_s = now_s - self._waits_since_s
+            if silent_s > RESTART_S:
+                self._restart(f"has not answered for {silent_s:.1f} s", now_s)
+            elif silent_s > HUNG_S and self._state != "hung":
+                log.warning("the listener has not answered for %.1f s", silent_s)
+                self._state = "hung"
+
+    def _restart(self, why: str, now_s: float) -> None:
+        self._child.close()
+        self._restarted_s = [at_s for at_s in self._restarted_s if now_s - at_s < _MINUTE_S]
+        if len(self._restarted_s) >= RESTARTS:
+            log.error("the listener %s again, %d times in a minute: the head goes on without it", why, RESTARTS)
+            self._state = "given up"
+            return
+        log.warning("the listener %s: started anew", why)
+        self._restarted_s.append(now_s)
+        self._restarts += 1
+        self._state, self._waits_since_s, self._unanswered = "starting", None, 0
+        self._child = _Child(self._name, self._seed + self._restarts)
+
+
+class _Child:
+    """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        command = [sys.executable, "-c", "from sfms_robot.listeners.process import main; main()"]
+        # In a session of its own, so that Ctrl-C is the parent's alone: the head must reach rest first.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, env=_environment()
+        )
+        self._frames: deque[Any] = deque([(name, seed)])
+        self._changed = threading.Condition()
+        self._messages: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
+        self.ended = False
+        self._closing = False
+        for work in (self._write, self._read):
+            threading.Thread(target=work, name=f"listener {work.__name__}", daemon=True).start()
+
+    def send(self, frame: SpeakerFrame) -> int:
+        """Queue a frame; the number of older ones dropped for it."""
+        with self._changed:
+            self._frames.append(frame)
+            dropped = max(0, len(self._frames) - MOST_WAITING)
+            for _ in range(dropped):
+                self._frames.popleft()
+            self._changed.notify()
+        return dropped
+
+    def message(self) -> tuple[str, Any, float] | None:
+        try:
+            return self._messages.get_nowait()
+        except queue.Empty:
+            return None
+
+    def next(self, limit_s: float) -> tuple[str, Any, float]:
+        """The next message; ("error", None, 0) when none comes in time."""
+        try:
+            return self._messages.get(timeout=limit_s)
+        except queue.Empty:
+            return "error", None, 0.0
+
+    def close(self) -> None:
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        try:
+            self._process.wait(CLOSE_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # also one that is stopped
+            self._process.wait()
+
+    def _write(self) -> None:
+        pipe = self._process.stdin
+        assert pipe is not None
+        try:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._closing or self._frames)
+                    if self._closing:
+                        break
+                    item = self._frames.popleft()
+                pickle.dump(item, pipe, protocol=5)
+                pipe.flush()
+            pipe.close()
+        except (BrokenPipeError, OSError, ValueError):
+            return  # it died: the reader sees that too, and says so
+
+    def _read(self) -> None:
+        pipe = self._process.stdout
+        assert pipe is not None
+        with pipe:
+            try:
+                while True:
+                    self._messages.put(pickle.load(pipe))
+            except (EOFError, OSError, pickle.UnpicklingError):
+                code = self._process.wait()
+                self._messages.put(("error", f"the listener process died (exit code {code})", 0.0))
+                self.ended = True
+
+
+def _environment() -> dict[str, str]:
+    """Where the child finds this package: wherever this process did."""
+    paths = [path for path in sys.path if path]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def threads() -> int:
+    """Of torch in the child: one core is the servo loop's."""
+    return max(1, (os.cpu_count() or 2) - 1)
+
+
+# --- the child ------------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Load what the first message names, then listen until the pipe ends."""
+    plans, frames = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")
+    os.dup2(2, 1)  # whatever a library prints goes to stderr
+    inbox = Inbox()
+    name, seed = pickle.load(frames)
+    threading.Thread(target=_receive, args=(frames, inbox), daemon=True).start()
+    if hasattr(os, "nice"):
+        os.nice(NICE)
+    try:
+        import torch
+
+        from sfms_robot.listeners.registry import load_listener
+
+        torch.set_num_threads(threads())
+        listener = load_listener(name)
+    except RobotError as error:
+        _say(plans, "error", str(error))
+        return
+    listen(listener, seed, inbox, plans)
+
+
+def _receive(frames: IO[bytes], inbox: Inbox) -> None:
+    """Frames into the inbox. The end of the pipe is the end of this process, whatever it computes."""
+    try:
+        while True:
+            inbox.put(pickle.load(frames))
+    except (EOFError, OSError, pickle.UnpicklingError):
+        os._exit(0)
+
+
+def listen(listener: Listener, seed: int, inbox: Inbox, plans: IO[bytes]) -> None:
+    """One step per frame until None comes; tells when it is ready, what it answers, and what it left out."""
+    memory = listener.start(seed)
+    _say(plans, "ready")
+    while (frame := inbox.next()) is not None:
+        if inbox.skipped:
+            _say(plans, "skipped", None, inbox.skipped)
+        began_s = time.perf_counter()
+        plan, memory = listener.step(frame, memory)
+        taken_ms = (time.perf_counter() - began_s) * 1e3
+        _say(plans, "done" if plan is None else "plan", plan, taken_ms)
+
+
+def _say(plans: IO[bytes], kind: str, value: Any = None, number: float = 0.0) -> None:
+    pickle.dump((kind, value, number), plans, protocol=5)
+    plans.flush()
+
+
+class Inbox:
+    """Frames in the order in which they came, until None does; the newest alone when too many are waiting.
+
+    Attributes:
+        skipped: frames left out before the last one given.
+    """
+
+    def __init__(self, most: int = MOST_WAITING) -> None:
+        self._queue: queue.SimpleQueue[SpeakerFrame | None] = queue.SimpleQueue()
+        self._most = most
+        self._waiting: deque[SpeakerFrame | None] = deque()
+        self.skipped = 0
+
+    def put(self, frame: SpeakerFrame | None) -> None:
+        self._queue.put(frame)
+
+    def next(self) -> SpeakerFrame | None:
+        """Blocks until there is one. None, the end, is neither left out nor waits for what came before it."""
+        if not self._waiting:
+            self._waiting.append(self._queue.get())
+        while not self._queue.empty():
+            self._waiting.append(self._queue.get())
+        if None in self._waiting:
+            return None
+        self.skipped = len(self._waiting) - 1 if len(self._waiting) > self._most else 0
+        for _ in range(self.skipped):
+            self._waiting.popleft()
+        return self._waiting.popleft()

@@ -1,0 +1,278 @@
+"""What a servo has stored, held against what the head's file says of its joint: values in, contradictions out, no I/O.
+
+Startup asks before torque comes on, `sfms-robot doctor` whenever it is run; both see the same. Registers that a model
+does not have, or that were not read, are not judged.
+
+Sources: ROBOTIS e-manual, control tables of the X and MX series (operating mode 11, homing offset 20, position limits
+48 and 52, startup configuration 60, shutdown 63) and of Protocol 1.0 (angle limits 6 and 8, shutdown 18); Feetech STS
+memory table V3.6 (angle limits 9 and 11, unloading condition 19, offset 31).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from sfms_robot.servo.registers import Table
+
+Then = Literal["refused", "set", "told"]
+
+REVERSE: Final = 0x01  # drive mode bit 0: ticks run the other way
+_SLAVE: Final = 0x02  # drive mode bit 1: follows another motor over a cable of its own (X540, MX-106)
+_TORQUE_AT_POWER_UP: Final = 0x01  # startup configuration bit 0
+_EXTENDED_MODE: Final = 4  # Protocol 2.0: extended position
+_CURRENT_POSITION_MODE: Final = 5  # Protocol 2.0: position with bounded current, also over many turns
+_PROTECTIONS: Final = ("overheating", "overload", "electrical shock")
+_LIMITS: Final = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
+_SCALES: Final = ("angular_resolution", "resolution_divider")  # other than 1: a tick is more than a tick
+
+
+@dataclass(frozen=True)
+class JointNeeds:
+    """What a joint asks of the servo that moves it.
+
+    Attributes:
+        low_ticks, high_ticks: first and last goal it will be given.
+        stored: EEPROM values that zero and direction in the head's file were written for.
+        other_ids: the other servos of its bus.
+        bounded_current: its current is to be limited, where the servo can.
+        allowed_faults: those the head's file says to live with.
+    """
+
+    low_ticks: int
+    high_ticks: int
+    stored: Mapping[str, int] = field(default_factory=dict)
+    other_ids: frozenset[int] = frozenset()
+    bounded_current: bool = False
+    allowed_faults: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A stored value that is not what the head's file reckons with.
+
+    Attributes:
+        wanted: the value that would do, as close to the stored one as can be.
+        then: `refused` at startup, `set` by startup itself, or only `told`.
+        fixable: whether writing `wanted` mends it without harm; else it is for a person to look at.
+    """
+
+    register: str
+    value: int
+    wanted: int
+    why: str
+    then: Then
+    fixable: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.register} is {self.value}, wanted {self.wanted}: {self.why}"
+
+
+def multi_turn(table: Table, needs: JointNeeds) -> bool:
+    """Whether the goals of a joint leave the one turn of position mode."""
+    return needs.low_ticks < 0 or needs.high_ticks >= table.ticks_per_revolution
+
+
+def operating_mode(table: Table, needs: JointNeeds) -> int | None:
+    """Value of role `operating_mode` for a joint; None where limits say it (Protocol 1.0), or nothing does.
+
+    Many turns are mode 4 with Protocol 2.0; a Feetech STS stays in mode 0 and is told by its limits.
+    """
+    if table.protocol == 2 and needs.bounded_current and "goal_current" in table.fields:
+        return _CURRENT_POSITION_MODE
+    if table.protocol == 2 and multi_turn(table, needs):
+        return _EXTENDED_MODE
+    return table.position_mode
+
+
+def limit_names(table: Table) -> tuple[str, str] | None:
+    """Names of the lower and the upper position limit; None for a model without."""
+    return next((names for names in _LIMITS if names[0] in table.fields), None)
+
+
+def limits_count(table: Table, needs: JointNeeds) -> bool:
+    """Whether the servo holds goals against its own position limits: not in modes 4 and 5, nor over many turns."""
+    if table.protocol == 2:
+        return operating_mode(table, needs) in (None, table.position_mode)
+    return not multi_turn(table, needs)
+
+
+def contradictions(values: Mapping[str, int], table: Table, needs: JointNeeds) -> list[Contradiction]:
+    """Everything stored in one servo that is not as its joint needs it, in the order of importance.
+
+    Args:
+        values: registers by name, as read.
+    """
+    found = [
+        *_mode(values, table, needs),
+        *_limits(values, table, needs),
+        *_zero_and_direction(values, table, needs),
+        *_secondary_id(values, needs),
+        *_startup(values),
+        *_shutdown(values, table, needs),
+        *_turns(values, table, needs),
+    ]
+    return sorted(found, key=lambda each: ("refused", "set", "told").index(each.then))
+
+
+def _mode(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+    mode, wanted = table.role("operating_mode"), operating_mode(table, needs)
+    if mode is not None and wanted is not None and (now := values.get(mode.name, wanted)) != wanted:
+        kinds = {_EXTENDED_MODE: "extended position", _CURRENT_POSITION_MODE: "current-based position"}
+        kind = kinds.get(wanted, "position") if table.protocol == 2 else "position"
+        yield Contradiction(mode.name, now, wanted, f"the joint is moved in {kind} control", "set")
+
+
+def _limits(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+    """Goals beyond the servo's own limits are refused by Protocol 2.0, and silently clipped by the others."""
+    names = limit_names(table)
+    if names is None or not values.keys() >= set(names):
+        return
+    low, high = (values[name] for name in names)
+    if multi_turn(table, needs) and table.protocol == 1:
+        yield from _unlimited(names, low, high, table)
+        return
+    if not limits_count(table, needs):
+        return
+    if low >= high:
+        if table.family == "dynamixel" and names[0] == "cw_angle_limit":  # both 0: wheel mode, both 4095: multi-turn
+            whole = table[names[1]].high
+            yield Contradiction(names[0], low, 0, "equal angle limits are no position mode", "set")
+            yield Contradiction(names[1], high, whole, "equal angle limits are no position mode", "set")
+        return
+    goals = f"the joint's range is {needs.low_ticks}..{needs.high_ticks} ticks"
+    if low > needs.low_ticks:
+        yield Contradiction(names[0], low, needs.low_ticks, goals, "refused")
+    if high < needs.high_ticks:
+        yield Contradiction(names[1], high, needs.high_ticks, goals, "refused")
+
+
+def _unlimited(names: tuple[str, str], low: int, high: int, table: Table) -> Iterator[Contradiction]:
+    """What the limits have to be for many turns: both 4095 (MX 1.0), both 0 (STS)."""
+    both = 0 if table.family == "feetech" else table[names[1]].high
+    for name, now in zip(names, (low, high), strict=True):
+        if now != both:
+            yield Contradiction(name, now, both, "the joint's range is more than one turn", "set")
+
+
+def _zero_and_direction(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+    """Homing offset, reverse bit and the like move or turn round every angle of the joint."""
+    for name in ("homing_offset", "multi_turn_offset"):
+        if name in values and (values[name] or name in needs.stored):
+            yield from _shifted(name, values[name], table, needs)
+    if "drive_mode" in values:
+        now = values["drive_mode"]
+        wanted = now & ~(REVERSE | _SLAVE) | needs.stored.get("drive_mode", 0) & (REVERSE | _SLAVE)
+        if (now ^ wanted) & _SLAVE:
+            yield Contradiction("drive_mode", now, wanted, "it follows another motor, not its goals", "refused")
+        elif now != wanted and "drive_mode" in needs.stored:
+            yield Contradiction("drive_mode", now, wanted, "the joint would move the other way", "refused")
+        elif now != wanted:
+            why = "its ticks run the other way; the head's file says nothing of it"
+            yield Contradiction("drive_mode", now, wanted, why, "told", fixable=False)
+    for name in _SCALES:
+        if values.get(name, 1) > 1:
+            yield Contradiction(name, values[name], 1, "one of its ticks is several", "refused")
+
+
+def _shifted(name: str, now: int, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+    wanted = needs.stored.get(name)
+    if now == wanted:
+        return
+    degrees = (now - (wanted or 0)) * 360.0 / table.ticks_per_revolution
+    if wanted is not None:
+        yield Contradiction(name, now, wanted, f"every angle would be {degrees:+.1f} deg off", "refused")
+    else:
+        why = f"it shifts every angle by {degrees:+.1f} deg; the head's file says nothing of it"
+        yield Contradiction(name, now, 0, why, "told", fixable=False)
+
+
+def _secondary_id(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
+    """0..252 is active: it obeys writes to that id too, and never answers them."""
+    now = values.get("secondary_id", 255)
+    if now in needs.other_ids:
+        yield Contradiction("secondary_id", now, 255, f"it would follow the goals of id {now} too", "refused")
+    elif now <= 252:
+        yield Contradiction("secondary_id", now, 255, f"it obeys id {now} too", "told", fixable=False)
+
+
+def _startup(values: Mapping[str, int]) -> Iterator[Contradiction]:
+    now = values.get("startup_configuration", 0)
+    if now & _TORQUE_AT_POWER_UP:
+        why = "its torque comes on at power-up, wherever it stands"
+        yield Contradiction("startup_configuration", now, now & ~_TORQUE_AT_POWER_UP, why, "refused")
+    elif now:
+        yield Contradiction("startup_configuration", now, 0, "it restores RAM values of an earlier time", "told")
+
+
+def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+    """Faults that take the torque away: those that protect the motor should, those the head lives with must not."""
+    name = "unloading_condition" if table.family == "feetech" else "shutdown"
+    if name not in values:
+        return
+    faults = table.faults if table.protocol == 2 else table.status_faults
+    now, factory = values[name], table[name].initial
+    protecting = sum(1 << bit for bit, text in faults.items() if text in _PROTECTIONS and factory >> bit & 1)
+    allowed = sum(1 << bit for bit, text in faults.items() if text in needs.allowed_faults and factory >> bit & 1)
+    wanted = (now | protecting) & ~(allowed & ~protecting)
+    if missing := wanted & ~now:
+        why = f"it goes on under {_named(faults, missing)}"
+        yield Contradiction(name, now, wanted, why, "told")
+    elif extra := now & ~wanted:
+        why = f"it gives way under {_named(faults, extra)}, which the head's file says to live with"
+        yield Contradiction(name, now, wanted, why, "told")
+
+
+def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+    """Where it stands: within the one turn of position mode, or at one turn of several and no other."""
+    present, turn = table.role("present_position"), table.ticks_per_revolution
+    if present is None or present.name not in values:
+        return
+    now, offset = values[present.name], values.get("homing_offset", 0)
+    torque = table.role("torque_enable")
+    if multi_turn(table, needs):
+        if torque is not None and values.get(torque.name):
+            return  # it has had power since somebody knew where it was
+        if not unique_turn(now, turn, needs):
+            low, high = home_ticks(turn, needs)
+            why = (
+                "the count of turns is lost at power-off, and this may be one of several places; switch its supply "
+                f"off, turn it by hand to where it will read {low}..{high}, and switch it on"
+            )
+            yield Contradiction(present.name, now, (low + high) // 2, why, "refused", fixable=False)
+    elif not min(0, offset) <= now < turn + max(0, offset):  # a homing offset shifts the one turn that there is
+        inside = (now - offset) % math.ceil(turn) + offset
+        cure = "it was turned past one turn"
+        if not can_clear_turns(table):
+            cure += ": turn it back by hand, or switch its supply off and on"
+        yield Contradiction(present.name, now, inside, cure, "refused", fixable=can_clear_turns(table))
+
+
+def unique_turn(present: int, turn: float, needs: JointNeeds) -> bool:
+    """Whether a servo that may have lost its count can only stand where it says, as far as its joint's range goes."""
+    whole = round(turn)
+    last = math.ceil((needs.high_ticks - needs.low_ticks) / whole) + 1
+    others = (present + count * whole for count in range(-last, last + 1) if count)
+    return needs.low_ticks <= present <= needs.high_ticks and not any(
+        needs.low_ticks <= each <= needs.high_ticks for each in others
+    )
+
+
+def home_ticks(turn: float, needs: JointNeeds) -> tuple[int, int]:
+    """First and last tick of the turn at power-up that belong to one position of the joint only; first > last where
+    there are none.
+    """
+    whole = round(turn)
+    low = max(needs.low_ticks, needs.high_ticks - whole + 1, 0)
+    return low, min(needs.high_ticks, needs.low_ticks + whole - 1, whole - 1)
+
+
+def can_clear_turns(table: Table) -> bool:
+    """Whether the model knows CLEAR (Protocol 2.0, X and MX; not the XL-320)."""
+    return table.protocol == 2 and "homing_offset" in table.fields
+
+
+def _named(faults: Mapping[int, str], bits: int) -> str:
+    return ", ".join(text for bit, text in sorted(faults.items()) if bits >> bit & 1)

@@ -1,0 +1,66 @@
+"""Quantiles of any number of values in fixed memory: exact while they are few, within one percent after that."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+_EXACT: Final = 4096  # values kept as they are
+_RATIO: Final = 1.02  # of the ends of a bin, so its middle is within one percent
+_LEAST: Final = 1e-6  # what is smaller counts as 0
+_BINS: Final = 2048  # up to 1e11
+
+
+class Quantiles:
+    """Takes values one at a time.
+
+    Values are sorted into bins whose ends grow by two percent each; nothing else of them is kept once there are many.
+    """
+
+    def __init__(self) -> None:
+        self._values: list[float] = []
+        self._bins = np.zeros(0, np.int64)
+        self._largest = 0.0
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, value: float) -> None:
+        """A value that is not negative and not NaN."""
+        self._count += 1
+        self._largest = max(self._largest, value)
+        if len(self._bins):
+            self._bins[_bin(value)] += 1
+            return
+        self._values.append(value)
+        if len(self._values) > _EXACT:
+            self._bins = np.bincount([_bin(each) for each in self._values], minlength=_BINS)
+            self._values = []
+
+    def at(self, percent: float) -> float:
+        """The value that `percent` of all do not exceed; 100 is the largest. Raises ValueError when there is none."""
+        if not self._count:
+            raise ValueError("no value was taken")
+        if not len(self._bins):
+            return float(np.percentile(self._values, percent))
+        if percent >= 100.0:
+            return self._largest
+        place = int(np.searchsorted(np.cumsum(self._bins), percent / 100.0 * self._count, side="left"))
+        return min(_middle(place), self._largest)
+
+    def report(self, **percent: float) -> dict[str, float | None]:
+        """{"p50": ..., ...} to three digits after the point; every value None when nothing was taken."""
+        if not self._count:
+            return dict.fromkeys(percent)
+        return {name: round(self.at(each), 3) for name, each in percent.items()}
+
+
+def _bin(value: float) -> int:
+    return 0 if value < _LEAST else min(_BINS - 1, 1 + int(math.log(value / _LEAST) / math.log(_RATIO)))
+
+
+def _middle(place: int) -> float:
+    return 0.0 if place == 0 else _LEAST * _RATIO ** (place - 0.5)

@@ -1,0 +1,304 @@
+"""The emulated chain without a terminal: packets in, packets out."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
+from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.codecs.dxl2 import Packet, encode_instruction, maybe_packet
+from sfms_robot.servo.registers import Table
+
+TABLE = Table.of(load_firmware_map("xl330-m288"))
+BAUD = 1_000_000
+
+
+class Host:
+    """A host that talks at one baud, at a time it sets."""
+
+    def __init__(self, *servos: int, baud: int = BAUD, firmware: int = 53, chain_break: bool = True):
+        each = [Dynamixel2Servo(i, TABLE, baud, start_ticks=2000 + i, firmware=firmware) for i in servos]
+        self.chain = Dynamixel2Chain(each, chain_break)
+        self.t = 0.0
+
+    def replies(self, servo: int, instruction: int, params: bytes = b""):
+        return self.chain.replies(encode_instruction(servo, instruction, params), BAUD, self.t)
+
+    def ask(self, servo: int, instruction: int, params: bytes = b"", baud: int = BAUD) -> list[Packet]:
+        buffer = bytearray(self.chain.receive(encode_instruction(servo, instruction, params), baud, self.t))
+        out = []
+        while (packet := maybe_packet(buffer)) is not None:
+            out.append(packet)
+        assert not buffer
+        return out
+
+    def write(self, servo: int, name: str, value: int) -> int:
+        """The error byte."""
+        field = TABLE[name]
+        [status] = self.ask(servo, dxl2.WRITE, field.address.to_bytes(2, "little") + field.to_bytes(value))
+        return status.error
+
+    def read(self, servo: int, name: str) -> int:
+        field = TABLE[name]
+        request = field.address.to_bytes(2, "little") + field.size.to_bytes(2, "little")
+        [status] = self.ask(servo, dxl2.READ, request)
+        return field.from_bytes(status.params)
+
+
+def words(*values: int) -> bytes:
+    return b"".join(value.to_bytes(2, "little") for value in values)
+
+
+@pytest.fixture
+def host():
+    return Host(1, 2, 3)
+
+
+def test_ping_tells_model_and_firmware(host):
+    assert host.ask(2, dxl2.PING) == [Packet(2, dxl2.STATUS, b"\xb0\x04\x35")]
+
+
+def test_broadcast_ping_is_answered_by_all(host):
+    assert [packet.servo for packet in host.ask(dxl2.BROADCAST, dxl2.PING)] == [1, 2, 3]
+
+
+def test_unknown_id_and_other_baud_are_silence(host):
+    assert host.ask(9, dxl2.PING) == []
+    assert host.ask(1, dxl2.PING, baud=57600) == []
+    assert host.ask(1, dxl2.PING, baud=None) == []
+
+
+def test_baud_register_moves_the_servo_to_another_baud(host):
+    assert host.write(1, "baud_rate", 1) == 0
+    assert host.ask(1, dxl2.PING) == []
+    assert len(host.ask(1, dxl2.PING, baud=57600)) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("present_position", 5, dxl2.ACCESS_ERROR),
+        ("torque_enable", 2, dxl2.DATA_RANGE_ERROR),
+        ("operating_mode", 99, dxl2.DATA_RANGE_ERROR),
+        ("goal_position", 5000, dxl2.DATA_LIMIT_ERROR),
+        ("bus_watchdog", -1, dxl2.DATA_RANGE_ERROR),
+        ("led", 1, 0),
+    ],
+)
+def test_write_is_checked(host, name, value, error):
+    before = host.read(1, name)
+    assert host.write(1, name, value) == error
+    assert host.read(1, name) == (before if error else value)
+
+
+def test_part_of_a_register_cannot_be_written(host):
+    [status] = host.ask(1, dxl2.WRITE, words(116) + b"\x00\x08")
+    assert status.error == dxl2.DATA_LENGTH_ERROR
+
+
+def test_eeprom_is_locked_under_torque(host):
+    assert host.write(1, "torque_enable", 1) == 0
+    assert host.write(1, "return_delay_time", 0) == dxl2.ACCESS_ERROR
+    assert host.write(1, "led", 1) == 0
+
+
+def test_unknown_instruction_is_refused(host):
+    assert [packet.error for packet in host.ask(1, 0x77)] == [dxl2.INSTRUCTION_ERROR]
+
+
+def test_status_return_level_decides_who_answers(host):
+    assert host.ask(1, dxl2.WRITE, words(68) + b"\x01") == []  # the new level counts at once
+    assert host.ask(1, dxl2.WRITE, words(65) + b"\x01") == []
+    assert host.read(1, "led") == 1
+    host.ask(1, dxl2.WRITE, words(68) + b"\x00")
+    assert host.ask(1, dxl2.READ, words(65, 1)) == []
+    assert len(host.ask(1, dxl2.PING)) == 1
+
+
+def test_without_torque_a_goal_moves_nothing(host):
+    host.write(1, "goal_position", 3000)
+    host.t = 2.0
+    assert host.read(1, "present_position") == 2001
+
+
+def test_torque_before_a_goal_jumps_to_the_middle(host):
+    host.write(1, "torque_enable", 1)
+    host.t = 2.0
+    assert host.read(1, "present_position") == 2048
+
+
+def test_sync_write_moves_all(host):
+    for servo in (1, 2, 3):
+        host.write(servo, "torque_enable", 1)
+    body = b"".join(bytes([i]) + (1000 * i).to_bytes(4, "little") for i in (1, 2, 3))
+    assert host.ask(dxl2.BROADCAST, dxl2.SYNC_WRITE, words(116, 4) + body) == []
+    host.t = 3.0
+    assert [host.read(i, "present_position") for i in (1, 2, 3)] == [1000, 2000, 3000]
+
+
+def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
+    assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x01\x02")] == [3, 1, 2]
+    assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x09\x02")] == [3]
+
+
+def test_bulk_read_and_write(host):
+    host.ask(dxl2.BROADCAST, dxl2.BULK_WRITE, b"\x01" + words(65, 1) + b"\x01" + b"\x02" + words(84, 2) + words(700))
+    answers = host.ask(dxl2.BROADCAST, dxl2.BULK_READ, b"\x01" + words(65, 1) + b"\x02" + words(84, 2))
+    assert [p.params for p in answers] == [b"\x01", words(700)]
+
+
+def test_registered_write_waits_for_action(host):
+    host.ask(1, dxl2.REG_WRITE, words(65) + b"\x01")
+    assert (host.read(1, "led"), host.read(1, "registered_instruction")) == (0, 1)
+    assert host.ask(dxl2.BROADCAST, dxl2.ACTION) == []
+    assert (host.read(1, "led"), host.read(1, "registered_instruction")) == (1, 0)
+
+
+def test_reboot_restores_ram_and_keeps_eeprom(host):
+    host.write(1, "return_delay_time", 7)
+    host.write(1, "led", 1)
+    host.write(1, "torque_enable", 1)
+    assert len(host.ask(1, dxl2.REBOOT)) == 1
+    assert host.ask(1, dxl2.PING) == []  # it is busy starting
+    host.t = 0.5
+    assert [host.read(1, n) for n in ("led", "torque_enable", "return_delay_time")] == [0, 0, 7]
+
+
+def test_factory_reset_keeps_what_it_is_told_to(host):
+    host.write(3, "return_delay_time", 7)
+    host.ask(3, dxl2.FACTORY_RESET, b"\x02")
+    host.t = 0.5
+    assert host.read(3, "return_delay_time") == 250
+    host.ask(3, dxl2.FACTORY_RESET, b"\x01")
+    host.t = 1.0
+    assert host.ask(3, dxl2.PING) == [] and len(host.ask(3, dxl2.PING, baud=57600)) == 1
+
+
+def test_hardware_error_is_latched_until_reboot(host):
+    host.write(2, "torque_enable", 1)
+    host.chain.servo(2).fail(1 << 5, 0.0)
+    [status] = host.ask(2, dxl2.READ, words(64, 1))
+    assert (status.error, status.params) == (dxl2.ALERT, b"\x00")
+    assert host.read(2, "hardware_error_status") == 1 << 5
+    assert host.write(2, "torque_enable", 1) == dxl2.ALERT | dxl2.ACCESS_ERROR
+    host.ask(2, dxl2.REBOOT)
+    host.t = 0.5
+    assert host.read(2, "hardware_error_status") == 0 and host.write(2, "torque_enable", 1) == 0
+
+
+def test_watchdog_stops_the_servo_when_the_host_is_gone(host):
+    host.write(1, "profile_velocity", 20)
+    host.write(1, "goal_position", 2001)
+    host.write(1, "torque_enable", 1)
+    host.write(1, "bus_watchdog", 5)
+    host.write(1, "goal_position", 4000)
+    host.t = 5.0
+    stopped = host.read(1, "present_position")
+    assert 2001 < stopped < 2060 and host.read(1, "bus_watchdog") == -1
+    assert host.write(1, "goal_position", 3000) == dxl2.DATA_RANGE_ERROR
+    assert host.write(1, "bus_watchdog", 0) == 0 and host.write(1, "goal_position", 3000) == 0
+
+
+def test_watchdog_is_fed_by_any_instruction(host):
+    host.write(1, "torque_enable", 1)
+    host.write(1, "bus_watchdog", 5)
+    for k in range(20):
+        host.t = 0.09 * k
+        host.ask(2, dxl2.PING)
+    assert host.read(1, "bus_watchdog") == 5
+
+
+def test_unfinished_packet_is_forgotten_after_a_pause(host):
+    host.chain.receive(encode_instruction(1, dxl2.READ, words(0, 2))[:-4], BAUD, 0.0)
+    host.t = 0.2
+    assert len(host.ask(1, dxl2.PING)) == 1
+
+
+@given(st.integers(0, 255), st.integers(0, 255), st.binary(max_size=40))
+def test_no_instruction_whatever_its_parameters_breaks_the_chain(servo, instruction, params):
+    host = Host(1)
+    if servo not in (0xFD, 0xFF):
+        host.chain.receive(encode_instruction(servo, instruction, params), BAUD, 0.0)
+
+
+POSITIONS = words(132, 4)
+
+
+def test_chain_may_skip_a_silent_id():
+    host = Host(1, 2, 3, chain_break=False)
+    host.chain.servo(2).dead = True
+    answers = host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + b"\x01\x02\x03")
+    assert [packet.servo for packet in answers] == [1, 3]
+
+
+@pytest.mark.parametrize("dead", [None, 3, 2, 1])
+def test_fast_sync_read_is_one_packet_that_stops_short_at_a_silent_id(host, dead):
+    if dead:
+        host.chain.servo(dead).dead = True
+    replies = host.replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, POSITIONS + b"\x01\x02\x03")
+    there = (1, 2, 3)[: dead - 1 if dead else 3]
+    assert [reply.servos for reply in replies] == ([there] if there else [])
+    if there:
+        parts = dxl2.split_fast_status(replies[0].data, 4)
+        assert parts == [(i, 0, (2000 + i).to_bytes(4, "little")) for i in there]
+        assert len(replies[0].data) == 8 + 8 * len(there)
+        assert replies[0].data[5] == 1 + 3 * 8  # announced whole
+
+
+def test_fast_bulk_read_has_its_own_length_for_each(host):
+    request = b"\x01" + words(132, 4) + b"\x02" + words(146, 1)
+    [reply] = host.replies(dxl2.BROADCAST, 0x9A, request)
+    assert reply.data[8:14] == bytes([0, 1]) + (2001).to_bytes(4, "little")
+    assert reply.data[16:19] == bytes([0, 2, 31])
+
+
+def test_fast_read_of_a_block_that_holds_a_header_is_not_stuffed():
+    host = Host(1)
+    host.write(1, "goal_position", 0)
+    host.write(1, "indirect_data_1", 0xFF)
+    host.write(1, "indirect_data_2", 0xFF)
+    host.write(1, "indirect_data_3", 0xFD)
+    [plain] = host.replies(1, dxl2.READ, words(224, 3))
+    [fast] = host.replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, words(224, 3) + b"\x01")
+    assert b"\xff\xff\xfd\xfd" in plain.data and b"\xff\xff\xfd\xfd" not in fast.data
+    assert dxl2.split_fast_status(fast.data, 3) == [(1, 0, b"\xff\xff\xfd")]
+
+
+def test_old_firmware_does_not_know_fast_reads():
+    assert Host(1, firmware=44).replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, POSITIONS + b"\x01") == []
+
+
+def test_second_id_obeys_and_says_nothing(host):
+    for servo in (2, 3):
+        assert host.write(servo, "secondary_id", 1) == 0
+    assert [p.servo for p in host.ask(1, dxl2.WRITE, words(65) + b"\x01")] == [1]
+    assert [host.read(i, "led") for i in (1, 2, 3)] == [1, 1, 1]
+    host.ask(dxl2.BROADCAST, dxl2.SYNC_WRITE, words(65, 1) + b"\x01\x00")
+    assert [host.read(i, "led") for i in (1, 2, 3)] == [0, 0, 0]
+
+
+def test_two_servos_with_one_id_talk_over_one_another(host):
+    assert host.write(2, "id", 1) == 0
+    both = host.replies(1, dxl2.READ, POSITIONS)
+    assert len(both) == 1 and maybe_packet(bytearray(both[0].data)) is None  # 2001 and 2002 at once: the crc is wrong
+
+
+def test_change_of_id_is_answered_under_the_old_one(host):
+    assert [p.servo for p in host.ask(3, dxl2.WRITE, words(7) + b"\x09")] == [3]
+    assert [p.servo for p in host.ask(9, dxl2.PING)] == [9]
+
+
+def test_each_reply_waits_its_return_delay(host):
+    host.write(2, "return_delay_time", 10)
+    replies = host.replies(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + b"\x01\x02")
+    assert [reply.pause_s for reply in replies] == pytest.approx([500e-6, 20e-6])
+
+
+def test_broadcast_ping_is_answered_in_slots(host):
+    assert all(reply.pause_s >= 0.003 for reply in host.replies(dxl2.BROADCAST, dxl2.PING))
+
+
+def test_baud_may_be_a_little_off(host):
+    assert len(host.ask(1, dxl2.PING, baud=1_020_000)) == 1 and host.ask(1, dxl2.PING, baud=921_600) == []

@@ -1,0 +1,157 @@
+"""Devices, faults and the line between, without a terminal."""
+
+import pytest
+
+from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
+from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.emulator.emulated_wire import EmulatedWire
+from sfms_robot.emulator.faults import parse_fault
+from sfms_robot.emulator.protocol1_chain import Protocol1Chain
+from sfms_robot.errors import ConfigError
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
+from sfms_robot.servo.registers import Table
+
+BAUD = 1_000_000
+TABLE = Table.of(load_firmware_map("xl330-m288"))
+POSITIONS = (132).to_bytes(2, "little") + (4).to_bytes(2, "little")
+
+
+def wire_of(*ids: int, timing="instant", faults=(), seed=0) -> EmulatedWire:
+    servos = [Dynamixel2Servo(i, TABLE, BAUD, 2000 + i, 53, {"return_delay_time": 50}) for i in ids]
+    return EmulatedWire([Dynamixel2Chain(servos)], timing, [parse_fault(text) for text in faults], seed)
+
+
+def sync_read(*ids: int) -> bytes:
+    return encode_instruction(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + bytes(ids))
+
+
+def ids_in(outs) -> list[int]:
+    buffer = bytearray(b"".join(out.data for out in outs))
+    found = []
+    while (packet := maybe_packet(buffer)) is not None:
+        found.append(packet.servo)
+    return found
+
+
+def test_instant_replies_are_due_at_once():
+    wire = wire_of(1, 2)
+    wire.receive(sync_read(1, 2), BAUD, 1.0)
+    assert ids_in(wire.take(1.0)) == [1, 2] and wire.take(9.0) == []
+
+
+def test_on_the_wire_a_byte_takes_ten_bits_and_a_servo_its_delay():
+    wire = wire_of(1, 2, timing="wire")
+    request = sync_read(1, 2)
+    wire.receive(request, BAUD, 1.0)
+    assert wire.take(1.0) == []
+    first, second = wire.take(2.0)
+    byte_s, delay_s, answer = 10 / BAUD, 100e-6, 15
+    assert first.due_s == pytest.approx(1.0 + len(request) * byte_s + delay_s + answer * byte_s)
+    assert second.due_s == pytest.approx(first.due_s + delay_s + answer * byte_s)
+    assert wire.statistics()["busy_s"] == pytest.approx((len(request) + 2 * answer) * byte_s)
+
+
+def test_a_request_waits_until_the_line_is_free():
+    wire = wire_of(1, timing="wire")
+    for _ in range(2):
+        wire.receive(sync_read(1), BAUD, 1.0)
+    first, second = wire.take(2.0)
+    assert second.due_s == pytest.approx(1.0 + 2 * (first.due_s - 1.0))
+
+
+def test_what_leaves_late_is_the_emulators_own_doing():
+    wire = wire_of(1, timing="wire")
+    for sent_s in (0.0, 0.01):
+        wire.receive(sync_read(1), BAUD, 1.0)
+        outs = wire.take(2.0)
+        wire.sent(outs, outs[0].due_s + sent_s)
+    assert wire.statistics()["emulator_late"] == 1 and wire.statistics()["replies"] == 2
+    assert [stamp["sent_s"] - stamp["due_s"] for stamp in wire.stamps()] == pytest.approx([0.0, 0.01])
+
+
+def test_delayed_reply_comes_after_the_next_one():
+    wire = wire_of(1, 2, faults=["delay:1=0.005"])
+    wire.receive(sync_read(1, 2), BAUD, 0.0)
+    assert ids_in(wire.take(0.0)) == [2] and wire.next_s == pytest.approx(0.005)
+    wire.receive(sync_read(2), BAUD, 0.01)
+    assert ids_in(wire.take(0.01)) == [1, 2]
+
+
+def test_echo_comes_before_the_answer_and_noise_behind():
+    wire = wire_of(1, faults=["echo", "noise"])
+    request = sync_read(1)
+    wire.receive(request, BAUD, 0.0)
+    sent = b"".join(out.data for out in wire.take(0.0))
+    assert sent.startswith(request) and len(sent) > len(request) + 15
+
+
+def test_silent_and_stuck_last_as_long_as_they_say():
+    wire = wire_of(1, 2, faults=["silent:1@1-2", "stuck:2@1-2"])
+    for now_s, silent in ((0.5, False), (1.5, True), (2.5, False)):
+        wire.advance(now_s)
+        assert (wire.servo(1).dead, wire.servo(2).plant.stuck) == (silent, silent)
+
+
+def test_brown_out_silences_everybody_and_lets_them_start_anew():
+    wire = wire_of(1, 2, faults=["brownout@1-1.5"])
+    for servo in (1, 2):
+        assert wire.servo(servo).write(64, b"\x01", 0.5) == 0
+    for now_s, count in ((0.9, 2), (1.2, 0), (1.6, 0), (1.9, 2)):
+        wire.receive(sync_read(1, 2), BAUD, now_s)
+        assert len(ids_in(wire.take(now_s))) == count
+    assert [wire.servo(i).torque for i in (1, 2)] == [0, 0]
+
+
+def test_overload_overheat_and_voltage_are_latched():
+    wire = wire_of(1, 2, 3, faults=["overload:1@1", "overheat:2@1", "voltage@1-2=7.5"])
+    wire.advance(3.0)
+    assert [wire.servo(i).fault_status for i in (1, 2, 3)] == [1 << 5 | 1, 1 << 2 | 1, 1]
+    assert wire.servo(3).supply_v == 5.0
+
+
+def test_clear_lets_a_stuck_joint_go():
+    wire = wire_of(1)
+    wire.inject("stuck:1", 0.0)
+    assert wire.servo(1).plant.stuck and wire.faults(0.0) == ["stuck:1"]
+    wire.clear(1.0)
+    assert not wire.servo(1).plant.stuck and wire.faults(1.0) == []
+
+
+def test_fault_that_concerns_nobody_is_refused():
+    with pytest.raises(ConfigError, match="'drop:9' concerns no servo"):
+        wire_of(1, faults=["drop:9"])
+
+
+def test_unplugged_wire_hears_nothing_but_counts():
+    wire = wire_of(1, faults=["hangup@1-2"])
+    wire.receive(sync_read(1), BAUD, 1.5)
+    assert wire.hung and wire.take(9.0) == [] and wire.digest()[1] == len(sync_read(1))
+    wire.advance(2.0)
+    assert not wire.hung
+
+
+def test_two_protocols_share_one_wire():
+    table = Table.of(load_firmware_map("ax-12a"))
+    row = {"id": 20, "model": "ax-12a", "baud": BAUD, "start_ticks": 512, "firmware": 24}
+    old = Protocol1Chain.from_rows([row], {"ax-12a": table})
+    wire = EmulatedWire([Dynamixel2Chain([Dynamixel2Servo(1, TABLE, BAUD, 2001, 53)]), old])
+    for _ in range(3):
+        wire.receive(encode_instruction(1, dxl2.PING), BAUD, 0.0)
+        assert ids_in(wire.take(0.0)) == [1]
+        wire.receive(frame1.encode(20, frame1.PING), BAUD, 0.0)
+        assert [out.servos for out in wire.take(0.0)] == [(20,)]
+
+
+def test_same_faults_and_requests_give_the_same_bytes():
+    def run(seed):
+        wire = wire_of(1, 2, 3, faults=["drop=0.2", "corrupt=0.2", "noise=0.3", "duplicate=0.1"], seed=seed)
+        out = []
+        for k in range(100):
+            wire.receive(sync_read(1, 2, 3), BAUD, 0.01 * k)
+            out.append(b"".join(each.data for each in wire.take(0.01 * k)))
+        return out
+
+    assert run(7) == run(7) != run(8)

@@ -1,0 +1,192 @@
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
+from sfms_robot.servo.codecs import maestro, ssc32
+from sfms_robot.servo.codecs.ssc32 import Move
+from sfms_robot.servo.registers import Table
+
+AA = bytes([maestro.BAUD_INDICATION])
+
+
+def rows(model, channels, baud=9600, start_ticks=None):
+    table = Table.of(load_firmware_map(model))
+    start = table.center_ticks if start_ticks is None else start_ticks
+    return table, [{"id": i, "model": model, "baud": baud, "start_ticks": start} for i in channels]
+
+
+def maestro_board(model="maestro-24", channels=range(6), **more):
+    """One that has detected its baud rate."""
+    board = MaestroBoard(*rows(model, channels, **more))
+    board.receive(AA, 115200, 0.0)
+    return board
+
+
+def position(board, channel, now_s):
+    return int.from_bytes(board.receive(maestro.get_position(channel), 115200, now_s), "little")
+
+
+def errors(board):
+    return int.from_bytes(board.receive(maestro.get_errors(), 115200, 0.0), "little")
+
+
+def test_maestro_is_deaf_until_it_has_seen_the_baud_byte():
+    board = MaestroBoard(*rows("maestro-24", [0]))
+    assert board.receive(maestro.get_errors(), 115200, 0.0) == b""
+    assert board.receive(AA + maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
+    assert board.receive(maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
+
+
+def test_maestro_takes_the_baud_byte_as_the_start_of_a_pololu_command():
+    board = MaestroBoard(*rows("maestro-24", [0]))
+    assert board.receive(maestro.addressed(maestro.get_errors()), 57600, 0.0) == b"\x00\x00"
+    assert board.baud == 57600
+
+
+def test_maestro_hears_no_other_baud_rate_and_says_so_later():
+    board = maestro_board()
+    board.receive(maestro.set_target(0, 6000), 115200, 0.0)
+    assert board.receive(maestro.get_errors(), 9600, 0.0) == b""
+    assert errors(board) == maestro.SIGNAL_ERROR
+    assert position(board, 0, 0.0) == 0  # an error sends all home, and home is off
+
+
+def test_target_without_a_speed_limit_is_there_at_once_and_the_shaft_follows():
+    board = maestro_board(start_ticks=6000)
+    board.receive(maestro.set_target(2, 7000), 115200, 1.0)
+    assert position(board, 2, 1.0) == 7000
+    assert board.servo(2).plant.position == 6000
+    board.advance(2.0)
+    assert board.servo(2).plant.position == 7000
+
+
+def test_speed_limit_holds_once_pulses_are_on():
+    board = maestro_board()
+    board.receive(maestro.set_speed(0, 20) + maestro.set_target(0, 5000), 115200, 0.0)
+    assert position(board, 0, 0.0) == 5000
+    board.receive(maestro.set_target(0, 7000), 115200, 0.0)
+    assert board.receive(maestro.get_moving(), 115200, 0.1) == b"\x01"
+    assert position(board, 0, 0.5) == pytest.approx(6000, abs=10)  # 20 x 0.25 us per 10 ms = 2000 ticks/s
+    assert position(board, 0, 1.5) == 7000
+    assert board.receive(maestro.get_moving(), 115200, 1.5) == b"\x00"
+
+
+def test_smallest_acceleration_takes_about_three_seconds_for_a_millisecond_of_pulse():
+    board = maestro_board()
+    board.receive(maestro.set_acceleration(0, 1) + maestro.set_target(0, 4000), 115200, 0.0)
+    board.receive(maestro.set_target(0, 8000), 115200, 0.0)
+    assert 7900 > position(board, 0, 2.5) > 6000
+    assert position(board, 0, 4.0) == 8000
+
+
+def test_targets_are_held_inside_the_limits_of_a_channel():
+    board = maestro_board()
+    board.receive(maestro.set_targets(0, [100, 16000]), 115200, 0.0)
+    assert (position(board, 0, 0.0), position(board, 1, 0.0)) == (992 * 4, 2000 * 4)
+
+
+def test_target_zero_and_going_home_end_the_pulses():
+    board = maestro_board()
+    board.receive(maestro.set_targets(0, [6000, 6000]) + maestro.set_target(0, maestro.OFF), 115200, 0.0)
+    assert (position(board, 0, 0.0), position(board, 1, 0.0)) == (0, 6000)
+    board.receive(maestro.go_home(), 115200, 0.0)
+    assert position(board, 1, 0.0) == 0
+
+
+def test_micro_maestro_knows_no_multiple_targets():
+    board = maestro_board("maestro-6")
+    board.receive(maestro.set_targets(0, [6000, 6000]), 115200, 0.0)
+    assert errors(board) == maestro.PROTOCOL_ERROR
+
+
+@pytest.mark.parametrize("command", [maestro.set_target(24, 6000), maestro.set_targets(23, [6000, 6000]), b"\xb0"])
+def test_nonsense_is_a_protocol_error_and_reading_it_clears_it(command):
+    board = maestro_board()
+    board.receive(command, 115200, 0.0)
+    assert errors(board) == maestro.PROTOCOL_ERROR
+    assert errors(board) == 0
+
+
+def test_mini_ssc_neutral_is_the_middle():
+    board = maestro_board()
+    board.receive(maestro.mini_ssc(3, 127) + maestro.mini_ssc(4, 0), 115200, 0.0)
+    assert position(board, 3, 0.0) == 6000
+    assert position(board, 4, 0.0) == pytest.approx((1500 - 476.25) * 4)
+
+
+def test_shaft_without_pulses_stays_where_it_is():
+    board = maestro_board(start_ticks=5000)
+    board.advance(10.0)
+    assert board.servo(0).plant.position == 5000
+
+
+def test_board_is_unplugged_when_every_channel_is_dead():
+    board = maestro_board(channels=[0, 1])
+    board.kill(0)
+    assert errors(board) == 0
+    board.kill(1)
+    assert board.receive(maestro.get_errors(), 115200, 0.0) == b""
+    board.revive(0)
+    assert errors(board) == 0
+
+
+def test_channel_without_a_servo_is_nobody():
+    board = maestro_board(channels=[4])
+    assert board.servo(4).id == 4 and board.servo(5) is None
+
+
+def ssc_board(baud=115200):
+    return Ssc32Board(*rows("ssc-32", range(8), baud))
+
+
+def pulses(board, channels, now_s):
+    return list(board.receive(b"QP " + b" ".join(b"%d" % c for c in channels) + b"\r", 115200, now_s))
+
+
+def test_group_starts_and_stops_together():
+    board = ssc_board()
+    board.receive(ssc32.group_move({0: Move(1000), 1: Move(1400)}), 115200, 0.0)
+    board.receive(ssc32.group_move({0: Move(2000), 1: Move(1600)}, 1000), 115200, 0.0)
+    assert pulses(board, [0, 1], 0.5) == [150, 150]
+    assert board.receive(ssc32.query_moving(), 115200, 0.9) == ssc32.MOVING
+    assert pulses(board, [0, 1], 1.01) == [200, 160]
+    assert board.receive(ssc32.query_moving(), 115200, 1.01) == ssc32.DONE
+
+
+def test_first_move_knows_no_speed():
+    board = ssc_board()
+    board.receive(ssc32.group_move({0: Move(2000, 100)}), 115200, 0.0)
+    assert pulses(board, [0], 0.0) == [200]
+
+
+def test_slower_of_speed_and_time_counts():
+    board = ssc_board()
+    board.receive(ssc32.group_move({0: Move(1000)}), 115200, 0.0)
+    board.receive(ssc32.group_move({0: Move(2000, 500)}, 100), 115200, 0.0)
+    assert pulses(board, [0], 1.0) == [150]
+
+
+def test_low_output_ends_the_pulses():
+    board = ssc_board()
+    board.receive(ssc32.group_move({0: Move(1500)}) + ssc32.outputs_low([0]), 115200, 0.0)
+    assert pulses(board, [0], 0.0) == [0]
+
+
+def test_ssc32_hears_no_other_baud_rate():
+    assert ssc_board().receive(ssc32.query_moving(), 9600, 0.0) == b""
+
+
+@given(st.lists(st.binary(max_size=64), max_size=20), st.sampled_from(["maestro-24", "maestro-6", "ssc-32"]))
+@settings(deadline=None)
+def test_rubbish_moves_no_channel_out_of_its_limits(chunks, model):
+    kind = Ssc32Board if model == "ssc-32" else MaestroBoard
+    board = kind(*rows(model, range(6)))
+    now_s = 0.0
+    for chunk in [AA, *chunks]:
+        now_s += 0.01
+        board.receive(chunk, 9600, now_s)
+    board.advance(now_s + 1.0)
+    for channel, (shortest, longest) in zip(board.channels, board.limits, strict=True):
+        assert channel.pulse == 0 or shortest <= channel.pulse <= longest

@@ -1,0 +1,182 @@
+"""The listener's own process: what it hears when it cannot keep up, what its parent does when it hangs or dies."""
+
+import io
+import os
+import pickle
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sfms_robot.errors import ModelError
+from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
+from sfms_robot.listeners import process
+from sfms_robot.listeners.process import MOST_WAITING, RESTARTS, Inbox, ListenerProcess, listen
+
+SILENCE = np.zeros(640, np.float32)
+
+
+def frames(count):
+    return [SpeakerFrame((i + 1) * FRAME_S, SILENCE) for i in range(count)]
+
+
+def filled(items):
+    inbox = Inbox()
+    for item in items:
+        inbox.put(item)
+    return inbox
+
+
+@pytest.mark.parametrize("count", [1, 2, MOST_WAITING])
+def test_frames_come_in_their_order_and_none_is_left_out_while_few_are_waiting(count):
+    sent, heard = frames(count), []
+    inbox = filled(sent)
+    for _ in sent:
+        heard.append(inbox.next())
+        assert inbox.skipped == 0
+    assert heard == sent
+
+
+def test_when_too_many_are_waiting_the_newest_is_next_and_the_others_are_counted():
+    sent = frames(MOST_WAITING + 1)
+    inbox = filled(sent)
+    assert inbox.next() is sent[-1] and inbox.skipped == MOST_WAITING
+    inbox.put(after := frames(1)[0])
+    assert inbox.next() is after and inbox.skipped == 0
+
+
+def test_the_end_waits_for_nothing():
+    assert filled([*frames(3), None]).next() is None
+
+
+class Slow:
+    """Hears one frame while all others arrive."""
+
+    hop = horizon = 1
+
+    def __init__(self, inbox):
+        self.inbox, self.late = inbox, [frames(60), [None]]
+
+    def start(self, seed):
+        return 0
+
+    def step(self, speaker, memory):
+        for frame in self.late.pop(0):
+            self.inbox.put(frame)
+        return Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), np.zeros((1, 58), np.float32)), memory
+
+
+def test_a_slow_listener_answers_the_newest_frame_and_tells_how_many_it_left_out():
+    inbox, said = filled(frames(1)), io.BytesIO()
+    listen(Slow(inbox), 0, inbox, said)
+    said.seek(0)
+    messages = [pickle.load(said) for _ in range(4)]
+    assert [kind for kind, *_ in messages] == ["ready", "plan", "skipped", "plan"]
+    assert messages[2][2] == 59 and messages[3][1].made_at_s == pytest.approx(60 * FRAME_S)
+
+
+# --- the parent and a real child -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def listener():
+    child = ListenerProcess("sfms-small", 3)
+    child.wait_ready()
+    yield child
+    child.close()
+
+
+def pid_of(listener):
+    return listener._child._process.pid
+
+
+def answered(listener, now_s):
+    """What comes of one hop of frames; waits for the child itself, however long that takes on this computer."""
+    for frame in frames(8):
+        listener.push(frame, now_s)
+    plans = []
+    while not plans:
+        kind, value, number = listener._child.next(60.0)
+        plan = listener._take(kind, value, number, now_s)
+        plans += [plan] if plan is not None else []
+    return plans
+
+
+def test_plans_come_back_and_torch_stays_in_the_child(listener):
+    assert answered(listener, 0.0)[0].frames.shape == (8, 58)
+    assert listener.statistics()["state"] == "listening"
+    code = (
+        "import sys; from sfms_robot.app import session; from sfms_robot.listeners import process\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_an_unknown_listener_is_told_by_name():
+    child = ListenerProcess("nobody", 0)
+    with pytest.raises(ModelError, match="nobody"):
+        child.wait_ready()
+
+
+def test_a_child_that_dies_is_started_anew_and_listens_again(listener):
+    answered(listener, 0.0)
+    os.kill(pid_of(listener), signal.SIGKILL)
+    listener._child._process.wait()
+    while listener.statistics()["restarts"] == 0:  # until the reading thread has seen the end of the pipe
+        listener.poll(1.0)
+    assert listener._child.next(60.0)[0] == "ready"
+    listener._take("ready", None, 0.0, 1.0)
+    assert answered(listener, 1.0) and listener.statistics()["state"] == "listening"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP here")
+def test_a_child_that_hangs_is_named_then_replaced_and_its_frames_do_not_pile_up(listener):
+    answered(listener, 0.0)
+    while listener._unanswered:  # the rest of the hop
+        listener._take(*listener._child.next(60.0), 0.0)
+    before = pid_of(listener)
+    os.kill(before, signal.SIGSTOP)
+    for frame in frames(2000):
+        listener.push(frame, 10.0)
+    listener.poll(10.0)
+    assert len(listener._child._frames) <= MOST_WAITING
+    listener.poll(10.0 + process.HUNG_S + 0.1)
+    assert listener.statistics()["state"] == "hung"
+    listener.poll(10.0 + process.RESTART_S + 0.1)
+    assert listener.statistics()["restarts"] == 1 and pid_of(listener) != before
+
+
+def test_a_child_that_keeps_dying_is_given_up_and_pushing_goes_on(listener):
+    for _ in range(RESTARTS + 1):
+        listener._child.close()
+        while not listener._child.ended:
+            pass
+        listener.poll(1.0)
+    assert listener.statistics()["state"] == "given up"
+    listener.push(frames(1)[0], 1.0)
+    assert listener.poll(1.0) == []
+
+
+def test_the_child_ends_when_its_parent_is_killed():
+    code = (
+        "import os, signal; from sfms_robot.listeners.process import ListenerProcess\n"
+        "child = ListenerProcess('sfms-small', 0); child.wait_ready()\n"
+        "print(child._child._process.pid, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    child = int(told.stdout)
+    assert _ends(child)
+
+
+def _ends(pid):
+    """Whether a process that is not our child is gone, or soon will be: it has nothing left to wait for."""
+    for _ in range(10_000_000):
+        try:
+            with open(f"/proc/{pid}/stat") as stat:
+                if stat.read().rpartition(")")[2].split()[0] == "Z":
+                    return True
+        except FileNotFoundError:
+            return True
+    return False

@@ -1,0 +1,151 @@
+"""Limiter, goals and audit are one law, wherever joints are found and whatever they are asked for."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.config.calibrate_first import held_back
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.motion.audit import Audit
+from sfms_robot.motion.calibration import Calibration
+from sfms_robot.motion.chase import StopChase, TimeOptimalChase
+from sfms_robot.motion.limits import JerkLimiter, JointLimits
+from sfms_robot.servo.goals import Goals
+from sfms_robot.servo.policy import BusServo
+
+DT_S = 0.01
+HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+CHASES = [TimeOptimalChase, StopChase]
+
+
+def sliver(head: Head) -> Head:
+    """The head with a tenth of a degree of travel in every joint."""
+    joints = {
+        name: joint.model_copy(update={"min_deg": joint.rest_deg - 0.05, "max_deg": joint.rest_deg + 0.05})
+        for name, joint in head.joints.items()
+    }
+    return head.model_copy(update={"joints": joints})
+
+
+SIZES = [lambda head: head, held_back, sliver]
+
+
+class Law:
+    """One head's limiter, goals and audit fed with the same; `tick` checks every law that holds at every tick."""
+
+    def __init__(self, head: Head, chase) -> None:
+        joints = head.joints
+        maps = {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
+        calibration = Calibration(
+            joints, np.array([maps[joint.model].ticks_per_revolution for joint in joints.values()])
+        )
+        servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in joints.items()]
+        self.limits = JointLimits.of(head)
+        self.count = len(servos)
+        self.limiter = JerkLimiter(self.limits, DT_S, chase)
+        self.goals = Goals("law", servos, calibration)
+        self.audit = Audit(self.limits, calibration, DT_S)
+        self.calibration = calibration
+
+    def start(self, angles) -> None:
+        self.state, self.audited = self.limiter.start(angles), self.audit.start(angles)
+        self.found, self.last = angles.copy(), angles.copy()
+        self.due_s = self.limiter.latest_in_s(angles)
+        for index, angle in enumerate(angles):
+            self.goals.hold(index, angle)
+
+    def restart(self, joints, angles) -> None:
+        angles = np.where(joints, angles, self.last)
+        self.state = self.limiter.restart(joints, angles, self.state)
+        self.audited = self.audit.restart(joints, angles, self.audited)
+        for index in np.flatnonzero(joints):
+            self.goals.hold(index, angles[index])
+        self.last = angles
+        self.due_s = np.where(joints, self.limiter.latest_in_s(angles), self.due_s)
+
+    def tick(self, reference, sent) -> np.ndarray:
+        goals, self.state = self.limiter.step(reference, self.state)
+        self.goals.ticks(goals, sent)  # raises for a goal that is refused
+        self.audited = self.audit.step(goals, reference[0], self.audited)
+        assert self.audited.violations == 0
+        low, high = self.limits.low, self.limits.high
+        assert (goals >= np.minimum(low, self.last)).all() and (goals <= np.maximum(high, self.last)).all()
+        self.due_s = self.due_s - DT_S
+        inside = (goals >= low) & (goals <= high)
+        assert (inside | (self.due_s > 0)).all()
+        self.last = goals
+        return inside
+
+
+def anywhere(rng, limits: JointLimits) -> np.ndarray:
+    """Inside, just outside, far outside, on either side; a joint each."""
+    width = limits.high - limits.low
+    side = np.where(rng.random(len(width)) < 0.5, -1.0, 1.0)
+    out = rng.choice([0.0, 1e-9, 1e-3, 0.3, 3.0], len(width)) * rng.random(len(width))
+    edge = np.where(side < 0, limits.low, limits.high)
+    return np.where(rng.random(len(width)) < 0.3, limits.low + rng.random(len(width)) * width, edge + side * out)
+
+
+def asked(rng, limits: JointLimits, last, kind: str) -> np.ndarray:
+    """A reference (3, J)."""
+    width, still = limits.high - limits.low, np.zeros(len(last))
+    rates = (
+        rng.choice([-1.0, 0.0, 1.0], (2, len(last))) * rng.uniform(0, 2) * np.stack([limits.speed, limits.acceleration])
+    )
+    if kind == "here, at speed":  # needs a run-up
+        return np.stack([last + rng.normal(size=len(last)) * 1e-3, *rates])
+    if kind == "outward":
+        return np.stack([np.where(last > limits.high, 9.0, -9.0), still, still])
+    if kind == "edge, at speed":
+        return np.stack([np.where(rng.random(len(last)) < 0.5, limits.low, limits.high), *rates])
+    if kind == "broken":
+        bad = rng.choice([np.nan, np.inf, -np.inf, 1e300, 0.0], (3, len(last)))
+        return np.where(rng.random((3, len(last))) < 0.5, bad, last)
+    return np.stack([limits.low + width * rng.uniform(-1, 2, len(last)), *rates])
+
+
+KINDS = ["here, at speed", "outward", "edge, at speed", "broken", "anywhere"]
+
+
+def tormented(law: Law, seed: int, kinds, ticks: int) -> None:
+    rng = np.random.default_rng(seed)
+    law.start(anywhere(rng, law.limits))
+    everybody = np.arange(law.count)
+    hold, reference = 1, None
+    for tick in range(ticks):
+        if tick % hold == 0:
+            hold = int(rng.choice([1, 1, 3, 20]))
+            reference = asked(rng, law.limits, law.last, kinds[rng.integers(len(kinds))])
+        if rng.random() < 0.02:
+            law.restart(rng.random(law.count) < 0.3, anywhere(rng, law.limits))
+        law.tick(reference, everybody[rng.random(law.count) < 0.8])
+
+
+@pytest.mark.parametrize("chase", CHASES)
+@pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
+@pytest.mark.parametrize("name", HEADS)
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
+def test_no_goal_is_refused_and_no_joint_goes_farther_out(name, size, chase, seed, kinds):
+    tormented(Law(size(load_head(name)), chase), seed, kinds, 120)
+
+
+@pytest.mark.parametrize("chase", CHASES)
+@pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
+@pytest.mark.parametrize("name", ["op3_head", "face28"])
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
+def test_every_joint_is_inside_its_range_in_the_stated_time_and_stays(name, size, chase, seed, kinds):
+    law = Law(size(load_head(name)), chase)
+    rng = np.random.default_rng(seed)
+    law.start(anywhere(rng, law.limits))
+    everybody, latest_s = np.arange(law.count), law.due_s.max()
+    before = np.zeros(law.count, bool)
+    for _ in range(int(latest_s / DT_S) + 20):
+        reference = asked(rng, law.limits, law.last, kinds[rng.integers(len(kinds))])
+        inside = law.tick(reference, everybody)
+        assert not (before & ~inside).any()
+        before = inside
+    assert before.all()

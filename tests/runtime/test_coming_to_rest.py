@@ -1,0 +1,211 @@
+"""Whatever is raised, wherever, at whichever tick: the head comes to rest and torque goes off, seen on the wire."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.app.session import build_bus, build_motion
+from sfms_robot.app.wiring import emulated
+from sfms_robot.config import load_head
+from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.errors import BusError, ModelError
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
+from sfms_robot.retarget.life import Life
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.runtime.safety import Interrupt, Released
+from sfms_robot.sources.recording import Recording
+
+HEAD = load_head("interbotix_wxxms")
+RATE_HZ = max(bus.rate_hz for bus in HEAD.buses.values())
+SECONDS = 0.8
+ERRORS = (ModelError, BusError, ValueError, ZeroDivisionError, MemoryError, KeyboardInterrupt, SystemExit)
+PLACES = (
+    "source.read", "feed.push", "feed.poll", "timeline.accept", "timeline.sample", "retargeter.step", "limiter.step",
+    "life.step", "bus.write", "bus.poll", "bus.enable",
+)  # fmt: skip
+
+
+class Turner:
+    """A listener that turns its head to one side and keeps it there."""
+
+    hop = horizon = 4
+
+    def start(self, seed: int) -> int:
+        return 0
+
+    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
+        if memory % self.hop:
+            return None, memory + 1
+        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
+        frames[:, CHANNEL_INDEX["yaw"]] = 0.3
+        return Plan(speaker.time_s, speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1), frames), memory + 1
+
+
+class Raising:
+    """Any part, of which one method raises: at its `first` call, and at `times` calls in all."""
+
+    def __init__(self, part: Any, method: str, error: type[BaseException], first: int, times: int = 1) -> None:
+        self._part, self._method, self._error = part, method, error
+        self._first, self._last, self._calls = first, first + times, 0
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._part, name)
+        return self._counted(found) if name == self._method else found
+
+    def _counted(self, call: Any) -> Any:
+        def called(*arguments: Any) -> Any:
+            self._calls += 1
+            if self._first <= self._calls < self._last:
+                raise self._error(f"{self._method} broke")
+            return call(*arguments)
+
+        return called
+
+
+@pytest.fixture(scope="module")
+def chain() -> Iterator[Chain]:
+    with launch(emulated(HEAD)["main"], virtual=True) as running:
+        yield running
+
+
+class Watcher:
+    """An observer that may raise; keeps the goals."""
+
+    def __init__(self, raises_at: int | None = None) -> None:
+        self.goals: list[Any] = []
+        self._raises_at = raises_at
+
+    def tick(self, seen: Any) -> None:
+        self.goals.append(seen.goals_rad)
+        if len(self.goals) == self._raises_at:
+            raise RuntimeError("a browser tab was closed")
+
+    def heard(self, frame: SpeakerFrame) -> None: ...
+
+    def planned(self, plan: Plan) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def driven(
+    chain: Chain, clock: VirtualClock, place: str = "", error: type[BaseException] = ValueError, first: int = 1,
+    times: int = 1, observer: Watcher | None = None, interrupted: Any = lambda: False,
+) -> tuple[str, RunLog]:  # fmt: skip
+    """One run on a fresh bus, in which `place` raises."""
+    motion = build_motion(HEAD, RATE_HZ)
+    bus = build_bus(HEAD, {"main": chain}, clock)
+    bus.connect()
+    log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
+    parts: dict[str, Any] = {
+        "source": Recording(None, None, SECONDS), "feed": InlineFeed(Turner(), 0, 0.01), "timeline": motion.timeline,
+        "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus, "life": Life(HEAD.life, 0),
+    }  # fmt: skip
+    if place:
+        name, method = place.split(".")
+        parts[name] = Raising(parts[name], method, error, first, times)
+    whole = Parts(**parts, observers=[observer or Watcher()], leads_s=motion.leads_s, rest_rad=motion.rest_rad)
+    try:
+        outcome = drive(whole, clock, log, rate_hz=RATE_HZ, duration_s=SECONDS, interrupted=interrupted)
+    except BaseException as raised:
+        outcome = f"{type(raised).__name__}: {raised}"
+    finally:
+        bus.close()
+    return outcome, log
+
+
+def assert_limp(chain: Chain) -> None:
+    for name, joint in HEAD.joints.items():
+        assert chain.state(joint.id)["torque"] == 0, f"{name} still has torque"
+
+
+def assert_at_rest(chain: Chain) -> None:
+    assert_limp(chain)
+    for name, joint in HEAD.joints.items():
+        assert abs(chain.state(joint.id)["position"] - joint.zero_ticks) <= 4, f"{name} is not at rest"
+
+
+@settings(max_examples=60, deadline=None)
+@given(place=st.sampled_from(PLACES[:-1]), error=st.sampled_from(ERRORS), at=st.integers(1, 70))
+def test_an_exception_at_any_place_of_any_tick_ends_at_rest_without_torque(chain, place, error, at):
+    first = {"source.read": at, "feed.push": 1 + at % 20, "feed.poll": at, "timeline.accept": 1 + at % 5}.get(place, at)
+    outcome, log = driven(chain, VirtualClock(), place, error, first)
+    assert outcome == f"{error.__name__}: {place.split('.')[1]} broke"
+    assert log.audited.violations == 0
+    assert_at_rest(chain)
+
+
+@pytest.mark.parametrize("place", ["limiter.step", "bus.write", "bus.poll"])
+def test_what_raises_for_good_still_leaves_no_torque(chain, place):
+    outcome, _ = driven(chain, VirtualClock(), place, ZeroDivisionError, 20, 10**9)
+    assert outcome.startswith("ZeroDivisionError")
+    assert_limp(chain)
+
+
+def test_a_servo_that_refuses_to_be_enabled_leaves_none_of_them_with_torque(chain):
+    outcome, _ = driven(chain, VirtualClock(), "bus.enable", BusError, 2)
+    assert outcome.startswith("BusError")
+    assert_limp(chain)
+
+
+def test_an_observer_that_raises_is_detached_and_the_run_goes_on(chain, caplog):
+    observer = Watcher(raises_at=5)
+    outcome, log = driven(chain, VirtualClock(), observer=observer)
+    assert outcome == "done" and len(observer.goals) == 5
+    assert log.detached == {"Watcher": "RuntimeError: a browser tab was closed"}
+    assert len([line for line in caplog.messages if "Watcher" in line]) == 1
+    assert_at_rest(chain)
+
+
+def test_asked_to_end_between_two_joints_the_rest_of_them_stay_off(chain):
+    asked = iter([False, True, True, True])
+    outcome, log = driven(chain, VirtualClock(), interrupted=lambda: next(asked))
+    assert outcome == "interrupted" and log.ticks == 0
+    assert_limp(chain)
+
+
+def test_asked_to_end_during_the_last_easing_counts_as_interrupted(chain):
+    watcher = Watcher()
+    outcome, _ = driven(chain, VirtualClock(), observer=watcher, interrupted=lambda: len(watcher.goals) > SECONDS * 100)
+    assert outcome == "interrupted"
+    assert_at_rest(chain)
+
+
+def test_the_second_request_releases_at_once_from_any_thread(chain):
+    clock = VirtualClock()
+    bus = build_bus(HEAD, {"main": chain}, clock)
+    bus.connect()
+    interrupt = Interrupt()
+    interrupt.arm(bus)
+    bus.enable(list(HEAD.joints))
+    interrupt.ask()
+    assert interrupt() and chain.state(1)["torque"] == 1
+    with pytest.raises(Released):
+        interrupt.on_signal(2, None)
+    bus.stop("release")
+    bus.close()
+    assert_limp(chain)
+
+
+def test_before_torque_the_first_request_ends_whatever_goes_on():
+    with pytest.raises(KeyboardInterrupt):
+        Interrupt().on_signal(2, None)
+
+
+def test_coming_to_rest_takes_seconds_not_ticks(chain):
+    """A computer that is late for most of its ticks takes no longer than one that is not."""
+
+    class Slow(VirtualClock):
+        def wait_until(self, time_s: float) -> None:
+            super().wait_until(time_s + 0.07)
+
+    clock = Slow()
+    driven(chain, clock)
+    assert clock.now_s() < SECONDS + 3.0 + 1.0
+    assert_limp(chain)

@@ -1,0 +1,75 @@
+"""What a run measures of itself: counted in blocks as from the whole, and in memory that does not grow."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Plan, SpeakerFrame
+from sfms_robot.runtime.clock import TickTime
+from sfms_robot.runtime.log import EventCounter, RunLog
+from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
+
+RATE_HZ = 100.0
+
+
+def talkative(seconds, seed):
+    """Head pitch, lids and smile with events at random, sampled at the rate of the loop."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0, seconds, 1 / RATE_HZ)
+    pitch, blink, smile = (np.zeros(len(time_s)) for _ in range(3))
+    for start in np.arange(2.0, seconds - 3, 7.3) + rng.uniform(0, 3, len(np.arange(2.0, seconds - 3, 7.3))):
+        inside = (time_s >= start) & (time_s < start + 1.2)
+        pitch[inside] += 0.08 * np.sin(2 * np.pi * 1.7 * (time_s[inside] - start)) ** 2
+    for start in np.arange(1.0, seconds - 1, 3.1):
+        blink += np.exp(-(((time_s - start) / 0.07) ** 2))
+    for start in np.arange(5.0, seconds - 4, 17.0):
+        smile[(time_s >= start) & (time_s < start + 2.0)] = 0.6
+    return pitch, blink, smile
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seconds", [5.0, 27.9, 28.0, 200.0])
+def test_events_counted_in_blocks_are_those_of_the_whole(seconds, seed):
+    for signal, find in zip(talkative(seconds, seed), (find_nods, find_blinks, find_smiles), strict=True):
+        counter = EventCounter(find, RATE_HZ)
+        for value in signal:
+            counter.add(float(value))
+        whole = len(find(signal, RATE_HZ))
+        assert counter.total() == whole and (whole > 0 or seconds < 10)
+
+
+class NoAudit:
+    """The audit's part is not what grows."""
+
+    def start(self, angles_rad):
+        return None
+
+    def step(self, angles_rad, wanted_rad, state):
+        return None
+
+
+def test_a_log_of_hours_is_as_large_as_one_of_minutes():
+    log = RunLog(["a", "b"], 1 / RATE_HZ, NoAudit(), {"nods": find_nods, "blinks": find_blinks})
+    log.start(np.zeros(2))
+    goals, motion = np.zeros(2), np.zeros(MOTION_DIM, np.float32)
+
+    def hear_and_move(first, last):
+        for k in range(first, last):
+            now_s = k / RATE_HZ
+            if k % 4 == 0:
+                log.heard(SpeakerFrame(now_s, np.full(640, 0.1, np.float32)))
+                log.planned(Plan(now_s, np.array([now_s + 0.04]), np.zeros((1, MOTION_DIM), np.float32)))
+            motion[CHANNEL_INDEX["pitch"]] = 0.05 * np.sin(now_s)
+            log.commanded(TickTime(now_s, 0.0, 0), goals, goals, motion)
+            log.wrote(now_s + 0.01, now_s + 0.1)
+
+    hear_and_move(0, 20_000)
+    tracemalloc.start()
+    hear_and_move(20_000, 24_000)
+    before = tracemalloc.get_traced_memory()[0]
+    hear_and_move(24_000, 36_000)
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert grown < 100_000
+    assert log.frame_to_wire_ms.report(p50=50)["p50"] == pytest.approx(10.0, rel=0.02)

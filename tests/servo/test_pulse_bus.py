@@ -1,0 +1,325 @@
+import logging
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from device_port import DevicePort, Time
+
+from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
+from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.servo.boards.maestro_bus import MaestroBus
+from sfms_robot.servo.boards.ssc32_bus import Ssc32Bus
+from sfms_robot.servo.codecs import maestro, ssc32
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.registers import Table
+
+LIMIT_RAD = 0.7
+KINDS = {
+    "maestro-24": (MaestroBus, MaestroBoard),
+    "maestro-6": (MaestroBus, MaestroBoard),
+    "ssc-32": (Ssc32Bus, Ssc32Board),
+}
+
+
+class Pulses:
+    """0 rad is 1500 us; angles outside +-limit give the ticks of the limit."""
+
+    def __init__(self, table, limit_rad=LIMIT_RAD):
+        self.center, self.limit_rad = table.center_ticks, limit_rad
+        self.per_rad = table.ticks_per_revolution / (2 * math.pi)
+
+    def to_ticks(self, angles_rad):
+        return np.rint(self.center + np.clip(angles_rad, -self.limit_rad, self.limit_rad) * self.per_rad).astype(int)
+
+    def to_rad(self, ticks):
+        return (np.asarray(ticks) - self.center) / self.per_rad
+
+
+class Bench:
+    """One board with servos on `channels`, and its bus."""
+
+    def __init__(self, model="maestro-24", channels=(0, 1, 2, 5), baud=115200, limit_rad=LIMIT_RAD, **more):
+        firmware_map = load_firmware_map(model)
+        bus_class, board_class = KINDS[model]
+        table = Table.of(firmware_map)
+        self.clock = Time()
+        self.ports = []
+        rows = [{"id": i, "baud": baud, "start_ticks": table.center_ticks} for i in channels]
+        self.board = board_class(table, rows)
+        self.bus = bus_class(
+            "face",
+            [BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad) for i in channels],
+            Pulses(table, limit_rad),
+            lambda: self.ports.append(DevicePort(self.board, baud, self.clock)) or self.ports[-1],
+            baud,
+            **{"confirmed": True} | more,
+        )
+
+    @property
+    def port(self):
+        return self.ports[-1]
+
+    def hold(self):
+        self.bus.connect()
+        return self.bus.enable(self.bus.joints)
+
+    def ticks(self, goals_rad, n, period_s=0.1):
+        for _ in range(n):
+            self.clock.t += period_s
+            self.bus.write(np.asarray(goals_rad, dtype=float), self.clock.t)
+            readings = self.bus.poll(self.clock.t)
+        return readings
+
+    def sent_since(self, mark):
+        return b"".join(self.port.sent[mark:])
+
+    def pulses(self):
+        return {channel.id: channel.pulse for channel in self.board.servos}
+
+
+@pytest.fixture(params=KINDS)
+def bench(request):
+    return Bench(request.param)
+
+
+def test_enabling_needs_somebody_who_knows(bench):
+    other = Bench(bench.bus.model, confirmed=False)
+    other.bus.connect()
+    before = list(other.port.sent)
+    with pytest.raises(ConfigError, match="report no position and jump to joint0, joint1.*confirm it with --yes"):
+        other.bus.enable(other.bus.joints[:2])
+    assert other.port.sent == before
+
+
+def test_jump_is_said_aloud_once(bench, caplog):
+    with caplog.at_level(logging.WARNING):
+        bench.hold()
+        bench.bus.enable(bench.bus.joints)
+    assert [r.message.count("jumps to its first pose") for r in caplog.records] == [1]
+
+
+def test_channels_come_on_one_at_a_time_at_rest(bench):
+    rest = np.array([0.1, -0.2, 0.3, 0.0])
+    bench = Bench(bench.bus.model, rest_rad=rest)
+    bench.bus.connect()
+    mark = len(bench.port.sent)
+    assert bench.bus.enable(bench.bus.joints) == pytest.approx(rest, abs=0.001)
+    assert len(bench.port.sent) - mark == 4 + 2  # and the board is asked whether it hears, before and after
+    assert max(bench.port.waits) - bench.clock.t == pytest.approx(2 * LIMIT_RAD / 3.5)
+
+
+def test_pulses_that_maestro_sends_already_are_kept_and_cost_no_wait():
+    first = Bench()
+    first.hold()
+    first.ticks([0.3, 0.2, 0.1, -0.4], 2)
+    before = first.pulses()
+    first.bus.stop("hold")
+    first.bus.close()
+    second = Bench(rest_rad=np.full(4, 0.6))
+    second.board = first.board
+    second.bus.connect()
+    waits = len(second.port.waits)
+    assert second.bus.enable(second.bus.joints) == pytest.approx([0.3, 0.2, 0.1, -0.4], abs=0.001)
+    assert second.pulses() == before
+    assert len(second.port.waits) == waits
+
+
+def test_goals_arrive_in_pulses(bench):
+    bench.hold()
+    bench.ticks([0.5, -0.5, 0.25, 0.0], 5)
+    bench.board.advance(bench.clock.t + 1.0)
+    per_rad = bench.bus._conversion.per_rad
+    shafts = [(c.plant.position - bench.board.table.center_ticks) / per_rad for c in bench.board.servos]
+    assert shafts == pytest.approx([0.5, -0.5, 0.25, 0.0], abs=0.001)
+
+
+def test_what_did_not_change_is_sent_in_turn_only(bench):
+    held = bench.hold()
+    bench.ticks(held, 10)
+    mark = len(bench.port.sent)
+    bench.ticks(held, 4, 0.01)
+    assert len(bench.port.sent) - mark == 4
+    channels = [line[1] for line in bench.port.sent[mark:]]
+    assert sorted(channels) == sorted(b"0125" if bench.bus.model == "ssc-32" else [0, 1, 2, 5])
+
+
+def test_maestro_takes_neighbours_in_one_command_where_it_can():
+    large, small = Bench("maestro-24"), Bench("maestro-6")
+    for bench in (large, small):
+        bench.hold()
+        bench.ticks([0.5, -0.5, 0.25, 0.1], 1)
+    assert large.port.sent[-1][:3] == bytes([maestro.SET_TARGETS, 3, 0])
+    assert [small.port.sent[-1][i] for i in range(0, 16, 4)] == [maestro.SET_TARGET] * 4
+
+
+def test_slow_wire_carries_the_newest_goals_and_never_piles_up():
+    bench = Bench("ssc-32", channels=range(24), baud=9600)
+    bench.hold()
+    bench.clock.t = 10.0
+    mark, start_s = len(bench.port.sent), bench.clock.t
+    goals = np.zeros(24)
+    for k in range(300):
+        goals = np.full(24, 0.6 * math.sin(k / 20))
+        bench.ticks(goals, 1, 0.01)
+    for _ in range(2):
+        bench.clock.t += 0.5
+        bench.bus.poll(bench.clock.t)
+    assert len(bench.sent_since(mark)) * 10 / 9600 <= bench.clock.t - start_s
+    counts = bench.bus.statistics()
+    assert counts["deferred"] > 250 and 8 < counts["writes"] < 40
+    last = bench.bus._conversion.to_ticks(goals)
+    bench.board.advance(bench.clock.t + 1.0)
+    assert list(bench.pulses().values()) == list(last)
+
+
+def test_ssc32_draws_lines_between_slow_goals():
+    bench = Bench("ssc-32")
+    held = bench.hold()
+    bench.ticks(held, 1, 5.0)
+    bench.ticks(held + 0.2, 1, 0.2)
+    assert b"T200\r" in bench.port.sent[-1]
+    bench.ticks(held + 0.3, 1, 0.01)
+    assert b"T" not in bench.port.sent[-1]
+
+
+def test_release_ends_the_pulses_and_hold_keeps_them(bench):
+    bench.hold()
+    kept = bench.pulses()
+    bench.bus.stop("hold")
+    assert bench.pulses() == kept
+    bench.bus.stop("release")
+    assert set(bench.pulses().values()) == {0}
+    with pytest.raises(ValueError, match="no joint is enabled"):
+        bench.bus.write(np.zeros(4), 0.0)
+
+
+def test_maestro_errors_become_faults_and_goals_are_sent_anew():
+    bench = Bench()
+    held = bench.hold()
+    bench.ticks(held, 3)
+    bench.board.fail(maestro.TIMEOUT_ERROR, bench.clock.t)
+    assert set(bench.pulses().values()) == {0}
+    assert {r.fault for r in bench.ticks(held, 11).values()} == {"serial timeout"}
+    assert 0 not in bench.pulses().values()
+    assert {r.fault for r in bench.ticks(held, 11).values()} == {None}
+    assert bench.bus.statistics()["faults"] == ["face: serial timeout"]
+
+
+def test_damaged_bytes_are_counted_and_blame_no_joint():
+    bench = Bench()
+    held = bench.hold()
+    bench.ticks(held, 3)
+    bench.board.receive(b"\xb0", 115200, bench.clock.t)
+    assert {r.fault for r in bench.ticks(held, 11).values()} == {None}
+    counts = bench.bus.statistics()
+    assert counts["faults"] == ["face: serial protocol"] and counts["errors"] == 1
+
+
+def test_silent_board_gets_no_goals_and_is_taken_back(bench):
+    held = bench.hold()
+    bench.ticks(held, 1)
+    for channel in bench.board.servos:
+        channel.dead = True
+    silent = bench.ticks(held, 40)
+    assert {r.fault for r in silent.values()} == {"no answer"}
+    assert bench.bus.statistics()["silent"] == [0, 1, 2, 5]
+    mark = len(bench.port.sent)
+    bench.ticks(held + 0.1, 5)
+    assert not any(b"P" in line or line[0] in (0x84, 0x9F) for line in bench.port.sent[mark:])
+    for channel in bench.board.servos:
+        channel.dead = False
+    assert {r.fault for r in bench.ticks(held, 11).values()} == {None}
+    after = bench.bus.statistics()
+    assert after["silent"] == [] and after["reconnects"] == 1
+    bench.ticks(held + 0.1, 5)
+    assert list(bench.pulses().values()) == list(bench.bus._conversion.to_ticks(held + 0.1))
+
+
+def test_channels_that_lost_their_supply_come_on_again_one_at_a_time():
+    bench = Bench()
+    held = bench.hold()
+    bench.ticks(held, 1)
+    for channel in bench.board.servos:
+        channel.dead = True
+    bench.ticks(held, 50)
+    bench.board.restart(bench.clock.t)
+    for channel in bench.board.servos:
+        channel.dead = False
+    lit = []
+    for _ in range(60):
+        readings = bench.ticks(held + 0.1, 1)
+        dark = [r.fault == "torque lost" for r in readings.values()]
+        lit.append(4 - list(bench.pulses().values()).count(0))
+        if bench.bus.statistics()["silent"] == []:
+            assert dark.count(True) <= 4 - lit[-1]
+    assert sorted(set(lit)) == [0, 1, 2, 3, 4] and lit == sorted(lit)
+    assert lit.count(2) >= 4  # 1.4 rad at 3.5 rad/s
+    assert {r.fault for r in readings.values()} == {None}
+    assert list(bench.pulses().values()) == list(bench.bus._conversion.to_ticks(held + 0.1))
+
+
+def test_asking_the_board_blocks_nobody(bench):
+    held = bench.hold()
+    for channel in bench.board.servos:
+        channel.dead = True
+    waits = len(bench.port.waits)
+    for _ in range(400):
+        bench.ticks(held, 1, 0.01)
+        assert all(deadline_s <= bench.clock.t for deadline_s in bench.port.waits[waits:])
+        waits = len(bench.port.waits)
+
+
+def test_joint_that_must_hold_keeps_its_pulses_when_the_others_are_released(bench):
+    servos = bench.bus._servos
+    stiff = [replace(servos[0], safety=Safety(stop="hold")), *servos[1:]]
+    bus = type(bench.bus)("face", stiff, bench.bus._conversion, bench.bus._open_port, 115200, confirmed=True)
+    bus.connect()
+    bus.enable(bus.joints)
+    bus.stop("release")
+    assert [pulse != 0 for pulse in bench.pulses().values()] == [True, False, False, False]
+
+
+def test_absent_board_is_named(bench):
+    for channel in bench.board.servos:
+        channel.dead = True
+    with pytest.raises(BusError, match=rf"bus 'face' on emulated at 115200 baud: no {bench.bus.model} answers"):
+        bench.bus.connect()
+    assert bench.port.closed
+
+
+def test_channel_that_the_board_does_not_have_is_refused():
+    with pytest.raises(ConfigError, match=r"joints.joint9.id = 9 is no channel of a maestro-6 \(0..5\)"):
+        Bench("maestro-6", channels=[0, 9])
+
+
+def test_range_beyond_what_the_board_makes_is_refused():
+    with pytest.raises(ConfigError, match=r"a ssc-32 does not make the pulses of joint0 \(\d+..\d+ us"):
+        Bench("ssc-32", channels=[0], limit_rad=1.6)
+
+
+def test_range_beyond_the_factory_limits_of_a_maestro_is_said(caplog):
+    with caplog.at_level(logging.WARNING):
+        Bench("maestro-24", channels=[0], limit_rad=1.2)
+    assert "set wider limits in the Maestro itself" in caplog.text
+
+
+def test_two_boards_on_one_bus_are_refused():
+    six, all_ = load_firmware_map("maestro-6"), load_firmware_map("maestro-24")
+    servos = [BusServo("a", 0, six, -0.1, 0.1), BusServo("b", 1, all_, -0.1, 0.1)]
+    with pytest.raises(ConfigError, match="one board is one model, the head says maestro-6 and maestro-24"):
+        MaestroBus("face", servos, Pulses(Table.of(six)), lambda: DevicePort(None, 1, Time()), 115200)
+
+
+def test_noise_that_comes_back_is_no_answer():
+    assert ssc32.DONE != b"?"
+
+    class Babble:
+        def receive(self, data, baud, now_s):
+            return b"?"
+
+    bench = Bench("ssc-32")
+    bench.board = Babble()
+    with pytest.raises(BusError, match="no ssc-32 answers"):
+        bench.bus.connect()
