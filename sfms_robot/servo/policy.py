@@ -8,7 +8,7 @@ outside a threshold of the head's own.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -24,10 +24,7 @@ SAID_EVERY_S: Final = 10.0
 
 @dataclass(frozen=True)
 class BusServo:
-    """One servo of a bus and the joint it moves; the limits are those of the joint.
-
-    `stored`: EEPROM values, such as a homing offset, that zero and direction of the joint were written for.
-    """
+    """One servo of a bus and the joint it moves; the limits are those of the joint."""
 
     joint: str
     id: int
@@ -35,7 +32,6 @@ class BusServo:
     min_rad: float
     max_rad: float
     safety: Safety = field(default_factory=Safety)
-    stored: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -79,15 +79,9 @@ def test_wrong_model_is_named(make_rig):
             rig.bus.connect()
 
 
-def test_absent_servo_is_named_with_those_that_answer(make_rig):
-    with make_rig([EmulatedServo(1), EmulatedServo(2)], expected=[1, 7, 2]) as rig:
-        with pytest.raises(BusError, match=r"1000000 baud: no answer from id 7 \(joint7\); ids that answer: 1, 2"):
-            rig.bus.connect()
-
-
 def test_other_baud_is_silence(make_rig):
     with make_rig([EmulatedServo(1, baud=57600)]) as rig:
-        with pytest.raises(BusError, match="ids that answer: none"):
+        with pytest.raises(BusError, match=r"no answer from id 1 \(joint1\)"):
             rig.bus.connect()
     with make_rig([EmulatedServo(1, baud=57600)], baud=57600) as rig:
         rig.bus.connect()

@@ -105,15 +105,9 @@ def test_wrong_model_is_named():
         rig.bus.connect()
 
 
-def test_absent_servo_is_named_with_those_that_answer(model):
-    rig = rig_of(model, starts(model, 0, 0), expected=[1, 7, 2])
-    with pytest.raises(BusError, match=r"1000000 baud: no answer from id 7 \(joint7\); ids that answer: 1, 2"):
-        rig.bus.connect()
-
-
 def test_other_baud_is_silence(model):
     rig = rig_of(model, starts(model, 0), servo_baud=57600)
-    with pytest.raises(BusError, match="ids that answer: none"):
+    with pytest.raises(BusError, match=r"no answer from id 1 \(joint1\)"):
         rig.bus.connect()
     rig_of(model, starts(model, 0), baud=57600).bus.connect()
 
@@ -235,7 +229,7 @@ def test_late_answers_are_never_taken_for_fresh_ones(rig):
         goals = held + 0.02 * (round_ + 1)
         readings = rig.ticks(goals, 1)
         for i, reading in enumerate(readings.values()):
-            if reading.age_s == 0.0:
+            if reading.age_s == 0.0 and not reading.rejoined:  # which tells the goal it holds
                 there = rig.servo(i + 1).plant.position
                 assert reading.position_rad == pytest.approx(
                     (there - rig.conversion.center) * tick_rad(rig), abs=tick_rad(rig)
