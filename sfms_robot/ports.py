@@ -5,7 +5,7 @@ Concrete parts are put together in `app`; everything that runs in time takes `no
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -121,8 +121,8 @@ class Bus(Protocol):
         """Send torque-off now, unconfirmed: one packet per wire, to this head's ids alone; pulses off on boards.
 
         May be called from any thread at any time after `connect`, also while another one is inside `poll`. Never
-        raises, never waits for an answer. With the policy "hold" nothing is sent. Does not refuse later goals: `stop`
-        does.
+        raises, never waits for an answer. No goal is sent from then on, until `enable`. With the policy "hold" nothing
+        happens.
         """
 
     def stop(self, policy: StopPolicy) -> None:
@@ -186,14 +186,27 @@ class Timeline(Protocol):
     def sample(self, times_s: Doubles, now_s: float, state: Any) -> tuple[Floats, Any]:
         """Motion (N, 58) at each of (N,) instants, and the state with what was counted."""
 
+    def lead_limit_s(self, state: Any) -> float:
+        """How far after a tick [s] `sample` may be asked for; inf where the whole future is known."""
+
 
 class Life(Protocol):
     """What the head does of itself, on top of the face that was asked for. State is a value."""
 
     def start(self) -> Any: ...
 
-    def step(self, motion: Floats, times_s: Doubles, now_s: float, state: Any) -> tuple[Floats, Any]:
-        """Motion (N, 58) at (N,) instants, row 0 at `now_s`; never changes its input."""
+    def step(
+        self,
+        motion: Floats,
+        times_s: Doubles,
+        now_s: float,
+        state: Any,
+        shown_pose: Callable[[Floats], Doubles] | None = None,
+    ) -> tuple[Floats, Any]:
+        """Motion (N, 58) at (N,) instants, row 0 at `now_s`; never changes its input.
+
+        `shown_pose`: see `Retargeter`, with the knobs of this tick; None: the neck shows the pose that is asked.
+        """
 
 
 class Retargeter(Protocol):
@@ -209,6 +222,9 @@ class Retargeter(Protocol):
 
         `knobs` None: those of the head's file.
         """
+
+    def shown_pose(self, motion: Floats, knobs: Any = None) -> Doubles:
+        """Motion (N, 58) -> the pose (N, 6) that the neck shows, as far as the knobs and its range let it."""
 
 
 class Limiter(Protocol):

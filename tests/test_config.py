@@ -64,7 +64,10 @@ WRONG = {
     ),
     "no speed": (("limits", "slow", "speed_deg_s", 0), ["limits.slow.speed_deg_s = 0", "greater than 0"]),
     "key missing": (("joints", "jaw", "id", "DELETE"), ["joints.jaw.id", "required"]),
-    "unknown family": (("buses", "main", "family", "dynamixle"), ["buses.main.family = 'dynamixle'", "'dynamixel2'"]),
+    "unknown family": (
+        ("buses", "main", "family", "dynamixle"),
+        ["buses.main.family = 'dynamixle'", "(dynamixel2, dynamixel1,"],
+    ),
     "two kinds": (
         ("joints", "jaw", "drive", {"sum": ["jawOpen"], "max": ["jawOpen"]}),
         ["joints.jaw.drive", "sum, max"],

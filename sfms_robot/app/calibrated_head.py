@@ -17,12 +17,12 @@ from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)
 
-BOARDS: Final = ("maestro", "ssc32")
 _REVERSED: Final = 1  # bit of the drive mode: which way ticks run
 
 
@@ -66,7 +66,7 @@ def identify(
     servos: dict[str, Identity | None] = {}
     for name, bus in head.buses.items():
         mine = [joint for joint in joints if head.joints[joint].bus == name]
-        if bus.family in BOARDS:
+        if family_named(bus.family).board:
             servos |= {j: Identity(id=head.joints[j].id, model=head.joints[j].model) for j in mine}
         elif mine:
             port = port_of(where[name], bus, clock)()

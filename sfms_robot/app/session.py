@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -48,6 +47,7 @@ from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, writ
 from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 from sfms_robot.sources.registry import open_source
@@ -58,15 +58,6 @@ SIM_READ_DEADLINE_S: Final = 0.02  # an emulator shares the computer's cores: it
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 INTERRUPTED: Final = 130
 EVENTS: Final = {"nods": find_nods, "blinks": find_blinks, "smiles": find_smiles}
-# The class of each bus family; only those of the head are imported.
-FAMILIES = {
-    "dynamixel2": "sfms_robot.servo.chain.dynamixel2_bus:DynamixelBus",
-    "dynamixel1": "sfms_robot.servo.chain.dynamixel1_bus:Dynamixel1Bus",
-    "feetech": "sfms_robot.servo.chain.feetech_bus:FeetechBus",
-    "maestro": "sfms_robot.servo.boards.maestro_bus:MaestroBus",
-    "ssc32": "sfms_robot.servo.boards.ssc32_bus:Ssc32Bus",
-}
-BOARDS = ("maestro", "ssc32")
 
 
 # --- a head and its servos ------------------------------------------------------------------------------------------
@@ -199,7 +190,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
 
 def on_boards(head: Head) -> list[str]:
     """Joints whose servos report no position, so that they jump when they come on."""
-    return [name for name, joint in head.joints.items() if head.buses[joint.bus].family in BOARDS]
+    return [name for name, joint in head.joints.items() if family_named(head.buses[joint.bus].family).board]
 
 
 def build_bus(head: Head, opened: Opened, clock: Clock, *, confirmed: bool = False, without: Sequence[str] = ()) -> Bus:
@@ -225,17 +216,16 @@ def _build_one(
     servos = [
         BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
     ]
-    if config.family in BOARDS:
+    family = family_named(config.family)
+    if family.board:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])
         more: dict[str, Any] = {"confirmed": confirmed or isinstance(where, Chain), "rest_rad": rest_rad}
     else:
         more = {"faults": head.faults}
-    module, kind = FAMILIES[config.family].split(":")
-    build = getattr(import_module(module), kind)
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, SIM_READ_DEADLINE_S)
-    bus: Bus = build(
+    bus: Bus = family.bus_class()(
         name,
         servos,
         calibration_of(joints),

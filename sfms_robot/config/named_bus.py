@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import entry_points
 from typing import Annotated, Final, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, Field, WithJsonSchema
 
 from sfms_robot.config.base import Model, Positive
 
-BusFamily = Literal["dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"]
+BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
+BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
 FORMER_FAMILIES: Final[Mapping[str, str]] = {"dynamixel": "dynamixel2"}  # as 0.1.0 called them
 HIGHEST_RATE_HZ: Final = 1000.0
 
@@ -17,6 +19,16 @@ HIGHEST_RATE_HZ: Final = 1000.0
 # it sends what changed, when its wire is free.
 _GOAL_BYTES: Final[Mapping[str, tuple[int, int]]] = {"dynamixel2": (14, 5), "dynamixel1": (8, 3), "feetech": (8, 3)}
 _BITS: Final = 10  # of a byte on the wire: start, eight, stop
+
+
+def _family(name: str) -> str:
+    name = FORMER_FAMILIES.get(name, name)
+    if name in BUS_FAMILIES:
+        return name
+    known = [*BUS_FAMILIES, *(entry.name for entry in entry_points(group=BUS_GROUP))]
+    if name not in known:
+        raise ValueError(f"is not a family of buses ({', '.join(known)})")
+    return name
 
 
 class Bus(Model):
@@ -28,7 +40,7 @@ class Bus(Model):
     a half-duplex RS-485 driver, the program by the RTS line (rts) or the driver (kernel); none for adapters that do.
     """
 
-    family: Annotated[BusFamily, BeforeValidator(lambda name: FORMER_FAMILIES.get(str(name), name))]
+    family: Annotated[str, AfterValidator(_family), WithJsonSchema({"enum": list(BUS_FAMILIES)})]
     baud: Annotated[int, Field(gt=0)]
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
     read_deadline_ms: Annotated[float, Field(gt=0, le=100)] = 3.0

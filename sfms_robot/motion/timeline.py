@@ -18,6 +18,10 @@ blinks by maximum. What was played already (leads included), and the piece of cu
 were: a late plan bends the future, it never makes the present jump. Past the last frame the curve goes on for
 one frame at most, then holds. A plan that comes too late for all its frames is still where the face goes next.
 When no plan came for half a second the face eases to neutral.
+
+A lead asks for the future of the plan in force, and there is no more of that than plans bring: how much is left when
+the next one comes is measured, and leads are cut to it (`lead_limit_s`). The limit follows slowly, so that time
+neither jumps nor stands still.
 """
 
 from __future__ import annotations
@@ -36,6 +40,8 @@ STALL_S = 0.5  # without a plan for this long, ease to neutral
 EASE_S = 1.0
 HISTORY = 8  # frames kept before the one in play
 JAW_FULL_OPEN_RAD = math.radians(25.0)  # jaw pitch that stands for jawOpen = 1
+LEAD_S = 0.25  # the limit of a lead before anything is measured
+FALL, RISE = 0.25, 0.02  # how fast the limit follows, seconds a second: it stays with the shortest that was left
 _EVEN = 1e-3  # frames count as evenly spaced within this share of a frame
 _FARTHEST = 1e6  # m or rad
 _BLINKS = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
@@ -94,6 +100,10 @@ class TimelineState:
         eased: samples on the way to neutral, or there, because no plan came.
         late: plans whose frames were all in the past.
         refused: plans thrown away: not finite, or older than the one before.
+        now_s: of the last tick.
+        until_s: last time of the plan in force.
+        left_s: how much of the plan in force was left at the last tick before a newer one came.
+        lead_limit_s: follows `left_s`, never below 0.
     """
 
     curve: Curve | None = None
@@ -102,6 +112,10 @@ class TimelineState:
     eased: int = 0
     late: int = 0
     refused: int = 0
+    now_s: float = -math.inf
+    until_s: float = -math.inf
+    left_s: float = LEAD_S
+    lead_limit_s: float = LEAD_S
 
 
 def horizon_left_s(horizon: int, hop: int, latency_s: float) -> float:
@@ -151,14 +165,20 @@ class PlanTimeline:
                 frames[i] = _blend(_motion(old, times_s[i : i + 1])[0], frames[i], (i + 1) / (BLEND_FRAMES + 1))
         knots = _joined(past, times_s, frames, step_s, played_s)
         curve = _curve(knots, plan.made_at_s, delay_s)
-        return replace(state, curve=curve, played_s=played_s, late=state.late + late)
+        left_s = state.left_s if old is None else min(state.until_s + old.delay_s - state.now_s, LEAD_S)
+        until_s = float(plan.times_s[-1])
+        return replace(state, curve=curve, played_s=played_s, late=state.late + late, until_s=until_s, left_s=left_s)
+
+    def lead_limit_s(self, state: TimelineState) -> float:
+        """Longest time after a tick [s] for which `sample` may be asked without running past the plan in force."""
+        return state.lead_limit_s
 
     def sample(self, times_s: Doubles, now_s: float, state: TimelineState) -> tuple[Floats, TimelineState]:
         """Motion (N, 58) at (N,) instants, in any order; neutral before the first plan.
 
         `now_s` is the time of the tick; instants after it are leads.
         """
-        curve = state.curve
+        state, curve = _ticked(now_s, state), state.curve
         played_s = max(state.played_s, float(times_s.max()) - (curve.delay_s if curve else 0.0))
         if curve is None:
             return np.zeros((len(times_s), MOTION_DIM), np.float32), replace(state, played_s=played_s)
@@ -182,6 +202,13 @@ class PlanTimeline:
         near = np.abs(times_s[frame] - asked_s) <= self._widening_s
         blinks: Doubles = curve.knots.values[frame, _BLINKS]
         return blinks * (near & (nearest >= 0) & (asked_s - curve.made_at_s < STALL_S))[:, None]
+
+
+def _ticked(now_s: float, state: TimelineState) -> TimelineState:
+    """The state at the next tick, its limit of leads a little nearer to what is left of plans."""
+    dt_s = max(now_s - state.now_s, 0.0) if math.isfinite(state.now_s) else 0.0
+    limit_s = min(max(state.left_s, state.lead_limit_s - FALL * dt_s), state.lead_limit_s + RISE * dt_s)
+    return replace(state, now_s=now_s, lead_limit_s=max(limit_s, 0.0))
 
 
 def _distinct(times_s: Doubles) -> tuple[Doubles, NDArray[np.intp]]:

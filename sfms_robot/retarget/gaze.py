@@ -1,11 +1,12 @@
 """Eyes that hold a point while the head moves, and jump to the next.
 
 What is held is a direction in space: eye + neck_gain x head. While it is held, every degree that the head turns is
-taken back by the eyes (the vestibulo-ocular reflex), so that a nod does not shake the gaze. The eyes follow the
-listener only when its gaze has really gone elsewhere: when both its eyes and its direction in space have left the
-dead zone, for a moment. Then they jump, with the duration a human eye takes, and hold again. (Eyes alone would jump at
-every nod of a listener that already turns them against the head; the direction in space alone, at every nod of one that
-does not.) Eyes that compensating has turned too far from where the listener has them jump back.
+taken back by the eyes (the vestibulo-ocular reflex), so that a nod does not shake the gaze. The head is the one that
+the neck will show, not the one asked for: what intensity or range takes away, the eyes need not take back. The eyes
+follow the listener only when its gaze has really gone elsewhere: when both its eyes and its direction in space have
+left the dead zone, for a moment. Then they jump, with the duration a human eye takes, and hold again. (Eyes alone would
+jump at every nod of a listener that already turns them against the head; the direction in space alone, at every nod of
+one that does not.) Eyes that compensating has turned too far from where the listener has them jump back.
 
 Lids need no rule: their drives follow eyeLookUp and eyeLookDown, which are written here.
 
@@ -15,6 +16,7 @@ A jump begins at the latest instant of the tick in which it is decided, so that 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +25,7 @@ from sfms_robot.config import Gaze
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
 from sfms_robot.retarget.eyes import Jump, directions, turn
 
+ShownPose = Callable[[Floats], Doubles]  # motion (N, 58) -> the pose (N, 6) that the neck will show
 _HEAD = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
 
 
@@ -52,17 +55,31 @@ class GazeHold:
         self._pause_s = config.pause_ms / 1e3
         self.full_rad = np.radians([config.full_yaw_deg, config.full_pitch_deg])
 
-    def step(self, motion: Floats, times_s: Doubles, state: GazeState | None) -> tuple[Floats, GazeState]:
-        """Motion (N, 58) at (N,) instants, with other eyes; None begins by holding what is looked at."""
+    def step(
+        self, motion: Floats, times_s: Doubles, state: GazeState | None, shown_pose: ShownPose | None = None
+    ) -> tuple[Floats, GazeState]:
+        """Motion (N, 58) at (N,) instants, with other eyes; `state` None begins by holding what is looked at.
+
+        `shown_pose` None: the neck shows the very pose that is asked.
+        """
         both_rad = directions(motion, self.full_rad)  # (N, eye, axis)
         eyes_rad = 0.5 * (both_rad[:, 0] + both_rad[:, 1])
-        head_rad = self._gain * motion.take(_HEAD, axis=-1).astype(np.float64)
+        head_rad = self._head(motion, times_s, shown_pose)
         last = int(np.argmax(times_s))
         state = self._decided(eyes_rad[last], head_rad[last], times_s, state)
         apart_rad = both_rad - eyes_rad[:, None]  # vergence stays the listener's
         out = motion.copy()
         turn(out, (state.jump.at(times_s) - head_rad)[:, None] + apart_rad, self.full_rad)
         return out, state
+
+    def _head(self, motion: Floats, times_s: Doubles, shown_pose: ShownPose | None) -> Doubles:
+        """Yaw and pitch (N, 2) that the eyes take back. Joints share their leads, so each instant is solved once."""
+        if shown_pose is None or self._gain == 0:
+            pose: Floats | Doubles = motion
+        else:
+            _, first, which = np.unique(times_s, return_index=True, return_inverse=True)
+            pose = shown_pose(motion[first])[which]
+        return self._gain * pose.take(_HEAD, axis=-1).astype(np.float64)
 
     def _decided(self, eyes_rad: Doubles, head_rad: Doubles, times_s: Doubles, state: GazeState | None) -> GazeState:
         """The state after hearing where the listener looks at the latest of the instants."""

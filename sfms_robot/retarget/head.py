@@ -17,6 +17,7 @@ from sfms_robot.config import Head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Doubles, Floats
 from sfms_robot.retarget.kinematics import build_neck
+from sfms_robot.retarget.kinematics.serial import EXACT_RAD
 from sfms_robot.retarget.mapping import Knobs, Mapping
 
 _POSE = len(POSE_CHANNELS)
@@ -78,11 +79,30 @@ class HeadRetargeter:
             angles[..., self.neck_columns] = self.neck.solve(self._pose(motion, knobs)).angles_rad
         return angles
 
+    def shown_pose(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
+        """Motion (..., 58) -> the poses (..., 6) that the neck shows: after the knobs, as far as its joints go.
+
+        Turns only are followed: shifts come back as they were asked. Without kinematics a channel that no joint
+        follows is 0. Raises ValueError where a pose is not finite.
+        """
+        if self.neck is None:
+            blind = [name in self.blind_channels for name in POSE_CHANNELS]
+            return np.where(blind, 0.0, motion[..., :_POSE].astype(np.float64))
+        poses = self._turned(motion[..., :_POSE].astype(np.float64), knobs)
+        solved = self.neck.solve(poses)
+        short = solved.residual_rad > EXACT_RAD
+        if short.any():
+            poses[short, :3] = self.neck.forward(solved.angles_rad[short], poses[short])[..., :3]
+        return poses
+
     def _pose(self, motion: Floats, knobs: Knobs | None) -> Doubles:
         first = self.neck_columns[0]
         row = motion if motion.ndim == 1 else motion[..., first, :]
-        knobs = knobs or self._knobs
-        pose: Doubles = row[..., :_POSE].astype(np.float64)
+        return self._turned(row[..., :_POSE].astype(np.float64), knobs)
+
+    def _turned(self, pose: Doubles, knobs: Knobs | None) -> Doubles:
+        """Poses (..., 6), changed in place, as the knobs of the neck's region have them."""
+        first, knobs = self.neck_columns[0], knobs or self._knobs
         if knobs.style[first] != 1.0:  # the same law as of the mapping's joints, over the pose
             pose *= 1.0 + (knobs.style[first] - 1.0) * (1.0 - np.minimum(np.abs(pose) / _LARGE, 1.0))
         pose *= knobs.intensity[first]

@@ -13,7 +13,7 @@ import numpy as np
 from sfms_robot.config import Gaze
 from sfms_robot.config import Life as LifeConfig
 from sfms_robot.frames import Doubles, Floats
-from sfms_robot.retarget.gaze import GazeHold, GazeState
+from sfms_robot.retarget.gaze import GazeHold, GazeState, ShownPose
 from sfms_robot.retarget.idle import IdleMotion, IdleState
 
 
@@ -37,14 +37,24 @@ class Life:
     def start(self) -> LifeState:
         return LifeState()
 
-    def step(self, motion: Floats, times_s: Doubles, now_s: float, state: LifeState) -> tuple[Floats, LifeState]:
-        """Motion (N, 58) asked for at (N,) instants, row 0 at `now_s` -> the same, alive. Never changes its input."""
+    def step(
+        self,
+        motion: Floats,
+        times_s: Doubles,
+        now_s: float,
+        state: LifeState,
+        shown_pose: ShownPose | None = None,
+    ) -> tuple[Floats, LifeState]:
+        """Motion (N, 58) asked for at (N,) instants, row 0 at `now_s` -> the same, alive. Never changes its input.
+
+        `shown_pose`: motion (N, 58) -> the pose (N, 6) that the neck will show; None: the one that is asked.
+        """
         gaze, idle = state.gaze, state.idle
         if self._idle:
             idle = self._idle.watch(motion, times_s, now_s, idle)
             motion = self._idle.sway(motion, times_s, idle)
         if self._gaze:
-            motion, gaze = self._gaze.step(motion, times_s, gaze)
+            motion, gaze = self._gaze.step(motion, times_s, gaze, shown_pose)
         if self._idle and idle:
             motion = self._idle.look(motion, times_s, idle)
         return motion, LifeState(gaze, idle)

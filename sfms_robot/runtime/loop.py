@@ -4,14 +4,15 @@
 
 One tick every 1/rate_hz s on absolute deadlines. What changes while it runs is a `State` handed from step to step. It
 is kept as soon as the limiter has decided, so whatever is raised after that, and wherever, the way to rest begins at
-the last command. The reference of a tick is the face at (tick time + lead of the joint); speed and acceleration are
-central differences, so one sample lies one tick ahead.
+the last command. The reference of a tick is the face at (tick time + lead of the joint, as far as the plan in force
+goes); speed and acceleration are central differences, so one sample lies one tick ahead.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -161,14 +162,15 @@ class Command:
 
 def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tuple[State, Command]:
     """The face of this instant, each joint ahead by its lead, as goals inside the limits."""
-    times_s = np.concatenate([[now_s], now_s + parts.leads_s + period_s])
+    ahead_s = np.minimum(parts.leads_s + period_s, parts.timeline.lead_limit_s(state.timeline))
+    times_s = np.concatenate([[now_s], now_s + ahead_s])
     motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
     if parts.overlay:
         motion = parts.overlay(motion, times_s)
-    life = state.life
+    life, knobs = state.life, parts.knobs() if parts.knobs else None
     if parts.life:
-        motion, life = parts.life.step(motion, times_s, now_s, life)
-    knobs = parts.knobs() if parts.knobs else None
+        shown_pose = partial(parts.retargeter.shown_pose, knobs=knobs)
+        motion, life = parts.life.step(motion, times_s, now_s, life, shown_pose)
     angles_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
     eased = smooth((now_s + period_s - state.since_s) / EASE_S)
     ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)

@@ -3,22 +3,33 @@
 Where time is real and there are several, each has its own writer thread and rate, so that one at 9600 baud does not
 hold up the others. In virtual time they take their turns, and a run is the same every time.
 
+A bus that has failed is said once, by `poll`, and left out from then on: the others go on. Torque off reaches all.
+
 Goals are limited once, at the rate of the loop, and a slower bus sends every k-th of them. Those keep the limits at its
 own rate as well: finite differences of a curve are averages of its derivatives, however far apart the samples lie.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.errors import RobotError
+from sfms_robot.errors import BusError, PortError, RobotError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import Bus, StopPolicy
 from sfms_robot.servo.writer import Writer
+
+log = logging.getLogger(__name__)
+
+STOP_S: Final = 0.5  # that `stop` takes at most where each bus has a thread
+_TICK_S: Final = 0.1  # that a writer is given for the tick it is in
+FAILED: Final = "bus failed"
 
 
 class CompositeBus:
@@ -40,6 +51,9 @@ class CompositeBus:
         self._buses = dict(buses)
         self._rates_hz = rates_hz
         self._writers: dict[str, Writer] = {}
+        self._failures: dict[str, Exception] = {}  # by bus; said once
+        self._unsaid: list[str] = []
+        self._last: dict[str, Mapping[str, Reading]] = {}
         place = {joint: i for i, joint in enumerate(joints)}
         self._places = {name: np.array([place[j] for j in bus.joints], np.intp) for name, bus in buses.items()}
 
@@ -49,6 +63,8 @@ class CompositeBus:
 
     def connect(self) -> None:
         """Connect all; when one fails, those already open are closed again."""
+        self._failures.clear()
+        self._unsaid.clear()
         try:
             for bus in self._buses.values():
                 bus.connect()
@@ -57,6 +73,7 @@ class CompositeBus:
             raise
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+        """As `ports.Bus`; one bus after the other, for supplies that dislike many at once."""
         held: dict[str, float] = {}
         for bus in self._buses.values():
             mine = [joint for joint in joints if joint in bus.joints]
@@ -65,43 +82,84 @@ class CompositeBus:
         return np.array([held[joint] for joint in joints])
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
-        """As a single bus; what a bus in a thread refuses is raised by the next call."""
+        """As a single bus, to all that work. A ValueError of a bus in a thread is raised by the next call."""
         if not np.isfinite(goals_rad).all():
             raise ValueError(f"goal of {self.joints[int(np.argmin(np.isfinite(goals_rad)))]} is not finite")
-        for name, bus in self._buses.items():
+        refused: ValueError | None = None
+        for name, bus in self._working():
             goals = goals_rad[self._places[name]]
-            if self._rates_hz is None:
-                bus.write(goals, now_s)
-            else:
-                if name not in self._writers:
-                    self._writers[name] = Writer(bus, self._rates_hz[name])
-                self._writers[name].put(goals, now_s)
+            try:
+                if self._rates_hz is None:
+                    bus.write(goals, now_s)
+                else:
+                    self._writer(name, bus).put(goals, now_s)
+                    self._writers[name].raise_failure()
+            except (BusError, PortError) as error:
+                self._fail(name, error)
+            except ValueError as error:  # the others have theirs all the same
+                refused = refused or error
+        if refused is not None:
+            raise refused
 
     def poll(self, now_s: float) -> Mapping[str, Reading]:
+        """As a single bus. Raises BusError once for a bus that has failed; the next call goes on with the others."""
         readings: dict[str, Reading] = {}
         for name, bus in self._buses.items():
-            writer = self._writers.get(name)
-            if writer is None:
-                readings |= bus.poll(now_s)
+            if name not in self._failures:
+                try:
+                    self._last[name] = self._read(name, bus, now_s)
+                except (BusError, PortError) as error:
+                    self._fail(name, error)
+            if name in self._failures:
+                readings |= {joint: Reading(None, float("inf"), FAILED) for joint in bus.joints}
             else:
-                unread = {joint: Reading(None, float("inf")) for joint in bus.joints}
-                readings |= writer.readings(now_s) or unread
+                readings |= self._last[name]
+        if self._unsaid:
+            name = self._unsaid.pop(0)
+            raise BusError(str(self._failures[name])) from self._failures[name]
         return readings
 
-    def stop(self, policy: StopPolicy) -> None:
-        self._end_writers()
+    def torque_off(self, policy: StopPolicy) -> None:
+        """As `ports.Bus`, on every bus, from the caller's thread."""
         for bus in self._buses.values():
-            bus.stop(policy)
+            bus.torque_off(policy)
+
+    def stop(self, policy: StopPolicy) -> None:
+        """Torque off on all buses first, whatever their writers are doing; then each bus confirms, all at once where
+        they have threads. Never raises; `STOP_S` at most, for a bus that hangs in a system call too.
+        """
+        began_s = time.monotonic()
+        for writer in self._writers.values():
+            writer.end()
+        self.torque_off(policy)
+        free = {name: self._buses[name] for name in self._buses if self._ended(name, began_s + _TICK_S)}
+        if self._rates_hz is None or not self._writers:
+            for bus in free.values():
+                bus.stop(policy)
+            return
+        threads = [_begin(bus.stop, policy) for bus in free.values()]
+        for name, thread in zip(free, threads, strict=True):
+            thread.join(max(0.0, began_s + STOP_S - time.monotonic()))
+            if thread.is_alive():
+                log.warning("bus %r: does not confirm in time that its torque is off", name)
+
+    def _ended(self, name: str, until_s: float) -> bool:
+        """Whether nobody else uses the bus any more."""
+        writer = self._writers.get(name)
+        if writer is None or writer.close(max(0.0, until_s - time.monotonic())):
+            self._writers.pop(name, None)
+            return True
+        log.warning("bus %r: hangs in the middle of a tick; its torque-off was sent, and is not confirmed", name)
+        return False
 
     def close(self) -> None:
-        self._end_writers()
-        for bus in self._buses.values():
-            bus.close()
-
-    def _end_writers(self) -> None:
+        """Give all ports back. Blocks for the tick that a writer is in, `STOP_S` at most."""
+        until_s = time.monotonic() + STOP_S
         for writer in self._writers.values():
-            writer.close()
-        self._writers.clear()
+            writer.end()
+        for name, bus in self._buses.items():
+            self._ended(name, until_s)
+            bus.close()
 
     def statistics(self) -> Mapping[str, Any]:
         """Totals, and each bus's own under `buses`."""
@@ -111,3 +169,29 @@ class CompositeBus:
             for key, value in counts.items():
                 total[key] = total[key] + value if key in total else value
         return {**total, "buses": each}
+
+    def _working(self) -> list[tuple[str, Bus]]:
+        return [(name, bus) for name, bus in self._buses.items() if name not in self._failures]
+
+    def _writer(self, name: str, bus: Bus) -> Writer:
+        if name not in self._writers:
+            self._writers[name] = Writer(bus, (self._rates_hz or {})[name])
+        return self._writers[name]
+
+    def _read(self, name: str, bus: Bus, now_s: float) -> Mapping[str, Reading]:
+        writer = self._writers.get(name)
+        if writer is None:
+            return bus.poll(now_s)
+        writer.raise_failure()
+        return writer.readings(now_s) or {joint: Reading(None, float("inf")) for joint in bus.joints}
+
+    def _fail(self, name: str, error: Exception) -> None:
+        log.error("bus %r has failed, the others go on: %s", name, error)
+        self._failures[name] = error
+        self._unsaid.append(name)
+
+
+def _begin(stop: Callable[[StopPolicy], None], policy: StopPolicy) -> threading.Thread:
+    thread = threading.Thread(target=stop, args=(policy,), daemon=True)
+    thread.start()
+    return thread

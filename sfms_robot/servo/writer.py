@@ -16,10 +16,10 @@ from sfms_robot.ports import Bus
 
 
 class Writer:
-    """Runs from construction until `close`. What goes wrong in the thread is raised by the next `put`.
+    """Runs from construction until `close`. What goes wrong in the thread is raised by `raise_failure`.
 
     Args:
-        bus: enabled; nobody else may use it meanwhile.
+        bus: enabled; nobody else may use it meanwhile, but for `torque_off`.
         rate_hz: ticks of the bus, however often goals come.
     """
 
@@ -37,16 +37,21 @@ class Writer:
         self._thread.start()
 
     def put(self, goals_rad: Doubles, now_s: float) -> None:
+        """Goals for the next tick of the bus. Never blocks."""
+        with self._changed:
+            self._goals = goals_rad.copy(), now_s
+            self._changed.notify()
+
+    def raise_failure(self) -> None:
+        """Raises what ended the thread, if anything did."""
         with self._changed:
             if self._failure is not None:
                 raise self._failure
-            self._goals = goals_rad.copy(), now_s
-            self._changed.notify()
 
     def readings(self, now_s: float) -> Mapping[str, Reading]:
         """The last ones, older by what has passed since; empty before the first tick of the bus."""
         with self._changed:
-            later_s = now_s - self._read_s
+            later_s = max(0.0, now_s - self._read_s)
             out = {
                 joint: replace(each, age_s=each.age_s + later_s, rejoined=joint in self._back)
                 for joint, each in self._readings.items()
@@ -54,12 +59,17 @@ class Writer:
             self._back.clear()
         return out
 
-    def close(self) -> None:
-        """Returns when the tick in progress is over. Idempotent."""
+    def end(self) -> None:
+        """Send nothing more, without waiting for the tick in progress. Idempotent."""
         with self._changed:
             self._closing = True
             self._changed.notify()
-        self._thread.join()
+
+    def close(self, timeout_s: float) -> bool:
+        """`end`, and wait for the tick in progress for so long; whether it is over. Idempotent."""
+        self.end()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         due_s = time.monotonic()

@@ -25,13 +25,14 @@ from sfms_robot.app.servo.diagnosis import (
 )
 from sfms_robot.app.servo.doctor import Line, examine, examine_line
 from sfms_robot.app.servo.servo_tools import parse_ids, reboot, set_baud, write_register
-from sfms_robot.app.servo.servo_wire import FAMILIES, Wire
+from sfms_robot.app.servo.servo_wire import Wire
 from sfms_robot.cli.main import app
 from sfms_robot.config import load_firmware_map, map_files
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.servo.discovery import Holder, SerialDevice
+from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import SerialPort, VirtualTimePort
 from sfms_robot.servo.stored_settings import JointNeeds
 
@@ -271,11 +272,13 @@ def test_the_older_frame_is_examined_too(model):
     assert report["budget"]["fast"] is None and report["fast_sync_read"] is None
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", servo_families())
 def test_every_model_that_has_a_map_can_be_examined(family):
     maps = [load_firmware_map(file.stem) for file in map_files()]
     models = [
-        each.model for each in maps if (each.family, each.protocol) == FAMILIES[family].maps and not each.variant_of
+        each.model
+        for each in maps
+        if (each.family, each.protocol) == servo_families()[family].maps and not each.variant_of
     ]
     servos = [EmulatedServo(i, model, start_ticks=500) for i, model in enumerate(models, start=1)]
     with patient(*servos) as sick:

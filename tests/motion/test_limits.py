@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
+from sfms_robot.motion.chase import StopChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.stop import Bound, Stop
 from sfms_robot.runtime.loop import difference
@@ -12,7 +13,7 @@ from sfms_robot.runtime.loop import difference
 DT_S = 0.01
 LIMITS = JointLimits.of(load_head("face28"))
 J = len(LIMITS.low)
-LIMITER = JerkLimiter(LIMITS, DT_S)
+LIMITER, WITHOUT_RUCKIG = JerkLimiter(LIMITS, DT_S), JerkLimiter(LIMITS, DT_S, StopChase)
 FREE = (LIMITS.low < -np.radians(4)) & (LIMITS.high > np.radians(4))  # joints that can swing 4 degrees either way
 
 
@@ -21,12 +22,13 @@ def standing(angles) -> np.ndarray:
     return np.stack([angles, np.zeros(J), np.zeros(J)])
 
 
-def followed(references, start=None):
+def followed(references, start=None, limiter=None):
     """Positions sent, the three before the start included, and the last state."""
     start = np.zeros(J) if start is None else start
-    state, sent = LIMITER.start(start), [start] * 3
+    limiter = limiter or LIMITER
+    state, sent = limiter.start(start), [start] * 3
     for wanted in references:
-        goals, state = LIMITER.step(wanted, state)
+        goals, state = limiter.step(wanted, state)
         sent.append(goals)
     return np.array(sent), state
 
@@ -91,10 +93,11 @@ def broken(rng, ticks):
 ADVERSARIES = [square_wave, jumps, random_walk, bang_bang_jerk, into_the_edge, broken]
 
 
+@pytest.mark.parametrize(("ruckig_there", "ticks"), [(True, 1500), (False, 300)])
 @pytest.mark.parametrize("adversary", ADVERSARIES)
-def test_no_command_ever_exceeds_a_limit(adversary):
+def test_no_command_ever_exceeds_a_limit(adversary, ruckig_there, ticks):
     rng = np.random.default_rng(0)
-    sent, _ = followed(adversary(rng, 1500))
+    sent, _ = followed(adversary(rng, ticks), limiter=LIMITER if ruckig_there else WITHOUT_RUCKIG)
     assert excess(sent) < 1e-6
 
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, SHAPES, Plan
-from sfms_robot.motion.timeline import EASE_S, HISTORY, STALL_S, PlanTimeline, horizon_left_s
+from sfms_robot.motion.timeline import EASE_S, HISTORY, LEAD_S, STALL_S, PlanTimeline, horizon_left_s
 
 TICK_S = 0.01
 PITCH, BLINK, SMILE = (CHANNEL_INDEX[name] for name in ("pitch", "eyeBlinkLeft", "mouthSmileLeft"))
@@ -213,3 +213,42 @@ def test_the_horizon_left_is_enough_to_never_hold():
         lead_s = horizon_left_s(horizon, hop, latency_s=0.02)
         _, _, state = ran(frames, lead_s - TICK_S, horizon, hop, latency_ticks=2)
         assert lead_s > 0 and state.held == 0 and state.played_s <= state.curve.end_s + 1e-9
+
+
+def led(horizon: int, hop: int, latency_s: float, lead_s: float, seconds: float = 6.0):
+    """Times asked for (T,) and the last state, of a listener whose plans become visible after `latency_s`."""
+    state, asked, rng = TIMELINE.start(), [], np.random.default_rng(0)
+    for tick in range(round(seconds / TICK_S)):
+        now_s = tick * TICK_S
+        for k in range(0, int(seconds / FRAME_S), hop):
+            if now_s - TICK_S < k * FRAME_S + latency_s <= now_s:
+                state = TIMELINE.accept(plan(k * FRAME_S, rng.uniform(0, 1, (horizon, MOTION_DIM))), state)
+        asked.append(now_s + min(lead_s, TIMELINE.lead_limit_s(state)))
+        _, state = TIMELINE.sample(np.array([asked[-1]]), now_s, state)
+    return np.array(asked), state
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    st.sampled_from([(8, 4), (8, 1), (8, 6), (1, 1)]),
+    st.sampled_from([0.002, 0.007, 0.013, 0.029]),
+    st.floats(0, 0.25),
+)
+def test_a_lead_is_cut_to_what_is_left_of_plans_and_no_further(plans, latency_s, lead_s):
+    asked, state = led(*plans, latency_s, lead_s)
+    left_s = min(horizon_left_s(*plans, latency_s), LEAD_S)
+    settled = (asked - TICK_S * np.arange(len(asked)))[300:]
+    assert (settled >= min(lead_s, max(left_s, 0.0)) - 1e-6).all()
+    assert (settled <= min(lead_s, max(left_s, 0.0) + TICK_S) + 1e-6).all()
+    steps = np.diff(asked)
+    assert (steps > 0.7 * TICK_S).all() and (steps < 1.3 * TICK_S).all()  # time neither jumps nor stands still
+
+
+def test_a_listener_that_hangs_for_a_while_gets_its_lead_back():
+    state = TIMELINE.start()
+    for tick in range(3000):
+        now_s = tick * TICK_S
+        if tick % 4 == 0 and not 300 < tick < 600:
+            state = TIMELINE.accept(plan(now_s, faces(8)), state)
+        _, state = TIMELINE.sample(np.array([now_s]), now_s, state)
+    assert TIMELINE.lead_limit_s(state) == LEAD_S

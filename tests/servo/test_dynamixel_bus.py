@@ -79,9 +79,31 @@ def test_wrong_model_is_named(make_rig):
             rig.bus.connect()
 
 
+def test_absent_servo_is_a_silent_member_that_comes_in_when_it_appears(make_rig):
+    with make_rig([EmulatedServo(i, start_ticks=2000) for i in (1, 2, 3)]) as rig:
+        rig.chain.kill(2)
+        held = rig.hold()
+        assert held[1] == 0.0
+        readings = rig.ticks(held, 10)
+        assert readings["joint2"].fault == "no answer" and readings["joint2"].position_rad is None
+        assert readings["joint1"].age_s == 0.0 and rig.chain.state(2)["torque"] == 0
+        rig.chain.revive(2)
+        _, readings = rig.until(held, lambda r: r["joint2"].rejoined, 2.0)
+        stands = readings["joint2"].position_rad
+        assert stands == pytest.approx((2000 - 2048) * RAD_PER_TICK) and readings["joint2"].fault is None
+        rig.ticks(held, 50)
+        assert rig.chain.state(2)["position"] == pytest.approx(2000, abs=1)  # 0.07 rad is no goal that begins there
+        held[1] = stands
+        rig.ticks(held, 1)
+        for step in np.linspace(0.0, -stands, 30):
+            held[1] = stands + step
+            rig.ticks(held, 1)
+        assert rig.ticks(held, 50)["joint2"].position_rad == pytest.approx(0.0, abs=2 * RAD_PER_TICK)
+
+
 def test_other_baud_is_silence(make_rig):
     with make_rig([EmulatedServo(1, baud=57600)]) as rig:
-        with pytest.raises(BusError, match=r"no answer from id 1 \(joint1\)"):
+        with pytest.raises(BusError, match="at 1000000 baud: no answer from id 1"):
             rig.bus.connect()
     with make_rig([EmulatedServo(1, baud=57600)], baud=57600) as rig:
         rig.bus.connect()

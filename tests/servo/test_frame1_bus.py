@@ -105,9 +105,19 @@ def test_wrong_model_is_named():
         rig.bus.connect()
 
 
+def test_absent_servo_is_a_silent_member_with_a_named_fault(model):
+    rig = rig_of(model, starts(model, 0, 0), expected=[1, 7, 2])
+    held = rig.hold()
+    assert held[1] == 0.0 and rig.torques() == [1, 1]
+    readings = rig.ticks(held, 20)
+    assert {joint: r.fault for joint, r in readings.items()} == {"joint1": None, "joint7": "no answer", "joint2": None}
+    assert readings["joint7"].position_rad is None
+    assert rig.bus.statistics()["silent"] == [7] and rig.bus.statistics()["faults"] == ["joint7: no answer"]
+
+
 def test_other_baud_is_silence(model):
     rig = rig_of(model, starts(model, 0), servo_baud=57600)
-    with pytest.raises(BusError, match=r"no answer from id 1 \(joint1\)"):
+    with pytest.raises(BusError, match="at 1000000 baud: no answer from id 1"):
         rig.bus.connect()
     rig_of(model, starts(model, 0), baud=57600).bus.connect()
 
@@ -314,7 +324,7 @@ def test_pinched_joint_whose_cable_came_out_meanwhile_comes_back_all_the_same():
     rig = rig_of("sts3215", [2048, 2048], safety=Safety(pinch=rule))
     held = rig.hold()
     rig.servo(2).plant.stuck = True
-    rig.ticks(held + 0.5, 60)
+    rig.ticks(held + np.array([0.0, 0.5]), 60)
     assert rig.torques() == [1, 0]
     rig.servo(2).plant.stuck = False
     rig.device.kill(2)
@@ -452,12 +462,12 @@ def test_mx_servos_are_read_together_and_a_mixed_bus_one_by_one():
     held = together.hold()
     before = together.wire.requests
     together.ticks(held, 10)
-    assert together.wire.requests - before == 30  # goals, one bulk read, one closer look
+    assert 22 <= together.wire.requests - before <= 24  # goals, a bulk read; torque and settings now and then
     single = rig_of("ax-12a", [512] * 6)
     held = single.hold()
     before = single.wire.requests
     single.ticks(held, 10)
-    assert single.wire.requests - before == 80
+    assert 80 <= single.wire.requests - before <= 82  # goals, six reads, one closer look; settings now and then
 
 
 def test_reading_one_by_one_keeps_to_its_budget_and_reaches_everybody():

@@ -7,7 +7,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
-from sfms_robot.servo.chain.dynamixel2_telemetry import common
+from sfms_robot.servo.chain.telemetry import common
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
 

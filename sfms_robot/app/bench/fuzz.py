@@ -13,20 +13,18 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app import session as heads
 from sfms_robot.app import wiring
 from sfms_robot.app.bench.campaign import FAMILIES, RECOVERY_S, Judge, Rig, head_of
-from sfms_robot.app.calibrated_head import BOARDS
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Bus
 from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port, VirtualTimePort
 
@@ -136,11 +134,9 @@ def _bus(head: Head, chain: Chain, clock: VirtualClock, noise: Noise) -> Bus:
     servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in head.joints.items()]
     turns = np.array([maps[joint.model].ticks_per_revolution for joint in head.joints.values()])
     wire = partial(VirtualTimePort, chain.device, chain.control, config.baud, clock)
-    board = config.family in BOARDS
-    more: dict[str, Any] = {"confirmed": True} if board else {"faults": head.faults}
-    module, kind = heads.FAMILIES[config.family].split(":")
-    build = getattr(import_module(module), kind)
-    bus: Bus = build(
+    family = family_named(config.family)
+    more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
+    bus: Bus = family.bus_class()(
         "main", servos, Calibration(head.joints, turns), lambda: NoisyPort(wire(), noise), config.baud, 0.003,
         config=config, **more,
     )  # fmt: skip

@@ -84,6 +84,9 @@ class Faces:
     def accept(self, plan: Plan, state: None) -> None:
         return None
 
+    def lead_limit_s(self, state: None) -> float:
+        return float("inf")
+
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
         """Motion (N, 58) at each of (N,) instants."""
         after = np.clip(np.searchsorted(self._times_s, times_s), 1, len(self._times_s) - 1)

@@ -13,12 +13,12 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.app.calibrated_head import BOARDS
 from sfms_robot.app.session import build_bus
 from sfms_robot.config import Head, Joint, load_firmware_map
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ServoError
 from sfms_robot.ports import Bus, Clock
+from sfms_robot.servo.families import family_named
 
 PACE_DEG_S: Final = 20.0
 _PERIOD_S: Final = 0.01
@@ -110,7 +110,7 @@ def probe(head: Head, name: str, where: Chain | str, clock: Clock) -> Iterator[P
 
 def jumps(head: Head, name: str) -> bool:
     """Whether the servo comes on with a jump: one that does not tell where it stands."""
-    return head.buses[head.joints[name].bus].family in BOARDS
+    return family_named(head.buses[head.joints[name].bus].family).board
 
 
 def _ticks_per_deg(joint: Joint) -> float:

@@ -127,6 +127,9 @@ class HeldFace:
     def accept(self, plan: Plan, state: None) -> None:
         return None
 
+    def lead_limit_s(self, state: None) -> float:
+        return float("inf")
+
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
         """Motion (N, 58) at each of (N,) instants."""
         share = smooth((times_s - EASE_S) / RISE_S) - smooth((times_s - self._falls_s) / RISE_S)

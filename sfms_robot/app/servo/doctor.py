@@ -35,7 +35,7 @@ from sfms_robot.app.servo.diagnosis import (
 from sfms_robot.app.servo.protocol_hint import protocol_hint
 from sfms_robot.app.servo.servo_state import State, read_all
 from sfms_robot.app.servo.servo_tools import Confirm, Progress, field_named, guard, put, scan, twins
-from sfms_robot.app.servo.servo_wire import FAMILIES, SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
@@ -44,6 +44,7 @@ from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
+from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds
@@ -89,8 +90,8 @@ def examine(
 
     Raises ConfigError for a head, a family or a port description that cannot be used.
     """
-    if family not in FAMILIES:
-        raise ConfigError.at("doctor", "family", family, "is unknown", FAMILIES)
+    if family not in servo_families():
+        raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
         buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress, fix) for line in lines]
@@ -281,7 +282,7 @@ def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[
 
 
 def _first_baud(line: Line) -> int:
-    return line.baud or FAMILIES[line.family].bauds[0]
+    return line.baud or servo_families()[line.family].bauds[0]
 
 
 def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, Seen], dict[int, Seen]]:

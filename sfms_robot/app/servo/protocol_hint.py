@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from sfms_robot.app.servo.servo_wire import FAMILIES, Wire, table_of
+from sfms_robot.app.servo.servo_wire import Wire, table_of
 from sfms_robot.errors import PortError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import Port
 
 LISTEN_S: Final = 0.08  # answers come by id, 3 ms apart: those of the first two dozen ids
@@ -26,7 +27,7 @@ def protocol_hint(wire: Wire) -> str:
     """What to type instead, or nothing. Takes at most 3 s on a silent wire, and leaves it at its rate."""
     before = wire.baud
     try:
-        for baud in dict.fromkeys(baud for family in FAMILIES.values() for baud in family.bauds[:_RATES]):
+        for baud in dict.fromkeys(baud for family in servo_families().values() for baud in family.bauds[:_RATES]):
             try:
                 wire.at(baud)
             except PortError:
@@ -46,7 +47,7 @@ def _speaks(port: Port, wire: Wire, baud: int) -> str | None:
     if _DXL2_HEADER in _heard(port, dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING)):
         return "dynamixel2"
     frames = frame1.salvage(bytearray(_heard(port, frame1.encode(frame1.BROADCAST, frame1.PING))))
-    if not frames and baud in FAMILIES["dynamixel1"].bauds[:2]:  # these answer only to their own id
+    if not frames and baud in servo_families()["dynamixel1"].bauds[:2]:  # these answer only to their own id
         link = Wire(port, "dynamixel1", wire.clock, baud, fixed=True).link
         link.silence_s = _ID_S
         if any(link.ping(servo) is not None for servo in range(1, _FIRST_IDS + 1)):

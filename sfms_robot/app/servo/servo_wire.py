@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from typing import Any, Final
 
 from sfms_robot.config import load_firmware_map, load_head, map_files, variant
@@ -21,61 +20,13 @@ from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.chain.link import Found, RegisterLink
 from sfms_robot.servo.discovery import access_problem, list_ports
+from sfms_robot.servo.families import BusFamily, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 
 SIM: Final = "sim"
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms, an emulator is late on a busy computer
 TRIES: Final = 3
-
-
-@dataclass(frozen=True)
-class Family:
-    """A way of speaking that a family of servos shares.
-
-    Attributes:
-        link: "module:class" of its RegisterLink, imported when it is chosen.
-        dialect: what the class is told beside port, baud and patience.
-        maps: (family, protocol) of its firmware maps.
-        bauds: rates its servos may be set to, those met most often first.
-        max_id: highest id.
-        broadcast: whether one ping asks everybody.
-    """
-
-    link: str
-    dialect: tuple[str, ...]
-    maps: tuple[str, int]
-    bauds: tuple[int, ...]
-    max_id: int
-    broadcast: bool
-
-
-FAMILIES: Final[Mapping[str, Family]] = {
-    "dynamixel2": Family(
-        "sfms_robot.servo.chain.dynamixel2_link:Dxl2Link",
-        (),
-        ("dynamixel", 2),
-        (1_000_000, 57_600, 4_000_000, 2_000_000, 3_000_000, 115_200, 9_600, 4_500_000),
-        252,
-        True,
-    ),
-    "dynamixel1": Family(
-        "sfms_robot.servo.chain.protocol1_link:Frame1Link",
-        ("dynamixel",),
-        ("dynamixel", 1),
-        (1_000_000, 57_600, 115_200, 500_000, 200_000, 250_000, 400_000, 19_200, 9_600),
-        253,
-        False,
-    ),
-    "feetech": Family(
-        "sfms_robot.servo.chain.protocol1_link:Frame1Link",
-        ("feetech",),
-        ("feetech", 1),
-        (1_000_000, 115_200, 500_000, 57_600, 38_400, 250_000, 128_000, 76_800),
-        253,
-        True,
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -122,7 +73,7 @@ class Wire:
 
     Args:
         port: owned by whoever made it.
-        family: one of FAMILIES.
+        family: a name of `servo_families`.
         baud: the port's rate now; with `fixed` no other rate is looked at.
         model: what every servo is taken for, whatever its number; None goes by the number.
     """
@@ -187,8 +138,7 @@ class Wire:
             raise ConfigError.at("servo", what, servo, "is not a servo id", [f"0..{self.kind.max_id}"])
 
     def _link(self, baud: int) -> RegisterLink:
-        module, name = self.kind.link.split(":")
-        link: RegisterLink = getattr(import_module(module), name)(self.port, baud, PATIENCE_S, *self.kind.dialect)
+        link: RegisterLink = self.kind.link_class()(self.port, baud, PATIENCE_S, *self.kind.dialect)
         return link
 
 
@@ -266,7 +216,7 @@ def _models(family: str) -> Mapping[int, Sequence[str]]:
     return {number: [name for _, name in sorted(rows)] for number, rows in found.items()}
 
 
-def _family(name: str) -> Family:
-    if name not in FAMILIES:
-        raise ConfigError.at("servo tools", "family", name, "is unknown", FAMILIES)
-    return FAMILIES[name]
+def _family(name: str) -> BusFamily:
+    if name not in servo_families():
+        raise ConfigError.at("servo tools", "family", name, "is unknown", servo_families())
+    return servo_families()[name]

@@ -4,19 +4,24 @@ Four promises:
 
 1. Torque comes on without a jump: goal := present, read back, then torque. A servo that stands outside the limits of
    its joint is held where it stands; it may come in, and never go further out.
-2. One servo never costs the frame. A silent one leaves the list at once and is probed alone, with growing pauses;
-   those behind it are asked again. Each joint has its own last position, age and fault.
+2. One servo never costs the frame. What becomes of each is its own `Member`'s affair; `StatusPoll` asks them within a
+   time budget. Each joint has its own last position, age and fault.
 3. What was away (a servo, the wire, the supply) is found again, checked and switched on as at start-up, beside the
    work of the others; until then its goals are withheld.
-4. `stop` reaches every servo that can be reached, whatever else is dead.
+4. Torque off is written before anything is asked, to all at once, and then again until it is confirmed.
+
+A missed answer is followed through three files: `status_poll` notices it, `member` says what it means, and here is
+what is done about it.
 """
 
 from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Generic, Protocol, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from threading import RLock
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,41 +32,34 @@ from sfms_robot.errors import BusError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
-from sfms_robot.servo.chain.care import Care, Told
 from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.roster import Roster
-from sfms_robot.servo.chain.startup import Startup
-from sfms_robot.servo.policy import Absences, BusServo
+from sfms_robot.servo.chain.member import FaultReporter, Member, State, members_of
+from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
+from sfms_robot.servo.chain.schedule import TURN_S
+from sfms_robot.servo.chain.startup import PATIENCE_S, Startup
+from sfms_robot.servo.chain.status_poll import StatusPoll
+from sfms_robot.servo.chain.telemetry import Telemetry
+from sfms_robot.servo.chain.verified_write import finish
+from sfms_robot.servo.policy import BusServo, torque_register
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field, Table
 
 log = logging.getLogger(__name__)
 
 READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
-_STOP_PATIENCE_S: Final = 0.02
+STOP_S: Final = 0.2  # that `stop` waits for servos to confirm
+_STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
+_EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
+_EXCHANGE_BYTES: Final = 160  # of the longest of them: a whole control table
+_COMPARE_S: Final = 1.0  # between two looks at the settings of one servo
+_COMPARED: Final = 40  # bytes read at once for that
+_SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
 _NOBODY: Final = np.zeros(0, np.intp)
 
-
-class State(Told, Protocol):
-    """Last known state of every servo, by index in bus order."""
-
-    torque: Field
-    position: tuple[int, int]
-
-    def capabilities(self, index: int) -> frozenset[str]: ...
-
-    def supply_mA(self) -> float: ...
-
-    def readings(
-        self, joints: Sequence[str], faults: Sequence[str | None], rejoined: set[int], now_s: float
-    ) -> Mapping[str, Reading]: ...
-
-
 L = TypeVar("L", bound=RegisterLink)
-S = TypeVar("S", bound=State)
 
 
-class ChainBus(WireBus[L], Generic[L, S]):
+class ChainBus(WireBus[L], Generic[L]):
     """One wire of servos; a family says how it is asked and told.
 
     Args:
@@ -74,6 +72,9 @@ class ChainBus(WireBus[L], Generic[L, S]):
     Raises ConfigError for servos that cannot share a bus.
     """
 
+    family: ClassVar[str]
+    protocol: ClassVar[int]
+
     def __init__(
         self,
         name: str,
@@ -85,39 +86,54 @@ class ChainBus(WireBus[L], Generic[L, S]):
         config: BusConfig | None = None,
         faults: Faults | None = None,
     ) -> None:
-        self._config = config or BusConfig(family="dynamixel2", baud=baud)
+        config = config or BusConfig(family="dynamixel2", baud=baud)
+        self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
         self._tables = [Table.of(servo.map) for servo in servos]
         self._index = {servo.id: i for i, servo in enumerate(servos)}
-        self._telemetry = self._state()
-        self._absences = Absences([f"{servo.joint} (id {servo.id})" for servo in servos])
-        self._care = Care(servos, self._tables, faults or Faults(), self._telemetry)
+        self._telemetry = Telemetry(name, self.family, self.protocol, self._tables, conversion)
+        self._reporter = FaultReporter()
+        self._members = members_of(servos, self._tables, faults or Faults(), self._reporter)
+        self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts)
+        self._writes = RepeatedWrites(list(self._index))
+        self._startup: Startup[L] | None = None
+        self._enabled = False
         self._places: NDArray[np.intp] = np.zeros(0, np.intp)  # who gets goals
-        self._stale = True  # that list
+        self._own: dict[int, dict[str, int]] = {}  # registers by index that hold something else than startup wanted
+        self._compared = 0
+        self._compare_s = 0.0
+        self._stamp_s = 0.0
+        self._peak_mA = 0.0
+        self._release_packet = b""
+        self._released = False  # by `torque_off`: no goal is sent until the next `enable`
+        self._sending = RLock()
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
         return {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
 
+    @property
+    def poll_budget_s(self) -> float:
+        """Time that a poll may take, whatever is lost: see `status_poll`."""
+        return self._poll.budget_s
+
     # --- what a family adds -------------------------------------------------------------------------------------
 
     @abstractmethod
-    def _state(self) -> S: ...
+    def _begin(self, link: L, tries: int = 3) -> Startup[L]:
+        """What starts servos up over `link`."""
 
     @abstractmethod
-    def _shake(self, link: L, tries: int = 3) -> Startup[L]: ...
-
-    @property
-    @abstractmethod
-    def _listed(self) -> Roster: ...
+    def _found(self, link: L) -> None:
+        """Everybody who answers is identified and prepared: find out how they can be read."""
 
     @abstractmethod
-    def _met(self, link: L, bits: Mapping[int, int]) -> None:
-        """Who answers is identified and prepared; latched faults by index."""
+    def _found_again(self, link: L) -> None:
+        """The same wire, opened again."""
 
     @abstractmethod
-    def _listen(self, link: L, now_s: float) -> bool:
-        """Ask for positions and the like; whether anybody answered."""
+    def _sync_write_packet(self, field: Field, values: Mapping[int, int]) -> bytes:
+        """Values by id in one packet that nobody answers."""
 
     @abstractmethod
     def _send(self, link: L, places: NDArray[np.intp], ticks: NDArray[np.int64], now_s: float) -> None:
@@ -126,86 +142,186 @@ class ChainBus(WireBus[L], Generic[L, S]):
     # --- start and stop -----------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open, identify every servo, make it listen to us. Torque is left as it is found."""
+        """Open, identify every servo that answers, make it listen to us. Torque is left as it is found.
+
+        Blocks a few exchanges per servo, and for one that does not answer a few times 50 ms. Raises PortError;
+        BusError when nobody answers; ServoError for a servo that contradicts the head's file.
+        """
         link = self._open()
         try:
-            bits = self._shake(link).run()
-            self._read_deadline_s = link.adapt(self._servos[min(bits)].id, *self._telemetry.position)
-            self._care.switched_off()
-            self._care.attach(link, self._shake(link, tries=1))
-            self._met(link, bits)
+            bits = self._begin(link).run()
+            present = [self._servos[index] for index in bits]
+            self._read_deadline_s = link.adapt(present[0].id, *self._telemetry.position)
+            self._telemetry.forget()
+            self._release_packet = self._packet_off(range(len(self._servos)))
+            self._attach(link)
+            for member in self._members:
+                (member.connected if member.index in bits else member.absent)()
+            self._found(link)
+            self._stamp_s = link.port.now_s()
+            self._poll.measure(link, self._stamp_s)
+            for index, status in bits.items():
+                self._members[index].take_bits(status, self._telemetry.measured(index), self._stamp_s)
         except BaseException:
             link.port.close()
             raise
         self._forget_silence()
-        self._link, self._stale = link, True
+        self._writes.clear()
+        self._own.clear()
+        self._enabled, self._link = False, link
+
+    def _attach(self, link: L) -> None:
+        self._now_s = link.port.now_s
+        self._startup = self._begin(link, tries=1)
+        for member in self._members:
+            member.attach(self._startup)
+
+    def _present(self) -> list[int]:
+        """Ids of those who are listed."""
+        return [member.id for member in self._members if member.presence.listed]
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """Torque on for `joints` without a jump, one after the other; angles held, rad, in the order of `joints`.
 
-        Raises ServoError when a servo refuses; those before it in the list then have torque, so call `stop`.
+        Of a joint whose servo has not answered since `connect`: 0 rad, or the end of its range nearest to that, so
+        that whoever eases goals has a number to begin with. Its goals are withheld; when it appears it is started up,
+        held where it stands, and its reading says `rejoined`.
+
+        Blocks a few exchanges per servo, and `stagger_ms`. Raises ServoError when a servo refuses or falls silent
+        meanwhile, BusError when `torque_off` comes meanwhile; others may then have torque, so call `stop`.
         """
         link = self._connected()
-        shake = self._shake(link)
+        startup = self._begin(link)
+        self._released = False
         held = []
         for joint in joints:
             index = self.joints.index(joint)
-            self._telemetry.ticks[index] = shake.switch_on(index)
-            self._care.switched_on(index)
+            member = self._members[index]
+            if not member.presence.listed:
+                member.awaited()
+                servo = self._servos[index]
+                held.append(min(max(0.0, servo.min_rad), servo.max_rad))
+                log.warning("%s (id %d) does not answer; it comes in when it does", joint, servo.id)
+                continue
+            self._forget_member(index)
+            with link.patient(PATIENCE_S):
+                steps = startup.torque_on(index) if member.identified else startup.bring_back(index, reboot=False)
+                self._telemetry.ticks[index] = finish(steps)
+            if self._released:
+                self.torque_off("release")
+                raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
+            member.enabled()
             held.append(self._hold(index))
             link.rest(self._config.stagger_ms / 1e3)
-        self._stale = True
+        self._enabled = True
+        self._update_places()
         return np.array(held)
 
+    def _forget_member(self, index: int) -> None:
+        self._writes.drop(index)
+        self._own.pop(index, None)
+
+    def torque_off(self, policy: StopPolicy) -> None:
+        """As `ports.Bus`: one sync write to the servos whose joints are to be released.
+
+        Bytes that are on their way to us may collide with it on a wire that goes both ways; `stop` says it again.
+        """
+        if policy == "hold":
+            return
+        self._released = True
+        alone = self._sending.acquire(timeout=_SENDING_S)  # a goal must not overtake it; a port that hangs may
+        try:
+            link, packet = self._link, self._release_packet
+            if link is not None and packet:
+                link.port.write(packet)
+        except BusError as error:
+            log.warning("bus %r: %s", self.name, error)
+        finally:
+            if alone:
+                self._sending.release()
+
     def stop(self, policy: StopPolicy) -> None:
-        """Release every servo but those whose joints are to hold, or none; refuse goals from now on. Never raises."""
-        self._care.switched_off()
-        self._stale = True
+        """As `ports.Bus`: torque off first, in one packet, then watchdogs off, in another; then both are read back and
+        written again, for `STOP_S` at most. Waits for nobody before the torque is off."""
+        self._enabled = False
+        armed = self._armed()
+        for member in self._members:
+            member.stopped()
+        self._writes.clear()
+        self._own.clear()
+        self._update_places()
         link = self._link
         if link is None and self._lost_s is not None:
             link = self._open_again()  # perhaps it has just come back
+            if link is not None:
+                self._found_again(link)
         if link is None:
             return
         limp = [i for i, servo in enumerate(self._servos) if policy == "release" and servo.safety.stop == "release"]
-        with link.patient(_STOP_PATIENCE_S):
-            self._let_go(link)
-            self._settle(link, self._telemetry.torque, limp, "its torque is off")
+        torque, watchdog = self._telemetry.torque, self._tables[0].role("bus_watchdog")
+        self._say_off(link, torque, limp)
+        if watchdog is not None:
+            self._say_off(link, watchdog, armed)
+        until_s = link.port.now_s() + STOP_S
+        with link.patient(min(_STOP_PATIENCE_S, STOP_S)):
+            self._confirm_off(link, torque, limp, until_s)
+            if watchdog is not None:
+                self._confirm_off(link, watchdog, [i for i in armed if i not in limp], until_s)
 
-    def _let_go(self, link: L) -> None:
-        """What has to be off before the torque is."""
+    def _say_off(self, link: L, field: Field, indices: Iterable[int]) -> None:
+        values = {self._servos[i].id: field.to_bytes(0) for i in indices}
+        if values:
+            self._attempt(lambda: link.sync_write(field.address, values))
+
+    def _confirm_off(self, link: L, field: Field, indices: Sequence[int], until_s: float) -> None:
+        """Read a register of all back, and write 0 again to those that do not say 0.
+
+        Whoever is asked first in one round is asked last in the next: behind a dead servo the others are silent.
+        """
+        rest = list(indices)
+        for _ in range(len(indices) + 2):
+            if not rest or link.port.now_s() >= until_s:
+                break
+            ids = [self._servos[i].id for i in rest]
+            got = self._attempt(partial(self._poll.read_all, link, (field.address, field.size), ids, until_s))
+            if got is None:
+                break  # the port is gone
+            off = field.to_bytes(0)
+            rest = [i for i in rest if self._servos[i].id not in got or got[self._servos[i].id].data != off]
+            rest = rest[1:] + rest[:1]
+            self._say_off(link, field, rest)
+        for index in sorted(rest):
+            log.warning("%s (id %d) does not confirm that its %s is off", *self._name(index), field.name)
+
+    def _name(self, index: int) -> tuple[str, int]:
+        return self._servos[index].joint, self._servos[index].id
+
+    def _packet_off(self, indices: Iterable[int]) -> bytes:
+        """Torque off for the servos at `indices` whose joints are to be released."""
+        released = {self._servos[i].id: 0 for i in indices if self._servos[i].safety.stop == "release"}
+        return self._sync_write_packet(self._telemetry.torque, released) if released else b""
+
+    def _armed(self) -> list[int]:
+        """Who has a watchdog running, or was told to."""
+        return [index for index, own in self._own.items() if own.get("bus_watchdog")]
 
     def close(self) -> None:
-        """Give the port back. Idempotent."""
-        self._care.switched_off()
+        """Give the port back; watchdogs that are still on are switched off, so that a held pose stays held."""
+        link, watchdog = self._link, self._tables[0].role("bus_watchdog")
+        if link is not None and watchdog is not None:
+            self._say_off(link, watchdog, self._armed())
+        self._own.clear()
+        self._writes.clear()
+        self._enabled = False
+        for member in self._members:
+            member.stopped()
         super().close()
-
-    def _settle(self, link: L, field: Field, indices: Sequence[int], what: str) -> None:
-        """Write 0 to a register of many servos and make sure of each, as far as it answers."""
-        if not indices:
-            return
-        off = field.to_bytes(0)
-        self._attempt(lambda: link.sync_write(field.address, {self._servos[i].id: off for i in indices}))
-        for index in indices:
-            servo = self._servos[index]
-            tries = 1 if servo.id in self._listed.silent else 2
-            if not any(self._is_off(link, servo.id, field) for _ in range(tries)):
-                log.warning("%s (id %d) does not confirm that %s", servo.joint, servo.id, what)
-
-    def _is_off(self, link: L, servo: int, field: Field) -> bool:
-        """Whether the register is 0; when it is not, or nobody says so, that is written once more."""
-        off = field.to_bytes(0)
-        answer = self._attempt(lambda: link.read(servo, field.address, field.size))
-        if answer is not None and answer.data == off:
-            return True
-        self._attempt(lambda: link.write(servo, field.address, off))
-        return False
 
     def _hold(self, index: int) -> float:
         """The angle of a servo that holds where it stands; the range reaches out to it."""
-        servo = self._servos[index]
         angle = float(self._conversion.to_rad(self._telemetry.ticks)[index])
         if not self._goals.hold(index, angle):
-            log.warning("%s (id %d) stands outside its limits and is held there", servo.joint, servo.id)
+            log.warning("%s (id %d) stands outside its limits and is held there", *self._name(index))
         return angle
 
     # --- every tick ---------------------------------------------------------------------------------------------
@@ -216,62 +332,202 @@ class ChainBus(WireBus[L], Generic[L, S]):
         Raises ValueError, with nothing sent, before `enable`, for a goal that is not finite, or one out of range.
         While the port is gone nothing is sent and nothing is raised.
         """
-        care = self._care
-        self._check(bool(care.wanted))
-        if care.rejoining:
-            near = self._goals.ticks(goals_rad, _NOBODY)
-            for index in [i for i in care.rejoining if care.near(i, int(near[i]))]:
-                if self._goals.allows(index, goals_rad[index]):
-                    del care.rejoining[index]
-                    self._stale = True
-        if self._stale:
-            chosen = [i for i in sorted(care.wanted) if i not in care.away and i not in care.rejoining]
-            self._places = np.array(chosen, np.intp)
-            self._stale = False
+        self._check(self._enabled)
+        if self._accepted(goals_rad):
+            self._update_places()
         link = self._link
-        ticks = self._goals.ticks(goals_rad, _NOBODY if link is None else self._places)
-        if link is None or not len(self._places):
+        places = self._places if link is not None else _NOBODY
+        ticks = self._goals.ticks(goals_rad, places)
+        if link is None or not len(places):
             return
-        self._counts["writes"] += 1
-        try:
-            self._send(link, self._places, ticks, now_s)
-        except BusError as error:
-            self._lose(error, now_s)
+        with self._sending:
+            if self._released:
+                return
+            self._counts["writes"] += 1
+            try:
+                self._send(link, places, ticks, link.port.now_s())
+            except BusError as error:
+                self._lose(error, now_s)
+
+    def _accepted(self, goals_rad: Doubles) -> bool:
+        """Whether a rejoining member takes goals from now on."""
+        waiting = [member for member in self._members if member.state is State.REJOINING]
+        if not waiting:
+            return False
+        ticks = self._goals.ticks(goals_rad, _NOBODY)
+        near = [
+            self._goals.allows(member.index, goals_rad[member.index]) and member.accepts(int(ticks[member.index]))
+            for member in waiting
+        ]
+        return any(near)
+
+    def _update_places(self) -> None:
+        """Who gets goals; the array stays the same object while it has the same content."""
+        places = [member.index for member in self._members if member.gets_goals]
+        if self._places.tolist() != places:
+            self._places = np.array(places, np.intp)
 
     def statistics(self) -> Mapping[str, Any]:
         return {
             **self._counts,
-            "silent": self._listed.silent,
-            "faults": list(self._care.said),
+            "silent": [member.id for member in self._members if not member.presence.listed],
+            "faults": list(self._reporter.said),
             "supply_mA": round(self._telemetry.supply_mA(), 1),
+            "supply_peak_mA": round(self._peak_mA, 1),
         }
-
-    def _ask(self, link: L, now_s: float) -> bool:
-        heard = self._listen(link, now_s)
-        back = self._care.step(now_s)
-        self._counts["reconnects"] += back
-        self._stale |= back > 0 or bool(self._care.away)
-        return heard
 
     def poll(self, now_s: float) -> Mapping[str, Reading]:
         """Position of all servos that are not silent, more of some, and whoever is away is looked after.
 
-        Raises BusError when nobody has answered for so long that the bus has failed.
+        Blocks for `StatusPoll.budget_s` at most. Raises BusError when nobody has answered for so long that the bus
+        has failed.
         """
-        self._care.rejoined.clear()
+        for member in self._members:
+            member.rejoined = False
         return super().poll(now_s)
 
+    def _ask(self, link: L, now_s: float) -> bool:
+        stamp_s = self._stamp_s = link.port.now_s()
+        if self._released:
+            for member in self._members:
+                member.stopped()
+        with link.within(self._poll.budget_s, self._read_deadline_s + TURN_S):
+            heard = self._poll.step(link, stamp_s)
+            self._command(link, stamp_s)
+            self._bring_back(link, stamp_s)
+            self._compare(link, stamp_s)
+        self._peak_mA = max(self._peak_mA, self._telemetry.supply_mA())
+        self._update_places()
+        return heard
+
     def _readings(self, now_s: float) -> Mapping[str, Reading]:
-        for index in self._care.rejoined:
+        """Ages are told by the port's clock, whatever `now_s` counts from."""
+        stamp_s = self._stamp_s if self._link is not None else self._now_s()
+        rejoined = {member.index for member in self._members if member.rejoined}
+        for index in rejoined:
             self._hold(index)
-        return self._telemetry.readings(self.joints, self._care.fault, self._care.rejoined, now_s)
+        faults = [member.fault for member in self._members]
+        return self._telemetry.readings(self.joints, faults, rejoined, stamp_s)
+
+    # --- what members want --------------------------------------------------------------------------------------
+
+    def _command(self, link: L, now_s: float) -> None:
+        """Torque off, less force: said first, then read back; again in the next poll where nobody confirms it."""
+        torque = self._telemetry.torque
+        for member in self._members:
+            if member.to_release:
+                self._writes.want(member.index, torque, 0)
+            elif (member.index, torque.name) in self._writes:
+                self._writes.drop(member.index, torque.name)
+            if member.state is State.REDUCED and not self._is_reduced(member.index):
+                self._reduce(member.index)
+        self._writes.step(
+            link,
+            lambda index: self._members[index].presence.listed,
+            lambda where, ids: self._poll.read_some(link, where, ids),
+            lambda index, field, value: self._told(index, field, value, now_s),
+        )
+        for member in self._members:
+            member.off_written |= member.to_release
+
+    def _told(self, index: int, field: Field, value: int, now_s: float) -> None:
+        if field.name == self._telemetry.torque.name:
+            self._members[index].take_torque(bool(value), now_s)
+
+    def _strength(self, index: int) -> str | None:
+        """The register that bounds the force of a servo."""
+        current = self._servos[index].safety.current_limit_mA is not None
+        if current and "goal_current" in self._tables[index].fields:
+            return "goal_current"
+        return torque_register(self._servos[index].map)
+
+    def _is_reduced(self, index: int) -> bool:
+        return (name := self._strength(index)) is None or name in self._own.get(index, ())
+
+    def _reduce(self, index: int) -> None:
+        """Half of what startup gave it: one value, however often it is written."""
+        name = self._strength(index)
+        if name is None or name not in self._tables[index].fields:
+            return
+        field = self._tables[index][name]
+        full = self._wanted(index).get(name, field.high)
+        self._own.setdefault(index, {})[name] = full // 2
+        self._writes.want(index, field, full // 2)
+
+    def _wanted(self, index: int) -> Mapping[str, int]:
+        return self._startup.wanted(index) if self._startup is not None else {}
+
+    def _bring_back(self, link: L, now_s: float) -> None:
+        """A poll's share of the jobs of members on their way back; a silence ends it."""
+        left = _EXCHANGES
+        for member in self._members:
+            while left and member.waits and member.due(now_s):
+                if not link.affords(_EXCHANGE_BYTES, alone=True):
+                    return
+                left -= 1
+                member.step(now_s)
+                if member.rejoined:
+                    self._back(member.index, now_s)
+                elif member.job is None or not link.judged:
+                    break
+
+    def _back(self, index: int, now_s: float) -> None:
+        self._counts["reconnects"] += 1
+        self._forget_member(index)
+        self._telemetry.ticks[index] = self._members[index].stands_ticks
+        self._telemetry.seen_s[index] = now_s
+
+    def _compare(self, link: L, now_s: float) -> None:
+        """Once a second, one servo after the other: do its registers hold what was asked of them?"""
+        if now_s < self._compare_s:
+            return
+        self._compare_s = now_s + _COMPARE_S / len(self._members)
+        member = self._members[self._compared % len(self._members)]
+        self._compared += 1
+        if not (member.gets_goals and member.presence.listed):
+            return
+        fields = self._tables[member.index].fields
+        wanted = {**self._wanted(member.index), **self._own.get(member.index, {})}
+        differing: dict[str, tuple[int, int]] = {}
+        for group in _groups([fields[name] for name in wanted if name in fields]):
+            first, end = group[0].address, max(each.address + each.size for each in group)
+            answer = self._poll.read_some(link, (first, end - first), [member.id]).get(member.id)
+            if answer is None or len(answer.data) != end - first:
+                return  # another time
+            for each in group:
+                seen = each.from_bytes(answer.data[each.address - first :])
+                if seen != wanted[each.name] and (member.index, each.name) not in self._writes:
+                    differing[each.name] = seen, wanted[each.name]
+        self._judge(member, differing, now_s)
+
+    def _judge(self, member: Member, differing: Mapping[str, tuple[int, int]], now_s: float) -> None:
+        """Settings of a member, compared: what it was told again and again is told once more."""
+        member.take_registers(differing)
+        for name in differing:
+            if name in self._own.get(member.index, ()):
+                self._writes.want(member.index, self._tables[member.index][name], self._own[member.index][name])
 
     # --- the port -----------------------------------------------------------------------------------------------
 
     def _left(self) -> None:
-        for index in sorted(self._care.wanted):
-            self._care.gone(index, "port lost")
+        for member in self._members:
+            member.gone()
+        self._update_places()
 
     def _returned(self, link: L, now_s: float) -> None:
-        self._care.attach(link, self._shake(link, tries=1))
-        self._listed.suspect_all(now_s)
+        """Everybody is asked alone first."""
+        self._attach(link)
+        self._found_again(link)
+        for member in self._members:
+            member.suspect(link.port.now_s(), pause_s=0.0)
+
+
+def _groups(fields: Sequence[Field]) -> list[list[Field]]:
+    """Registers that lie close enough together to be read at once, in the order of their addresses."""
+    groups: list[list[Field]] = []
+    for field in sorted(fields, key=lambda each: each.address):
+        if groups and field.address + field.size - groups[-1][0].address <= _COMPARED:
+            groups[-1].append(field)
+        else:
+            groups.append([field])
+    return groups

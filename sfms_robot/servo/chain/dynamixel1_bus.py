@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from sfms_robot.servo.chain.protocol1_bus import Frame1Bus
 from sfms_robot.servo.chain.protocol1_link import Frame1Link
-from sfms_robot.servo.chain.protocol1_poll import GroupRead
+from sfms_robot.servo.chain.status_poll import GroupRead
 
 
 class Dynamixel1Bus(Frame1Bus):

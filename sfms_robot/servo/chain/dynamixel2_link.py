@@ -18,14 +18,15 @@ from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
 from numpy.typing import NDArray
 
 from sfms_robot.errors import PacketError
-from sfms_robot.servo.chain.link import CHUNK, NO_PATIENCE, Answer, Found, RegisterLink
+from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, Packet, maybe_packet
+from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, maybe_packet
 from sfms_robot.servo.port import Port
 
 _REQUESTS_KEPT: Final = 512
 _WRITES_KEPT: Final = 16  # each has a table of 0.5 KiB per byte of data
 _PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
+_LENGTHS: Final = 4  # of a read of several servos, one byte apart
 _HEADER: Final = b"\xff\xff\xfd"
 _SYNC_DATA: Final = 12  # where the first id of a sync write stands
 
@@ -57,21 +58,22 @@ class Dxl2Link(RegisterLink):
         self._requests: dict[tuple[object, ...], bytes] = {}
         self._writes: dict[tuple[int, int, tuple[int, ...]], _SyncWrite] = {}
         self._sent = 0
+        self._extra = 0  # bytes that reads of several servos ask for beside what is wanted
 
     # --- one servo ----------------------------------------------------------------------------------------------
 
     def ping(self, servo: int) -> Found | None:
         self._send(dxl2.encode_instruction(servo, dxl2.PING))
-        packet = self._answers([servo], 3).get(servo)
-        return _found(packet) if packet is not None and len(packet.params) == 3 else None
+        answer = self._answers([servo], 3).get(servo)
+        return _found(answer) if answer is not None and len(answer.data) == 3 else None
 
     def broadcast_ping(self) -> dict[int, Found]:
         """Everybody who answers at this baud, by id; takes 253 answering times, and no more than it needs to."""
         self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING))
         everybody = range(dxl2.MAX_ID + 1)
         with self.patient(len(everybody) * _PING_S):
-            packets = self._answers(everybody, 3)
-        return {servo: _found(packet) for servo, packet in packets.items() if len(packet.params) == 3}
+            answers = self._answers(everybody, 3)
+        return {servo: _found(answer) for servo, answer in answers.items() if len(answer.data) == 3}
 
     def reboot(self, servo: int) -> Answer | None:
         self._send(dxl2.encode_instruction(servo, dxl2.REBOOT))
@@ -134,20 +136,24 @@ class Dxl2Link(RegisterLink):
             write = self._writes[key] = _SyncWrite(build, length)
         self._send(write.packet(data))
 
-    def sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Packet]:
+    def sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Answer]:
         """Answers by id, of those that answered."""
-        self._send(self._read_request(address, length, servos, fast=False))
-        return self._answers(servos, length)
+        longer = length + self._extra
+        self._send(self._read_request(address, longer, servos, fast=False))
+        return self._trimmed(self._answers(servos, longer), length, len(servos))
 
-    def fast_sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Packet]:
+    def fast_sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Answer]:
         """As `sync_read`, but all answer in one packet, which stops where somebody is silent."""
+        wanted, length = length, length + self._extra
         self._send(self._read_request(address, length, servos, fast=True))
         size = 8 + len(servos) * (length + 4)
         buffer, start = bytearray(), -1
-        deadline_s = self.port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
-        last_s = deadline_s + size * self._byte_s + NO_PATIENCE * self.silence_s
+        allowance_s = self._allowance_s()
+        asked_s = self.port.now_s()
+        deadline_s = asked_s + (self._sent + size) * self._byte_s + allowance_s
+        last_s = deadline_s + self._rubbish_s()
         while len(buffer) < max(start, 0) + size and self.port.now_s() < last_s:
-            data = self.port.read(CHUNK, deadline_s)
+            data = self.port.read(CHUNK, min(deadline_s, last_s))
             if not data:
                 break
             buffer += data
@@ -155,14 +161,25 @@ class Dxl2Link(RegisterLink):
                 start = buffer.find(_HEADER + b"\x00\xfe")
             if len(buffer) > dxl2.MAX_PACKET + CHUNK:
                 break
-            deadline_s = self.port.now_s() + self.silence_s
-        answers: dict[int, Packet] = {}
+            deadline_s = self.port.now_s() + allowance_s
+        answers: dict[int, Answer] = {}
         for servo, error, data in dxl2.split_fast_status(buffer[max(start, 0) :], length):
             if servo in servos:
-                answers[servo] = Packet(servo, STATUS, data, error)
-        return answers
+                answers[servo] = Answer(error, data)
+        if len(answers) < len(servos):
+            self._waited(min(allowance_s, self.port.now_s() - asked_s))
+        return self._trimmed(answers, wanted, len(servos))
 
     # --- inside -------------------------------------------------------------------------------------------------
+
+    def _trimmed(self, answers: dict[int, Answer], length: int, asked: int) -> dict[int, Answer]:
+        """Data of `length` bytes. After a silence the next request asks for another length, so that what comes late
+        is told from its answer: a status packet does not say what it answers."""
+        if self._extra:
+            answers = {servo: Answer(error, data[:length]) for servo, (error, data) in answers.items()}
+        if len(answers) < asked:
+            self._extra = (self._extra + 1) % _LENGTHS
+        return answers
 
     def _read_request(self, address: int, length: int, servos: Sequence[int], fast: bool) -> bytes:
         return self._request(
@@ -191,21 +208,22 @@ class Dxl2Link(RegisterLink):
         self._sent = len(packet)
 
     def _answer(self, servo: int, length: int) -> Answer | None:
-        packet = self._answers([servo], length).get(servo)
-        return None if packet is None else Answer(packet.error, packet.params)
+        return self._answers([servo], length).get(servo)
 
-    def _answers(self, servos: Sequence[int], length: int) -> dict[int, Packet]:
+    def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
         """Status packets of `servos` with `length` bytes of data, or with an error and none.
 
         Waits until all are there, or nothing came for `silence_s` beyond the time that the bytes take.
         """
-        port, buffer, answers = self.port, bytearray(), dict[int, Packet]()
+        port, buffer, answers = self.port, bytearray(), dict[int, Answer]()
         pending = set(servos)
         size = STATUS_OVERHEAD + length
-        deadline_s = port.now_s() + (self._sent + size) * self._byte_s + self.silence_s
-        last_s = deadline_s + 2 * len(servos) * size * self._byte_s + NO_PATIENCE * self.silence_s
+        allowance_s = self._allowance_s()
+        asked_s = port.now_s()
+        deadline_s = asked_s + (self._sent + size) * self._byte_s + allowance_s
+        last_s = deadline_s + (len(servos) - 1) * size * self._byte_s + self._rubbish_s()
         while pending and port.now_s() < last_s:
-            data = port.read(CHUNK, deadline_s)
+            data = port.read(CHUNK, min(deadline_s, last_s))
             if not data:
                 break
             buffer += data
@@ -213,9 +231,11 @@ class Dxl2Link(RegisterLink):
                 servo, instruction, params, error = packet
                 expected = len(params) == length or (error & 0x7F and not params)
                 if instruction == STATUS and servo in pending and expected:
-                    answers[servo] = packet
+                    answers[servo] = Answer(error, params)
                     pending.remove(servo)
-            deadline_s = port.now_s() + self.silence_s
+            deadline_s = port.now_s() + allowance_s
+        if pending:
+            self._waited(min(allowance_s, port.now_s() - asked_s))
         return answers
 
 
@@ -263,5 +283,6 @@ def _additions(size: int, places: NDArray[np.intp]) -> NDArray[np.uint16]:
     return adds[places]
 
 
-def _found(packet: Packet) -> Found:
-    return Found(int.from_bytes(packet.params[:2], "little"), packet.params[2])
+def _found(answer: Answer) -> Found:
+    """Parameters of a ping's status: model number (2 bytes, low first), firmware version."""
+    return Found(int.from_bytes(answer.data[:2], "little"), answer.data[2])

@@ -7,9 +7,10 @@ are never asked to: there servos are read one by one, in rotation.
 from __future__ import annotations
 
 from sfms_robot.errors import ServoError
+from sfms_robot.servo.chain.member import State
 from sfms_robot.servo.chain.protocol1_bus import Frame1Bus
 from sfms_robot.servo.chain.protocol1_link import Frame1Link
-from sfms_robot.servo.chain.protocol1_poll import GroupRead
+from sfms_robot.servo.chain.status_poll import GroupRead
 
 
 class FeetechBus(Frame1Bus):
@@ -26,6 +27,6 @@ class FeetechBus(Frame1Bus):
         Raises ServoError for a joint that has torque, or a model that cannot.
         """
         index = self.joints.index(joint)
-        if index in self._care.wanted:
+        if self._members[index].state is not State.OFF:
             raise ServoError(f"{joint} (id {self._servos[index].id}) has torque on: stop it before it is calibrated")
-        self._shake(self._connected()).calibrate_here(index)
+        self._begin(self._connected()).calibrate_here(index)

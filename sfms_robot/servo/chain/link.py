@@ -1,11 +1,14 @@
-"""Registers over a wire, whatever the protocol: what buses, tools and handshakes need of a link.
+"""Registers over a wire, whatever the protocol: what buses, tools and startup need of a link.
 
-A link asks one servo at a time and says None where nobody answered; the error byte of an answer is the protocol's own.
+A request to one servo gives None where nobody answered; the error byte of an answer is the protocol's own. A request
+blocks until all answers are there, or no byte came for `silence_s` beyond the time that the bytes take on the wire.
+Inside `within` all requests share one allowance of silence, so that a poll costs one silence whoever is dead.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -44,12 +47,19 @@ class RegisterLink(ABC):
         port: owned by the link from now on.
         baud: bits per second, to tell how long bytes take.
         silence_s: how long to wait for the next byte before the servo counts as silent.
+
+    Attributes:
+        judged: whether the last request waited that long. Inside `within` it may not have, and then who did not answer
+            may still be there.
     """
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         self.port = port
         self.silence_s = silence_s
+        self.judged = True
         self._byte_s = 10.0 / baud
+        self._end_s = math.inf
+        self._left_s = math.inf
 
     @abstractmethod
     def ping(self, servo: int) -> Found | None: ...
@@ -88,6 +98,46 @@ class RegisterLink(ABC):
             yield
         finally:
             self.silence_s = usual
+
+    @contextmanager
+    def within(self, budget_s: float, silence_s: float) -> Iterator[None]:
+        """A time budget for the requests inside the block, which those who make them ask `affords` about.
+
+        Args:
+            budget_s: until then all requests are over.
+            silence_s: waiting for answers that do not come, all requests together; a request whose turn comes when
+                that is used up waits for nothing beyond what its bytes take.
+        """
+        self._end_s, self._left_s = self.port.now_s() + budget_s, silence_s
+        try:
+            yield
+        finally:
+            self._end_s = self._left_s = math.inf
+            self.judged = True
+
+    def affords(self, bytes_on_wire: int, alone: bool = False) -> bool:
+        """Whether a request that takes so many bytes, answer included, is over in time even when nobody answers.
+
+        `alone`: it asks for somebody who may well be silent, so it is of use only if that can be found out.
+        """
+        if alone and self._left_s < self.silence_s:
+            return False
+        allowance_s = min(self.silence_s, self._left_s)
+        return self.port.now_s() + bytes_on_wire * self._byte_s + allowance_s <= self._end_s
+
+    def _allowance_s(self) -> float:
+        """Silence that the next request may wait for."""
+        allowance_s = min(self.silence_s, self._left_s)
+        self.judged = allowance_s >= self.silence_s
+        return allowance_s
+
+    def _rubbish_s(self) -> float:
+        """What bytes that are no answer may cost a request."""
+        return NO_PATIENCE * self.silence_s if self._left_s == math.inf else 0.0
+
+    def _waited(self, in_vain_s: float) -> None:
+        """A request was not answered by everybody."""
+        self._left_s = max(0.0, self._left_s - in_vain_s)
 
     def rest(self, duration_s: float) -> None:
         """Leave the wire alone for so long; in virtual time that is no time. What comes meanwhile is dropped."""

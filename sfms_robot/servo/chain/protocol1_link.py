@@ -17,7 +17,7 @@ from typing import Final, Literal
 from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler
 
 from sfms_robot.errors import PacketError
-from sfms_robot.servo.chain.link import CHUNK, NO_PATIENCE, Answer, Found, RegisterLink
+from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.codecs import protocol1 as frame1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, OVERHEAD, Frame, encode, maybe_frame, salvage
@@ -207,15 +207,16 @@ class Frame1Link(RegisterLink):
         port, buffer, answers, echo = self.port, bytearray(), dict[int, Answer](), self._sent
         pending = set(servos)
         self._echoed = False
-        deadline_s = port.now_s() + len(echo) * self._byte_s + self.silence_s
-        answer_s = 2 * len(servos) * (OVERHEAD + length) * self._byte_s
-        last_s = deadline_s + answer_s + NO_PATIENCE * self.silence_s
+        allowance_s = self._allowance_s()
+        asked_s = port.now_s()
+        deadline_s = asked_s + (len(echo) + OVERHEAD + length) * self._byte_s + allowance_s
+        last_s = deadline_s + (len(servos) - 1) * (OVERHEAD + length) * self._byte_s + self._rubbish_s()
         while pending and port.now_s() < last_s:
-            data = port.read(CHUNK, deadline_s)
+            data = port.read(CHUNK, min(deadline_s, last_s))
             if not data:
                 break
             buffer += data
-            deadline_s = port.now_s() + self.silence_s
+            deadline_s = port.now_s() + allowance_s
             if len(buffer) < len(echo) and echo.startswith(buffer):
                 continue  # perhaps an adapter that hears itself
             if echo and buffer.startswith(echo):
@@ -227,6 +228,8 @@ class Frame1Link(RegisterLink):
         for frame in salvage(buffer):
             self._take(frame, length, pending, answers)
         now_s = port.now_s()
+        if pending:
+            self._waited(min(allowance_s, now_s - asked_s))
         for servo in pending:
             self._owed.setdefault(servo, {})[length] = now_s
         return answers

@@ -11,21 +11,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-_USE: Final = 0.8  # of a tick; the rest is for probes, retries and a busy computer
-_TURN_S: Final = 0.001
+USE: Final = 0.8  # of a tick; the rest is for probes, retries and a busy computer
+TURN_S: Final = 0.001
 _REQUEST: Final = 14  # bytes of a sync request without its ids
 _STATUS: Final = 11
 _FAST_HEAD: Final = 8
 _FAST_EACH: Final = 4
 
 
-def read_s(servos: int, length: int, baud: int, fast: bool) -> float:
-    """Seconds on the wire of one sync read of `length` bytes from `servos`."""
+def read_bytes(servos: int, length: int, fast: bool) -> int:
+    """Bytes on the wire of one sync read of `length` bytes from `servos`, request and answers."""
     if fast:
         reply = _FAST_HEAD + servos * (length + _FAST_EACH)
     else:
         reply = servos * (length + _STATUS)
-    return (_REQUEST + servos + reply) * 10.0 / baud + _TURN_S
+    return _REQUEST + servos + reply
+
+
+def read_s(servos: int, length: int, baud: int, fast: bool) -> float:
+    """Seconds that such a read takes."""
+    return read_bytes(servos, length, fast) * 10.0 / baud + TURN_S
 
 
 def write_s(servos: int, length: int, baud: int) -> float:
@@ -35,7 +40,7 @@ def write_s(servos: int, length: int, baud: int) -> float:
 
 def blocks_per_tick(servos: int, position: int, block: int, goal: int, baud: int, rate_hz: float, fast: bool) -> int:
     """How many servos' blocks fit in a tick beside goals and positions; all of them where one read does for all."""
-    budget_s = _USE / rate_hz - write_s(servos, goal, baud)
+    budget_s = USE / rate_hz - write_s(servos, goal, baud)
     if read_s(servos, block, baud, fast) <= budget_s:
         return servos
     left_s = budget_s - read_s(servos, position, baud, fast)

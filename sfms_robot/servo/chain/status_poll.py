@@ -1,0 +1,396 @@
+"""One poll of a wire: who answered, who did not, and what the answers say. For every family of the chain.
+
+On a chain each servo waits for the answer of the one before it, so where the answers to one request stop, exactly one
+servo is suspect, and those behind it are asked again in the same poll, without it. A single lost answer in the middle
+is forgiven once. A wire on which nobody answers blames nobody until it has happened a few times, and then everybody:
+the supply may be gone. Who is suspect is probed alone, with growing pauses, until it answers.
+
+**Time.** A poll has a budget, and its requests share one allowance of silence (`RegisterLink.within`): the first read
+is always made, everything else only when it would be over in time even if nobody answered. So any number of silent
+servos costs a poll one read deadline, once; whom a request had no time to wait for is not blamed.
+
+    budget = the larger of  0.8 / rate - goals,  first read + read deadline + a turn of the adapter
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from sfms_robot.config import Bus as BusConfig
+from sfms_robot.servo.chain.link import Answer, RegisterLink
+from sfms_robot.servo.chain.member import Member
+from sfms_robot.servo.chain.schedule import TURN_S, USE, Rotation, blocks_per_tick, read_bytes, read_s, write_s
+from sfms_robot.servo.chain.telemetry import Block, Telemetry
+from sfms_robot.servo.codecs.dxl2 import ALERT
+
+log = logging.getLogger(__name__)
+
+QUIET_POLLS: Final = 3  # polls without any answer before servos are blamed rather than the wire
+_REQUESTS: Final = 3  # for the same thing in one poll at most
+_SILENCES: Final = 2  # single reads in one poll that may stay unanswered
+_PROBES: Final = 4  # in one poll, as long as they are answered
+_FAST_FAILURES: Final = 5
+_HEALTH_POLLS: Final = 5  # between two looks at torque and error status, where several are read at once
+_HEALTH_SHARE: Final = 8  # servos in one look
+_ALERTS_READ: Final = 2  # per poll
+_IN_TURN_SHARE: Final = 0.6  # of a tick that reading servos one by one may take
+_SINGLE: Final = 14  # bytes of a single read and its answer beside the data, protocol 1
+_TURNAROUND_S: Final = 0.0005  # host and servo, between a request and its answer
+
+GroupRead = Callable[[int, int, Sequence[int]], Mapping[int, Answer]]
+
+
+@dataclass
+class Outcome:
+    """What asking everybody brought. `gaps`: ids where answers stopped; `missed`: ids that were passed over."""
+
+    answers: dict[int, Answer] = field(default_factory=dict)
+    gaps: list[int] = field(default_factory=list)
+    missed: list[int] = field(default_factory=list)
+    judged: bool = False  # somebody was waited for as long as it takes
+
+
+class StatusPoll:
+    """Asks the members of one bus and tells them what they said.
+
+    Args:
+        bus: its name, for messages.
+        members: in bus order.
+        telemetry: takes positions and the like.
+        config: of the bus.
+        counts: of the bus: reads, errors and retries are counted up in place.
+
+    Attributes:
+        budget_s: time that a poll may take, waiting for answers included.
+        quiet_polls: polls in a row in which nobody answered.
+    """
+
+    def __init__(
+        self, bus: str, members: Sequence[Member], telemetry: Telemetry, config: BusConfig, counts: dict[str, int]
+    ) -> None:
+        self._bus = bus
+        self._members = list(members)
+        self._ids = [member.id for member in members]
+        self._by_id = {member.id: member for member in members}
+        self._telemetry = telemetry
+        self._config = config
+        self._counts = counts
+        self._error_bits = [ALERT if telemetry.error is not None else _status_bits(member) for member in members]
+        self._restart(None, None)
+
+    def _restart(self, group: GroupRead | None, fast: GroupRead | None) -> None:
+        self._group, self._fast = group, fast
+        self._fast_proven, self._fast_failures = fast is not None, 0
+        self.quiet_polls = 0
+        self._rotation, self._looks, self._currents = Rotation(), Rotation(), Rotation()
+        self._polls = 0
+        self._turn = 0
+        self._flagged: set[int] = set()  # whose status says that something is wrong
+        self._missing = {member.id for member in self._members}  # who has to be told that it has answered
+        self._plan()
+
+    def restart(self, group: GroupRead | None, fast: GroupRead | None = None, proven: bool = True) -> None:
+        """Another connection.
+
+        Args:
+            group: reads several servos at once; None where they are read one by one, in rotation.
+            fast: the same in one packet of all, given up when it fails too often.
+            proven: the fast read is known to work here.
+        """
+        self._restart(group, fast)
+        self._fast_proven = proven and fast is not None
+
+    def reconnect(self, group: GroupRead | None, fast: GroupRead | None) -> None:
+        """The same wire, opened again: what was found out about it still holds."""
+        self._group = group if self._group is not None else None
+        self._fast = fast if self._fast is not None else None
+
+    @property
+    def has_fast(self) -> bool:
+        return self._fast is not None
+
+    @property
+    def has_group(self) -> bool:
+        return self._group is not None
+
+    def _plan(self) -> None:
+        """How many whole blocks fit into a tick, and the budget of a poll."""
+        telemetry, config, count = self._telemetry, self._config, len(self._ids)
+        fast, (_, position), (_, block) = self._fast is not None, telemetry.position, telemetry.block
+        goal = telemetry.goal.size
+        self._blocks = count
+        if telemetry.error is not None:  # the others are always asked for the block
+            self._blocks = blocks_per_tick(count, position, block, goal, config.baud, config.rate_hz, fast)
+        single_s = (_SINGLE + block) * 10.0 / config.baud + _TURNAROUND_S
+        self._many = max(1, int(_IN_TURN_SHARE / config.rate_hz / single_s))
+        first = read_s(count, position if self._blocks < count else block, config.baud, fast)
+        if self._group is None:
+            first = read_s(1, block, config.baud, False)
+        spare_s = USE / config.rate_hz - write_s(count, goal, config.baud)
+        self.budget_s = max(spare_s, first + config.read_deadline_ms / 1e3 + TURN_S)
+
+    def measure(self, link: RegisterLink, now_s: float) -> None:
+        """Everything of everybody who is listed, once; nobody is blamed."""
+        self._take(link, self._telemetry.block, self.read_some(link, self._telemetry.block, self._listed()), now_s)
+
+    def step(self, link: RegisterLink, now_s: float) -> bool:
+        """Ask; whether anybody answered. Raises BusError when the port fails."""
+        telemetry, listed = self._telemetry, self._listed()
+        whole = self._group is None or self._blocks >= len(self._ids)
+        where = telemetry.block if whole else telemetry.position
+        outcome = self._in_turn(link, listed) if self._group is None else self._everybody(link, where, listed)
+        answers = outcome.answers
+        self._counts["errors"] += len(outcome.gaps) + len(outcome.missed)
+        for servo in self._missing & answers.keys():
+            self._by_id[servo].answered()
+        self._missing -= answers.keys()
+        fresh = self._take(link, where, answers, now_s)
+        self._blame(outcome, now_s)
+        if not whole and answers:
+            chosen = self._rotation.take([servo for servo in listed if servo in answers], self._blocks)
+            fresh += self._take(link, telemetry.block, self.read_some(link, telemetry.block, chosen), now_s)
+        self._look(link, list(answers), now_s)
+        self._look_at_alerts(link, fresh, now_s)
+        return self._probe(link, now_s) or bool(answers)
+
+    # --- requests -----------------------------------------------------------------------------------------------
+
+    def _listed(self) -> list[int]:
+        return [member.id for member in self._members if member.presence.listed]
+
+    def read_some(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
+        """Answers of a few, by one request where the wire has one; nothing when there is no time for it."""
+        if self._group is not None:
+            if not ids or not link.affords(read_bytes(len(ids), where[1], False)):
+                return {}
+            self._counts["reads"] += 1
+            fast = self._fast if len(ids) > 1 and where == self._telemetry.block else None
+            return (fast or self._group)(*where, ids)
+        answers: dict[int, Answer] = {}
+        for servo in ids:
+            if not link.affords(read_bytes(1, where[1], False), alone=True):
+                break
+            self._counts["reads"] += 1
+            if (answer := link.read(servo, *where)) is not None:
+                answers[servo] = answer
+        return answers
+
+    def read_all(self, link: RegisterLink, where: Block, ids: Sequence[int], until_s: float) -> dict[int, Answer]:
+        """Answers of all who are there, outside of a poll: as long as it takes, but not beyond `until_s`."""
+        if self._group is not None:
+            return dict(self._group(*where, ids))
+        answers: dict[int, Answer] = {}
+        for servo in ids:
+            if link.port.now_s() >= until_s:
+                break
+            if (answer := link.read(servo, *where)) is not None:
+                answers[servo] = answer
+        return answers
+
+    def _everybody(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Outcome:
+        """All by one request, and those behind a silent one by a second."""
+        out = Outcome()
+        # Behind a dead servo in front everybody is silent: after a quiet poll somebody else is asked first.
+        start = self.quiet_polls * (len(ids) // QUIET_POLLS or 1) % max(1, len(ids))
+        rest = [*ids[start:], *ids[:start]]
+        for attempt in range(_REQUESTS):
+            # A wire that was quiet in the last poll as well is asked once: most likely nobody is there.
+            if not rest or (attempt > 0 and not out.answers and self.quiet_polls > 0):
+                break
+            if attempt > 0 and not link.affords(read_bytes(len(rest), where[1], False)):
+                break
+            self._counts["retries"] += attempt > 0
+            self._counts["reads"] += 1
+            fast = self._fast if attempt == 0 and len(rest) > 1 else None
+            got = self._request(fast or self._group, where, rest)
+            out.answers.update(got)
+            out.judged |= link.judged
+            if fast is not None and not got:
+                if self._fast_proven:  # the first servo is the likely cause: one silence in a poll is enough
+                    out.missed, rest = rest[:1], rest[1:]
+                else:
+                    rest = [*rest[1:], rest[0]]  # was it the first servo, or the fast read? Now the others come first
+                continue
+            if self._fast is not None and attempt == 1 and len(out.answers) == len(got):
+                self._count_against_fast(len(got) == len(rest))
+            elif fast is not None:
+                self._fast_failures = 0
+                self._fast_proven |= len(got) == len(rest)
+            last = max((i for i, servo in enumerate(rest) if servo in got), default=-1)
+            out.missed += [servo for servo in rest[: last + 1] if servo not in got]
+            if link.judged:
+                out.gaps += rest[last + 1 : last + 2]
+            rest = rest[last + 2 :]
+        if not out.answers:
+            out.missed = []  # on a quiet wire nobody was passed over
+        return out
+
+    def _request(self, read: GroupRead | None, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
+        return read(*where, ids) if read is not None else {}
+
+    def _count_against_fast(self, all_there: bool) -> None:
+        """Silence to a fast read that a plain one then breaks, everybody answering."""
+        self._fast_failures = self._fast_failures + 1 if all_there else 0
+        if self._fast_failures >= _FAST_FAILURES:
+            self._fast = None
+            self._plan()
+            log.warning("bus %r: fast sync read is not answered; plain sync read from now on", self._bus)
+
+    def _in_turn(self, link: RegisterLink, ids: Sequence[int]) -> Outcome:
+        """One by one, as many per poll as its share of a tick allows, going on where the last poll left off."""
+        out, where = Outcome(), self._telemetry.block
+        place = {servo: i for i, servo in enumerate(self._ids)}
+        order = sorted(ids, key=lambda servo: (place[servo] - self._turn) % len(place))
+        for number, servo in enumerate(order[: self._many]):
+            if number and not link.affords(read_bytes(1, where[1], False), alone=True):
+                break
+            self._turn = (place[servo] + 1) % len(place)
+            self._counts["reads"] += 1
+            if (answer := link.read(servo, *where)) is not None:
+                out.answers[servo] = answer
+            elif link.judged:
+                out.gaps.append(servo)
+                if len(out.gaps) >= _SILENCES:
+                    break
+        out.judged = bool(out.gaps)
+        return out
+
+    # --- who is there -------------------------------------------------------------------------------------------
+
+    def _blame(self, outcome: Outcome, now_s: float) -> None:
+        """End of asking everybody: who is suspect now."""
+        if outcome.answers:
+            self.quiet_polls = 0
+            found = outcome.gaps
+        else:
+            self.quiet_polls += outcome.judged
+            found = self._listed() if self.quiet_polls >= QUIET_POLLS else []
+        for servo in outcome.missed:
+            self._missing.add(servo)
+            self._by_id[servo].unanswered(now_s)
+        for servo in found:
+            self._missing.add(servo)
+            self._by_id[servo].suspect(now_s)
+
+    def _probe(self, link: RegisterLink, now_s: float) -> bool:
+        """Ask members that are not listed and have waited long enough, one by one, until one does not answer."""
+        answered = False
+        absent = [member for member in self._members if not member.presence.listed]
+        waiting = [member for member in absent if member.presence.probe_s <= now_s]
+        for _ in range(_PROBES):
+            if not waiting or not link.affords(read_bytes(1, self._telemetry.block[1], False), alone=True):
+                return answered
+            member = min(waiting, key=lambda each: each.presence.probe_s)
+            waiting.remove(member)
+            self._counts["retries"] += 1
+            where = self._telemetry.position if self._group is not None else self._telemetry.block
+            self._counts["reads"] += 1
+            answer = self._group(*where, [member.id]) if self._group is not None else None
+            if self._group is None and (single := link.read(member.id, *where)) is not None:
+                answer = {member.id: single}
+            if not answer:
+                member.probe_failed(now_s)
+                return answered
+            answered = True
+            member.answered()
+            self._missing.discard(member.id)
+            self._take(link, where, answer, now_s)
+            absent.remove(member)
+            for other in absent:
+                other.hurry(now_s)
+            waiting = list(absent)
+            self._take_health(self.read_some(link, self._telemetry.health, [member.id]), now_s)
+            member.back(now_s)
+        return answered
+
+    # --- what they say ------------------------------------------------------------------------------------------
+
+    def _take(self, link: RegisterLink, where: Block, answers: Mapping[int, Answer], now_s: float) -> list[int]:
+        """Values and status of those who told; ids whose alert has just come on."""
+        telemetry, length, alert = self._telemetry, where[1], self._telemetry.error is not None
+        good: list[int] = []
+        data: list[bytes] = []
+        fresh: list[int] = []
+        for servo, answer in answers.items():
+            member = self._by_id[servo]
+            status = answer.error & self._error_bits[member.index]
+            if len(answer.data) != length or (alert and answer.error & ~ALERT):
+                self._counts["errors"] += 1  # it refuses to say
+            else:
+                good.append(member.index)
+                data.append(answer.data)
+            if status or servo in self._flagged:
+                fresh += self._take_status(member, status, alert, now_s)
+        if good:
+            telemetry.take(where, good, data, now_s)
+            if where == telemetry.block:
+                self.judge_loads(good, now_s)
+        return fresh
+
+    def _take_status(self, member: Member, status: int, alert: bool, now_s: float) -> list[int]:
+        """What the error byte of an answer says of the servo; its id when it has to be asked what is wrong."""
+        known = member.id in self._flagged
+        (self._flagged.add if status else self._flagged.discard)(member.id)
+        if alert and status:
+            return [] if known else [member.id]
+        member.take_bits(status, self._telemetry.measured(member.index), now_s)
+        return []
+
+    def judge_loads(self, indices: Sequence[int], now_s: float) -> None:
+        """Present currents of servos that have just told them, against their load rules."""
+        currents = self._telemetry.current_mA.tolist()
+        for index in indices:
+            member = self._members[index]
+            if abs(currents[index]) > member.lowest_mA or member.over_load:
+                member.take_current(currents[index], now_s)
+
+    def _look(self, link: RegisterLink, ids: Sequence[int], now_s: float) -> None:
+        """Of a few, what is not in the block: torque, error status, a current that lies elsewhere."""
+        if not ids:
+            return
+        self._polls += 1
+        tells = [servo for servo in ids if self._telemetry.currents[self._by_id[servo].index] is not None]
+        if tells and (self._group is not None or self._polls % 2):
+            self._look_at_current(link, self._currents.take(tells, 1)[0], now_s)
+        if self._group is not None and self._polls % _HEALTH_POLLS == 0:
+            chosen = self._looks.take(ids, _HEALTH_SHARE)
+        elif self._group is None and not (tells and self._polls % 2):
+            chosen = self._looks.take(ids, 1)
+        else:
+            return
+        self._take_health(self.read_some(link, self._telemetry.health, chosen), now_s)
+
+    def _look_at_current(self, link: RegisterLink, servo: int, now_s: float) -> None:
+        index = self._by_id[servo].index
+        register = self._telemetry.currents[index]
+        if register is None or not link.affords(read_bytes(1, register.size, False), alone=True):
+            return
+        answer = link.read(servo, register.address, register.size)
+        if answer is not None and len(answer.data) == register.size:
+            self._telemetry.take_current(index, register, answer.data)
+            self.judge_loads([index], now_s)
+
+    def _look_at_alerts(self, link: RegisterLink, fresh: Sequence[int], now_s: float) -> None:
+        """Ask those whose alert bit has just come on what is wrong; who is not told of now is asked next time."""
+        asked = fresh[:_ALERTS_READ]
+        told = self.read_some(link, self._telemetry.health, asked) if asked else {}
+        self._flagged -= set(fresh) - told.keys()
+        self._take_health(told, now_s)
+
+    def _take_health(self, answers: Mapping[int, Answer], now_s: float) -> None:
+        telemetry = self._telemetry
+        for servo, answer in answers.items():
+            if len(answer.data) == telemetry.health[1]:
+                member = self._by_id[servo]
+                torque, bits = telemetry.health_of(answer.data)
+                if telemetry.error is not None:
+                    member.take_bits(bits, telemetry.measured(member.index), now_s)
+                member.take_torque(torque, now_s)
+
+
+def _status_bits(member: Member) -> int:
+    """Bits of a status packet's error byte that are about the servo; the others are about the request."""
+    return sum(1 << bit for bit in member.table.status_faults)

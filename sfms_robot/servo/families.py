@@ -1,0 +1,138 @@
+"""The table of bus families: what drives each, and what the tools call it. Classes are named, and imported on use.
+
+Another package adds a family by an entry point of the group `sfms_robot.buses`: its name is the family's, its value
+loads a `BusFamily`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Final
+
+from sfms_robot.config.named_bus import BUS_GROUP, FORMER_FAMILIES
+from sfms_robot.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class BusFamily:
+    """Servos, or boards of servos, that are driven alike.
+
+    Attributes:
+        title: the word for people.
+        bus: "module:class" of its `ports.Bus`.
+        maps: (family, protocol) of its firmware maps; the protocol is None for a board.
+        link: "module:class" of the `RegisterLink` that its tools speak through; None for a board, whose servos have
+            no registers.
+        dialect: what that class is told beside port, baud and patience.
+        bauds: bits per second that its servos may be set to, those met most often first.
+        max_id: highest id of a servo.
+        broadcast: whether one ping asks everybody.
+    """
+
+    title: str
+    bus: str
+    maps: tuple[str, int | None]
+    link: str | None = None
+    dialect: tuple[str, ...] = ()
+    bauds: tuple[int, ...] = ()
+    max_id: int = 253
+    broadcast: bool = False
+
+    @property
+    def board(self) -> bool:
+        """Its servos report nothing, not even where they stand."""
+        return self.link is None
+
+    @property
+    def protocol(self) -> int:
+        """Raises ConfigError for a board."""
+        if self.maps[1] is None:
+            raise ConfigError(f"{self.title}: a board speaks no servo protocol")
+        return self.maps[1]
+
+    def bus_class(self) -> Any:
+        return _resolved(self.bus)
+
+    def link_class(self) -> Any:
+        """Raises ConfigError for a board."""
+        if self.link is None:
+            raise ConfigError(f"{self.title}: a board has no registers to read or write")
+        return _resolved(self.link)
+
+
+_CHAIN: Final = "sfms_robot.servo.chain"
+_BOARDS: Final = "sfms_robot.servo.boards"
+_OWN: Final = {
+    "dynamixel2": BusFamily(
+        "Dynamixel 2.0",
+        f"{_CHAIN}.dynamixel2_bus:DynamixelBus",
+        ("dynamixel", 2),
+        f"{_CHAIN}.dynamixel2_link:Dxl2Link",
+        (),
+        (1_000_000, 57_600, 4_000_000, 2_000_000, 3_000_000, 115_200, 9_600, 4_500_000),
+        252,
+        True,
+    ),
+    "dynamixel1": BusFamily(
+        "Dynamixel 1.0",
+        f"{_CHAIN}.dynamixel1_bus:Dynamixel1Bus",
+        ("dynamixel", 1),
+        f"{_CHAIN}.protocol1_link:Frame1Link",
+        ("dynamixel",),
+        (1_000_000, 57_600, 115_200, 500_000, 200_000, 250_000, 400_000, 19_200, 9_600),
+    ),
+    "feetech": BusFamily(
+        "Feetech",
+        f"{_CHAIN}.feetech_bus:FeetechBus",
+        ("feetech", 1),
+        f"{_CHAIN}.protocol1_link:Frame1Link",
+        ("feetech",),
+        (1_000_000, 115_200, 500_000, 57_600, 38_400, 250_000, 128_000, 76_800),
+        253,
+        True,
+    ),
+    "maestro": BusFamily("Pololu Maestro", f"{_BOARDS}.maestro_bus:MaestroBus", ("maestro", None)),
+    "ssc32": BusFamily("Lynxmotion SSC-32", f"{_BOARDS}.ssc32_bus:Ssc32Bus", ("ssc32", None)),
+}
+
+
+@cache
+def families() -> Mapping[str, BusFamily]:
+    """All of them by name: our own, then those of other packages. Raises ConfigError for an entry that is none."""
+    found = dict(_OWN)
+    for entry in entry_points(group=BUS_GROUP):
+        family = entry.load()
+        if not isinstance(family, BusFamily):
+            raise ConfigError(f"entry point {BUS_GROUP}: {entry.name} = {entry.value} is not a BusFamily")
+        if entry.name in found:
+            raise ConfigError(f"entry point {BUS_GROUP}: {entry.name} = {entry.value}: there is a family of that name")
+        found[entry.name] = family
+    return found
+
+
+def servo_families() -> Mapping[str, BusFamily]:
+    """Those whose servos have registers, by name: what the servo tools can talk to."""
+    return {name: family for name, family in families().items() if not family.board}
+
+
+def family_named(name: str) -> BusFamily:
+    """A family by its name, or by that of version 0.1.0. Raises ConfigError naming those there are."""
+    known = families()
+    name = current_name(name)
+    if name not in known:
+        raise ConfigError.at("buses", "family", name, "is unknown", known)
+    return known[name]
+
+
+def current_name(name: str) -> str:
+    """The name as it is said now."""
+    return FORMER_FAMILIES.get(name, name)
+
+
+def _resolved(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(import_module(module), name)

@@ -1,0 +1,279 @@
+"""What a bus may cost in time, and how late torque-off may be: on a port where silence costs time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from families import FAMILIES
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from timed import CHAINS, READ_DEADLINE_S, Time, timed
+
+from sfms_robot.config import LoadRule, Safety
+from sfms_robot.servo.composite import CompositeBus
+
+BYTE_S = 10 / 1_000_000
+SLACK_S = 200 * BYTE_S  # the exchange that may be under way when the budget ends
+
+
+def most(rig, n, held):
+    rig.polls_s.clear()
+    readings = rig.ticks(held, n)
+    return max(rig.polls_s), readings
+
+
+@pytest.mark.parametrize("family", CHAINS)
+def test_any_number_of_silent_servos_costs_one_read_deadline_in_a_poll(family):
+    rig = timed(family)
+    held = rig.hold()
+    healthy_s, _ = most(rig, 30, held)
+    for dead in ({14}, {1}, {28}, {3, 9, 10, 20, 28}):
+        rig.port.mute = dead
+        worst_s, readings = most(rig, 120, held)
+        assert worst_s <= healthy_s + READ_DEADLINE_S + 0.001 + SLACK_S
+        assert worst_s <= rig.bus.poll_budget_s + SLACK_S
+        assert rig.bus.statistics()["silent"] == sorted(dead)
+        assert all(readings[f"joint{i}"].age_s < 0.1 for i in rig.ids if i not in dead)
+
+
+@pytest.mark.parametrize("family", CHAINS)
+@settings(max_examples=6, suppress_health_check=[HealthCheck.too_slow])
+@given(st.data())
+def test_no_pattern_of_loss_makes_a_poll_longer_than_its_budget(family, data):
+    rig = timed(family)
+    held = rig.hold()
+    rig.ticks(held, 2)
+    rig.polls_s.clear()
+    for _ in range(6):
+        rig.port.mute = data.draw(st.sets(st.integers(1, 28), max_size=28), label="mute")
+        lost = data.draw(st.sets(st.integers(1, 28), max_size=28), label="answers lost")
+        rig.port.lose = lost.__contains__
+        rig.port.deaf = data.draw(st.integers(0, 5), label="deaf") == 0
+        rig.ticks(held, 2)
+    assert max(rig.polls_s) <= rig.bus.poll_budget_s + SLACK_S
+
+
+@pytest.mark.parametrize("family", CHAINS)
+def test_everybody_is_back_after_a_bad_time(family):
+    rig = timed(family, 12)
+    held = rig.hold()
+    rig.ticks(held, 2)
+    random = np.random.default_rng(5)
+    for _ in range(20):
+        rig.port.mute = set(random.integers(1, 13, 3).tolist())
+        rig.port.lose = lambda servo: random.random() < 0.2
+        rig.port.deaf = random.random() < 0.1
+        rig.ticks(held, 3)
+    rig.port.mute, rig.port.lose, rig.port.deaf = set(), lambda servo: False, False
+    readings = rig.ticks(held, 250)
+    assert all(reading.age_s < 0.1 and reading.fault is None for reading in readings.values())
+    assert rig.bus.statistics()["silent"] == [] and rig.torques() == [1] * 12
+
+
+def test_28_servos_at_100_hz_and_1_mbit_keep_their_tick_with_two_bad_connections():
+    rig = timed("dynamixel2")
+    held = rig.hold()
+    rig.ticks(held, 5)
+    random = np.random.default_rng(1)
+    rig.port.lose = lambda servo: servo in (5, 17) and random.random() < 0.3
+    rig.polls_s.clear()
+    rig.ticks(held, 300)
+    goals_s = (14 + 28 * 5) * BYTE_S
+    assert max(rig.polls_s) + goals_s <= rig.period_s
+
+
+@pytest.mark.parametrize("family", CHAINS)
+def test_torque_off_is_on_the_wire_before_anybody_is_asked(family):
+    rig = timed(family)
+    rig.ticks(rig.hold(), 3)
+    rig.port.mute = set(rig.ids)  # they hear, and do not answer
+    began_s, mark = rig.clock.t, len(rig.port.sent)
+    rig.bus.stop("release")
+    assert rig.clock.t - began_s <= 0.5
+    sent_s, packet = rig.port.sent[mark]
+    assert sent_s - began_s <= 0.02
+    assert rig.torques() == [0] * 28
+    rig.port.mute.clear()
+    torque = rig.family.table.role("torque_enable")
+    named = packet[12:-2:2] if rig.family.table.protocol == 2 else packet[7:-1:2]
+    assert list(named) == rig.ids and torque.size == 1
+
+
+@pytest.mark.parametrize("first", CHAINS)
+def test_two_mute_buses_have_torque_off_within_20_ms_and_stop_within_half_a_second(first):
+    clock = Time()
+    one, two = timed(first, 28, clock), timed("dynamixel2", 28, clock)
+    two.bus.joints = tuple(f"other{i}" for i in two.ids)
+    bus = CompositeBus({"one": one.bus, "two": two.bus}, [*one.bus.joints, *two.bus.joints])
+    bus.connect()
+    held = bus.enable(bus.joints)
+    bus.write(held, clock.t)
+    bus.poll(clock.t)
+    one.port.mute, two.port.mute = set(one.ids), set(two.ids)
+    began_s, marks = clock.t, [len(each.port.sent) for each in (one, two)]
+    bus.stop("release")
+    assert clock.t - began_s <= 0.5
+    for each, mark in zip((one, two), marks, strict=True):
+        assert each.port.sent[mark][0] - began_s <= 0.02
+        assert each.torques() == [0] * 28
+
+
+@pytest.mark.parametrize("family", CHAINS)
+def test_torque_off_waits_for_nobody_and_no_goal_follows_it(family):
+    rig = timed(family, 8)
+    held = rig.hold()
+    rig.ticks(held, 2)
+    rig.port.mute = set(rig.ids)
+    began_s = rig.clock.t
+    rig.bus.torque_off("hold")
+    assert rig.clock.t == began_s
+    rig.bus.torque_off("release")
+    assert rig.clock.t - began_s < 0.001
+    rig.port.mute = set()
+    rig.ticks(held + 0.1, 100)
+    assert rig.torques() == [0] * 8
+    assert rig.bus.enable(rig.bus.joints) == pytest.approx(held, abs=0.02)
+    rig.ticks(held, 5)
+    assert rig.torques() == [1] * 8
+
+
+@pytest.mark.parametrize("family", CHAINS)
+def test_watchdogs_are_switched_off_after_the_torque(family):
+    rig = timed(family, 8)
+    rig.ticks(rig.hold(), 60)
+    watchdog = rig.family.table.role("bus_watchdog")
+    if watchdog is None:
+        return
+    assert {rig.register(i, "bus_watchdog") for i in rig.ids} == {10}
+    mark = len(rig.port.sent)
+    rig.bus.stop("release")
+    addresses = [int.from_bytes(packet[8:10], "little") for _, packet in rig.port.sent[mark:]]
+    assert addresses.index(rig.family.table.role("torque_enable").address) < addresses.index(watchdog.address)
+    assert {rig.register(i, "bus_watchdog") for i in rig.ids} == {0}
+
+
+@pytest.mark.parametrize("family", CHAINS)
+@pytest.mark.parametrize("origin_s", [0.0, 100.0, -3.0])
+def test_age_is_never_negative_and_a_servo_dead_since_connect_is_not_fresh(family, origin_s):
+    rig = timed(family, 4)
+    held = rig.hold()
+    rig.loop_origin_s = origin_s
+    rig.port.mute = {4}
+    began_s = rig.clock.t
+    for _ in range(50):
+        readings = rig.tick(held)
+        assert all(reading.age_s >= 0.0 for reading in readings.values())
+    assert readings["joint4"].age_s >= rig.clock.t - began_s - 0.02
+    assert readings["joint1"].age_s < 0.05
+
+
+GENTLE = Safety(pinch=LoadRule(current_mA=200, for_s=0.1, then="limp"))
+
+
+def pinched(rig, held):
+    """Ticks until joint 2 is pinched, by the bus's own rule."""
+    rig.port.device.servo(2).plant.stuck = True
+    goals = held.copy()
+    goals[1] += 0.5
+    for _ in range(200):
+        rig.tick(goals)
+        if any("pinched" in fault for fault in rig.bus.statistics()["faults"]):
+            return goals
+    raise AssertionError("nobody noticed")
+
+
+TELLS_CURRENT = [name for name in CHAINS if name in ("dynamixel2", "sts")]
+
+
+def loses_answers_about(rig, servo_id, role_or_name):
+    """From now on no answer of a servo to a read of one register comes through."""
+    table = rig.family.table
+    here = table.role(role_or_name) or table[role_or_name]
+
+    def lost(servo):
+        packet = rig.port.sent[-1][1]
+        address = int.from_bytes(packet[8:10], "little") if table.protocol == 2 else packet[5]
+        return servo == servo_id and address == here.address
+
+    rig.port.lose = lost
+
+
+@pytest.mark.parametrize("family", TELLS_CURRENT)
+def test_pinched_servo_is_limp_at_once_though_nothing_it_says_of_its_torque_arrives(family):
+    rig = timed(family, 4, safety=GENTLE)
+    held = rig.hold()
+    rig.ticks(held, 3)
+    loses_answers_about(rig, 2, "torque_enable")
+    goals = pinched(rig, held)
+    assert rig.torques() == [1, 0, 1, 1]  # in the very poll in which the rule was broken
+    assert rig.ticks(goals, 50)["joint2"].fault is not None
+
+
+@pytest.mark.parametrize("family", TELLS_CURRENT)
+def test_torque_off_that_gets_lost_is_a_named_fault_and_is_repeated(family):
+    rig = timed(family, 4, safety=GENTLE)
+    held = rig.hold()
+    rig.ticks(held, 3)
+    servo = rig.port.device.servo(2)
+    write, torque = servo.write, rig.family.table.role("torque_enable").address
+    servo.write = lambda address, data, now_s: 0 if address == torque else write(address, data, now_s)  # it refuses
+    goals = pinched(rig, held)
+    readings = rig.ticks(goals, 10)
+    assert rig.torques()[1] == 1
+    assert readings["joint2"].fault == "torque is not off"
+    assert "joint2: torque is not off" in rig.bus.statistics()["faults"]
+    servo.write = write
+    readings = rig.ticks(goals, 2)
+    assert rig.torques() == [1, 0, 1, 1]
+    assert rig.ticks(goals, 3)["joint2"].fault != "torque is not off"
+
+
+@pytest.mark.parametrize("family", TELLS_CURRENT)
+def test_reduce_is_half_whatever_acknowledgements_are_lost(family):
+    rule = LoadRule(current_mA=200, for_s=0.1, then="reduce")
+    limits = Safety(pinch=rule, current_limit_mA=700) if family == "dynamixel2" else Safety(pinch=rule)
+    rig = timed(family, 4, safety=limits)
+    held = rig.hold()
+    strength = "goal_current" if family == "dynamixel2" else "torque_limit"
+    full = rig.register(2, strength)
+    loses_answers_about(rig, 2, strength)
+    goals = pinched(rig, held)
+    for _ in range(100):
+        rig.tick(goals)
+        assert rig.register(2, strength) == full // 2
+    rig.port.lose = lambda servo: False
+    rig.ticks(goals, 5)
+    assert rig.register(2, strength) == full // 2
+
+
+@pytest.mark.parametrize("family", CHAINS)
+def test_setting_that_is_not_what_was_asked_for_is_a_named_fault(family):
+    rig = timed(family, 4)
+    held = rig.hold()
+    rig.ticks(held, 60)
+    table = rig.family.table
+    name = "profile_velocity" if family == "dynamixel2" else None
+    name = name or next(each for each in ("moving_speed", "goal_velocity") if each in table.fields)
+    servo = rig.port.device.servo(3)
+    servo.write(table[name].address, table[name].to_bytes(77), rig.clock.t)
+    readings = rig.ticks(held, 220)
+    assert readings["joint3"].fault == f"{name} reads 77, set to 0"
+    assert f"joint3: {name} reads 77, set to 0" in rig.bus.statistics()["faults"]
+    servo.write(table[name].address, table[name].to_bytes(0), rig.clock.t)
+    assert rig.ticks(held, 220)["joint3"].fault is None
+
+
+def test_watchdog_whose_first_write_is_lost_is_armed_all_the_same():
+    rig = timed("dynamixel2", 4)
+    held = rig.hold()
+    servo = rig.port.device.servo(3)
+    write, address = servo.write, rig.family.table["bus_watchdog"].address
+    servo.write = lambda at, data, now_s: 0 if at == address else write(at, data, now_s)
+    rig.ticks(held, 5)
+    servo.write = write
+    rig.ticks(held, 3)
+    assert [rig.register(i, "bus_watchdog") for i in rig.ids] == [10] * 4
+
+
+def test_every_family_of_a_chain_is_tried():
+    assert set(CHAINS) == {name for name, family in FAMILIES.items() if family.table.protocol is not None}
