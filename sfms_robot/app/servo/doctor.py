@@ -12,8 +12,6 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, cast
 
-import numpy as np
-
 from sfms_robot.app.servo.budget import BOARDS, Budget, board_budget, wire_budget
 from sfms_robot.app.servo.diagnosis import (
     Command,
@@ -37,9 +35,9 @@ from sfms_robot.app.servo.servo_state import State, read_all
 from sfms_robot.app.servo.servo_tools import Confirm, Progress, field_named, guard, put, scan, twins
 from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
 from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.config.overlay import head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
-from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.codecs import maestro, ssc32
@@ -161,6 +159,7 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         }
     else:
         where = devices(described, port or only_port())
+        described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
     for name, device in where.items():
         bus = described.buses[name]
         shown = SIM if port == SIM else device
@@ -172,8 +171,9 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
     thresholds = {name: (each.min, each.max) for name, each in head.faults.thresholds.items()}
     joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
     maps = {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
-    turns = np.array([maps[joint.model].ticks_per_revolution for joint in joints.values()])
-    ranges = Calibration(joints, turns)
+    from sfms_robot.app.wiring import calibration_of
+
+    ranges = calibration_of(joints)
     ids = frozenset(joint.id for joint in joints.values())
     found = {}
     for name, low, high in zip(joints, ranges.low_ticks, ranges.high_ticks, strict=True):
