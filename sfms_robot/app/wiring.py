@@ -57,7 +57,8 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
         hanging = np.array([joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)])
         ticks = int(calibration_of({name: joint}).to_ticks(hanging)[0])
         baud = head.buses[joint.bus].baud
-        by_bus.setdefault(joint.bus, []).append(EmulatedServo(joint.id, joint.model, baud, ticks))
+        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
+        by_bus.setdefault(joint.bus, []).append(servo)
     return by_bus
 
 
@@ -72,6 +73,9 @@ def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
             raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
     joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
     return {
-        bus: [replace(servo, registers=stored.of(joints[bus, servo.id]), supply_v=stored.supply_v) for servo in servos]
+        bus: [
+            replace(servo, registers={**servo.registers, **stored.of(joints[bus, servo.id])}, supply_v=stored.supply_v)
+            for servo in servos
+        ]
         for bus, servos in emulated(head).items()
     }
