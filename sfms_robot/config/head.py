@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, load
 from sfms_robot.config.drives import expanded, problems
@@ -198,6 +199,12 @@ class Head(Model):
     regions: dict[Name, Region] = Field(default_factory=dict)
     kinematics: Kinematics | None = None
     life: Life = Life()
+    _folder: Path | None = PrivateAttr(None)
+
+    @property
+    def folder(self) -> Path | None:
+        """Where its file lies; None for a head that was made otherwise."""
+        return self._folder
 
     @model_validator(mode="before")
     @classmethod
@@ -241,4 +248,7 @@ def wiring(joints: Mapping[str, Joint | None], buses: Collection[str], limits: C
 
 def load_head(name: str) -> Head:
     """A head by shipped name or folder."""
-    return load(Head, find("heads", name, "head.yaml") / "head.yaml")
+    folder = find("heads", name, "head.yaml")
+    head = load(Head, folder / "head.yaml")
+    head._folder = folder
+    return head
