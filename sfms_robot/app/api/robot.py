@@ -14,8 +14,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from numpy.typing import ArrayLike
-
 from sfms_robot.app.api.background import Background, Report
 from sfms_robot.app.api.live_knobs import LiveKnobs
 from sfms_robot.app.api.named_head import head_name
@@ -30,7 +28,8 @@ from sfms_robot.retarget.head import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
 from sfms_robot.runtime.safety import Interrupt
-from sfms_robot.sources.push import PushSource
+from sfms_robot.sources.push import Pcm, PushSource
+from sfms_robot.sources.validated import ValidatedSource
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +100,9 @@ class Robot:
         config = load_head(self._options.head)
         self._listener = own
         self._push = PushSource() if pushed else None
-        self._source: Source | None = self._push if pushed else source
+        inner = self._push if pushed else source
+        self._source = None if inner is None else ValidatedSource(inner)
+        self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
         self._puppet = Puppet(config.life.gaze, frozenset(HeadRetargeter(config).blind_channels))
         self._knobs = LiveKnobs(config, intensity or {}, style or {})
@@ -152,22 +153,31 @@ class Robot:
 
     # --- what the robot hears and sees ---
 
-    def hear(self, pcm: ArrayLike, rate_hz: float) -> None:
-        """The person's voice: the next piece of sound, any length; see `PushSource.hear`. Never blocks."""
+    def hear(self, pcm: Pcm, rate_hz: float) -> None:
+        """The person's voice: the next piece of sound, of any length. Never blocks.
+
+        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. Sound that has
+        waited for more than a second is left out. Raises ConfigError for another type, shape or rate.
+        """
         self._pushed("hear").hear(pcm, rate_hz)
 
-    def see(self, face: FaceFrame | ArrayLike | None) -> None:
-        """The person's face now; None when it is not seen. See `PushSource.see`. Never blocks."""
+    def see(self, face: FaceFrame | Floats | None) -> None:
+        """The person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms. Never blocks.
+
+        Raises ConfigError for another shape.
+        """
         self._pushed("see").see(face)
 
-    def say(self, pcm: ArrayLike, rate_hz: float) -> None:
-        """What the robot itself says: the next piece of sound, any length; see `PushSource.say`. Never blocks."""
+    def say(self, pcm: Pcm, rate_hz: float) -> None:
+        """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
+
+        Play it one frame (40 ms) after it is handed over. Up to two minutes may wait. Never blocks.
+        """
         self._pushed("say").say(pcm, rate_hz)
 
     def _pushed(self, what: str) -> PushSource:
         if self._push is None:
-            audio = self._options.audio if self._source is None else type(self._source).__name__
-            raise InputError(f'{what}() needs audio="push"; this robot listens to {audio!r}')
+            raise InputError(f'{what}() needs audio="push"; this robot listens to {self._hears!r}')
         return self._push
 
     # --- what the face shows ---
