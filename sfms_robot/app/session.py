@@ -27,11 +27,12 @@ from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import run_report
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
-from sfms_robot.config import Head, Joint, find, load_head
+from sfms_robot.config import Head, Joint, load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.frames import Doubles, Floats
+from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.motion.audit import Audit
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
@@ -433,7 +434,7 @@ def run(
 
 def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     """Inline in virtual time, so that one seed is one run; else in a process of its own, which loads from now on."""
-    find("listeners", options.listener, "config.yaml")
+    listener_folder(options.listener)
     feed: PlanFeed
     if options.fast:
         from sfms_robot.listeners.registry import load_listener, one_thread  # torch: only here in this process

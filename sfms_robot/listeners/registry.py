@@ -6,8 +6,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final, cast
 
-from sfms_robot.config import find
 from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.listeners.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
 # kind -> module with load(folder) -> Listener
@@ -15,8 +15,13 @@ LOADERS: Final = {"sfms": "sfms_robot.listeners.sfms", "arig": "sfms_robot.liste
 
 
 def load_listener(name: str | Path) -> Listener:
-    """A listener by shipped name, or of a folder with config.yaml and weights. Raises ConfigError or ModelError."""
-    folder = find("listeners", str(name), "config.yaml")
+    """A listener by shipped name, of a folder with config.yaml and weights, or of another package.
+
+    Raises ConfigError or ModelError.
+    """
+    folder = listener_folder(str(name))
+    if folder is None:
+        return load_plugin(str(name))
     module = import_module(LOADERS[load_config(folder).kind])
     return cast(Listener, module.load(folder))
 
