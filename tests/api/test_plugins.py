@@ -1,4 +1,4 @@
-"""A package of somebody else's adds a listener by name: a real one, with its dist-info, beside ours."""
+"""A package of somebody else's adds listeners and buses by name: a real one, with its dist-info, beside ours."""
 
 import os
 import subprocess
@@ -27,6 +27,14 @@ class Nodder:
         return sr.Plan(speaker.time_s, np.array([speaker.time_s + 0.04]), frames), memory
 """
 
+FAMILY = """
+from sfms_robot.servo.families import BusFamily
+
+FAMILY = BusFamily("Somebody's servos", "somebodys_servos:Bus", ("somebodys", None))
+
+class Bus: ...
+"""
+
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
@@ -38,7 +46,9 @@ def installed(tmp_path, monkeypatch):
     (info / "entry_points.txt").write_text(
         "[sfms_robot.listeners]\nnodder = somebodys_nods:Nodder\nbroken = somebodys_nods:Missing\n"
         "sfms-small = somebodys_nods:Nodder\n"
+        "[sfms_robot.buses]\nsomebodys = somebodys_servos:FAMILY\n"
     )
+    (tmp_path / "somebodys_servos.py").write_text(FAMILY)
     monkeypatch.syspath_prepend(str(tmp_path))
     return tmp_path
 
@@ -70,3 +80,13 @@ def test_a_run_listens_with_it_in_its_own_process(installed):
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
     assert done.returncode == 0, done.stderr
     assert '"listener_state": {"state": "listening"' in done.stdout.splitlines()[-1]
+
+
+def test_a_bus_family_of_another_package_is_in_the_table(installed):
+    code = (
+        "from sfms_robot.servo.families import family_named\n"
+        "family = family_named('somebodys'); print(family.title, family.bus_class())"
+    )
+    here = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
+    assert done.stdout.strip() == "Somebody's servos <class 'somebodys_servos.Bus'>", done.stderr
