@@ -12,7 +12,7 @@ from sfms_robot.cli import main as command_line
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 
 START = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()"]
-LIGHT = {"torch", "scipy", "numpy", "pydantic", "matplotlib", "vtkmodules", "ruckig"}
+LIGHT = {"torch", "scipy", "numpy", "matplotlib", "vtkmodules", "ruckig"}
 
 
 @pytest.fixture
