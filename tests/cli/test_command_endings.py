@@ -12,7 +12,7 @@ from sfms_robot.cli import main as command_line
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 
 START = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()"]
-LIGHT = {"torch", "scipy", "numpy", "matplotlib", "vtkmodules", "ruckig"}
+HEAVY = {"torch", "scipy", "numpy", "matplotlib", "vtkmodules", "ruckig"}
 
 
 @pytest.fixture
@@ -108,7 +108,8 @@ def test_a_slip_of_the_keyboard_is_found_before_anything_is_loaded(words, code):
         "import sys; from sfms_robot.cli.main import main\n"
         f"try: main(['run', *{words!r}])\n"
         "except SystemExit as ended: code = ended.code\n"
-        f"sys.exit(f'loaded {{{LIGHT!r} & set(sys.modules)}}' if {LIGHT!r} & set(sys.modules) else code)"
+        f"loaded = {HEAVY!r} & set(sys.modules)\n"
+        "sys.exit(f'loaded {loaded}' if loaded else code)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == code, done.stderr
