@@ -137,6 +137,17 @@ def prepare_head(options: HeadOptions) -> Head:
 
 
 @contextmanager
+def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
+    """Where each bus of the head is: emulated servos, which live as long as this does, or devices. Opens no port."""
+    with ExitStack() as stack:
+        if options.port != SIM:
+            yield devices(head, options.port)
+            return
+        chains = plugged_in(options.head, head)
+        yield {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
+
+
+@contextmanager
 def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     """Connect to every servo of a head. Blocks for as long as identifying takes. Raises RobotError."""
     prepare_head(options)
@@ -145,12 +156,7 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     motion = build_motion(head, rate_hz)
     clock: Clock = VirtualClock() if options.fast else RealClock()
     with ExitStack() as stack:
-        opened: Opened
-        if options.port == SIM:
-            chains = plugged_in(options.head, head)
-            opened = {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
-        else:
-            opened = devices(head, options.port)
+        opened = stack.enter_context(open_wires(head, options))
         bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without)
         stack.callback(bus.close)
         bus.connect()
