@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sfms_robot.config import FirmwareMap, Head, Joint
+from sfms_robot.config.register_rules import check_registers
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.servo.policy import tells_current, torque_register
@@ -16,13 +17,13 @@ from sfms_robot.servo.stored_settings import JointNeeds, home_ticks
 def check_safety(head: Head, joints: Mapping[str, Joint], maps: Mapping[str, FirmwareMap]) -> None:
     """Of joints, and the maps of their models. A rule that nobody keeps is worse than none.
 
-    Raises ConfigError for a limit that a joint's servo cannot keep, a register that it does not have, or more turns
-    than it makes.
+    Raises ConfigError for a limit that a joint's servo cannot keep, a register that a run must not write, or more
+    turns than it makes.
     """
     for name, joint in joints.items():
         _limits(head, name, maps[joint.model])
-        _registers(head, name, maps[joint.model])
         _turns(head, name, maps[joint.model])
+    check_registers(head.name, {name: (head.safety_of(name), maps[joint.model]) for name, joint in joints.items()})
 
 
 def _limits(head: Head, name: str, table: FirmwareMap) -> None:
@@ -47,18 +48,6 @@ def _limits(head: Head, name: str, table: FirmwareMap) -> None:
             )
         except_here = f"for {name}: {joint.model} {why} (joints.{name}.safety.{key}: null leaves it out)"
         raise ConfigError.at(head.name, f"safety.{key}", value, f"cannot be kept {except_here}")
-
-
-def _registers(head: Head, name: str, table: FirmwareMap) -> None:
-    model, registers = head.joints[name].model, table.registers
-    for register, value in head.safety_of(name).registers.items():
-        key = f"joints.{name}.safety.registers.{register}"
-        if register not in registers or registers[register].access != "RW":
-            choices = [each for each, row in registers.items() if row.access == "RW"]
-            raise ConfigError.at(head.name, key, value, f"is no register of {model} to be written", choices)
-        if not registers[register].low <= value <= registers[register].high:
-            allowed = f"{registers[register].low}..{registers[register].high}"
-            raise ConfigError.at(head.name, key, value, f"does not fit {model}", [allowed])
 
 
 def _turns(head: Head, name: str, table: FirmwareMap) -> None:

@@ -23,10 +23,12 @@ import yaml
 from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Model, Name, load
-from sfms_robot.config.drives import problems
+from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Head, Joint, Safety
+from sfms_robot.config.head import Head
+from sfms_robot.config.joint import Joint
 from sfms_robot.config.mapping import Expression
+from sfms_robot.config.safety_rules import Safety
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 

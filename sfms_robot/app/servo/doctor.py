@@ -42,7 +42,7 @@ from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
-from sfms_robot.servo.families import current_name, servo_families
+from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds
@@ -162,9 +162,8 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
     for name, device in where.items():
         bus = described.buses[name]
-        speaks = current_name(bus.family)
         shown = SIM if port == SIM else device
-        yield Line(name, device, shown, speaks, bus.baud, bus.rate_hz, _wanted(described, name), head)
+        yield Line(name, device, shown, bus.family, bus.baud, bus.rate_hz, _wanted(described, name), head)
 
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
