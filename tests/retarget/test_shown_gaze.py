@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.config.caution import cautious
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
-from sfms_robot.retarget import life
+from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.eyes import directions
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 TICK_S, FULL_RAD = 0.01, np.radians([30.0, 20.0])
 HEADS = {name: load_head(name) for name in ("face28", "inmoov2_ssc32", "reachy_mini", "op3_head")}
@@ -28,7 +28,7 @@ def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style,
     retargeter = RETARGETERS[name]
     region = {"neck": intensity} if "neck" in HEADS[name].regions else {}
     knobs = retargeter.mapping.knobs(region, {"neck": style} if region else {})
-    alive = life.Life(Life(gaze=Gaze(recentre_deg=90.0)), seed=0)
+    alive = spontaneous.Life(Life(gaze=Gaze(recentre_deg=90.0)), seed=0)
     state, in_space = alive.start(), []
     for now_s in TICK_S * np.arange(60):
         times_s = now_s + np.array([0.0, 0.05, 0.05])
@@ -47,7 +47,7 @@ def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style,
 def test_a_neck_that_is_switched_off_moves_no_eye():
     retargeter = RETARGETERS["face28"]
     knobs = retargeter.mapping.knobs({"neck": 0.0})
-    alive = life.Life(Life(gaze=Gaze()), seed=0)
+    alive = spontaneous.Life(Life(gaze=Gaze()), seed=0)
     state, times_s = alive.start(), np.zeros(2)
     for pitch in (0.0, 0.15):
         motion = np.zeros((2, MOTION_DIM), np.float32)
