@@ -14,7 +14,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError, ModelError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.retarget.life import Life
+from sfms_robot.retarget.spontaneous import Life
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
