@@ -128,7 +128,5 @@ class Troubles(RuleBasedStateMachine):
 @pytest.mark.parametrize("family", ["dynamixel2", "dynamixel1", "sts"])
 def test_no_order_of_troubles_breaks_a_promise(family):
     machine = type("Troubles", (Troubles,), {"family": family})
-    quick = settings(
-        max_examples=12, stateful_step_count=15, deadline=None, suppress_health_check=list(HealthCheck)
-    )
+    quick = settings(max_examples=12, stateful_step_count=15, deadline=None, suppress_health_check=list(HealthCheck))
     run_state_machine_as_test(machine, settings=quick)
