@@ -51,7 +51,7 @@ from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
-from sfms_robot.sources.recording import open_source
+from sfms_robot.sources.registry import open_source
 
 logger = logging.getLogger(__name__)
 

@@ -62,7 +62,8 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
             load_firmware_map(joint.model).center_ticks,
         )
         baud = head.buses[joint.bus].baud
-        by_bus.setdefault(joint.bus, []).append(EmulatedServo(joint.id, joint.model, baud, ticks))
+        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
+        by_bus.setdefault(joint.bus, []).append(servo)
     return by_bus
 
 
@@ -77,6 +78,9 @@ def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
             raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
     joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
     return {
-        bus: [replace(servo, registers=stored.of(joints[bus, servo.id]), supply_v=stored.supply_v) for servo in servos]
+        bus: [
+            replace(servo, registers={**servo.registers, **stored.of(joints[bus, servo.id])}, supply_v=stored.supply_v)
+            for servo in servos
+        ]
         for bus, servos in emulated(head).items()
     }

@@ -1,24 +1,20 @@
-"""Which predictor a folder holds. Families are strings, imported only when chosen."""
+"""Which predictor a folder holds: the kinds of `config.listener_kinds`, imported only when chosen."""
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
-from typing import Final, cast
+from typing import cast
 
 from sfms_robot.config import find
-from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.config.listener_kinds import listener_kind
+from sfms_robot.listeners.checkpoint import CONFIG, load_config
 from sfms_robot.ports import Listener
-
-# kind -> module with load(folder) -> Listener
-LOADERS: Final = {"sfms": "sfms_robot.listeners.sfms", "arig": "sfms_robot.listeners.arig"}
 
 
 def load_listener(name: str | Path) -> Listener:
     """A listener by shipped name, or of a folder with config.yaml and weights. Raises ConfigError or ModelError."""
-    folder = find("listeners", str(name), "config.yaml")
-    module = import_module(LOADERS[load_config(folder).kind])
-    return cast(Listener, module.load(folder))
+    folder = find("listeners", str(name), CONFIG)
+    return cast(Listener, listener_kind(load_config(folder).kind, folder / CONFIG).load_folder(folder))
 
 
 def one_thread() -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from sfms_robot.config import find
-from sfms_robot.config.kinds import load_listener
+from sfms_robot.config import find, load_listener
 from sfms_robot.listeners.space import MotionSpace
 
 
