@@ -11,7 +11,7 @@ from sfms_robot.errors import ConfigError
 SMALL = {
     "name": "small",
     "description": "two joints",
-    "buses": {"main": {"family": "dynamixel", "baud": 1000000}},
+    "buses": {"main": {"family": "dynamixel2", "baud": 1000000}},
     "limits": {"slow": {"speed_deg_s": 90, "acceleration_deg_s2": 900, "jerk_deg_s3": 9000}},
     "joints": {
         name: {
@@ -64,7 +64,10 @@ WRONG = {
     ),
     "no speed": (("limits", "slow", "speed_deg_s", 0), ["limits.slow.speed_deg_s = 0", "greater than 0"]),
     "key missing": (("joints", "jaw", "id", "DELETE"), ["joints.jaw.id", "required"]),
-    "unknown family": (("buses", "main", "family", "dynamixle"), ["buses.main.family = 'dynamixle'", "'dynamixel'"]),
+    "unknown family": (
+        ("buses", "main", "family", "dynamixle"),
+        ["buses.main.family = 'dynamixle'", "(dynamixel2, dynamixel1,"],
+    ),
     "two kinds": (
         ("joints", "jaw", "drive", {"sum": ["jawOpen"], "max": ["jawOpen"]}),
         ["joints.jaw.drive", "sum, max"],

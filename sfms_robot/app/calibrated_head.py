@@ -12,12 +12,12 @@ from typing import Final
 from sfms_robot.app.servo.servo_wire import Seen, Wire
 from sfms_robot.app.wiring import SIM, devices, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
-from sfms_robot.config.caution import cautious
+from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
-from sfms_robot.servo.families import current_name, family_named
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
 
@@ -56,7 +56,7 @@ def ready(head: Head, *, real: bool, calibrated: Collection[str] = (), refused: 
         return head
     which = "" if len(held) == len(head.joints) else f" in {', '.join(held)}"
     log.warning("head %s is not calibrated%s: 20 %% of its travel, 0.3 of its speed", head.name, which)
-    return cautious(head, held)
+    return held_back(head, held)
 
 
 def identify(
@@ -72,7 +72,7 @@ def identify(
             port = port_of(where[name], bus, clock)()
             try:
                 for joint in mine:
-                    servos[joint] = _identity(port, current_name(bus.family), bus.baud, head.joints[joint], clock)
+                    servos[joint] = _identity(port, bus.family, bus.baud, head.joints[joint], clock)
             finally:
                 port.close()
     return servos

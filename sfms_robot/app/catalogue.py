@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sfms_robot.config.kinds import load_listener
+from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.speakers import shipped_speaker, speakers

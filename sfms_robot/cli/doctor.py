@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import json as json_module
 import sys
-from enum import StrEnum
 
 import typer
 
-
-class Family(StrEnum):
-    dynamixel2 = "dynamixel2"
-    dynamixel1 = "dynamixel1"
-    feetech = "feetech"
+from sfms_robot.cli.servo_wiring import Family, confirmation
 
 
 def doctor(
@@ -22,18 +17,21 @@ def doctor(
     head: str | None = typer.Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
     baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: at all."),
     family: Family = typer.Option(Family.dynamixel2, help="Without a head: how the servos speak."),
+    fix: bool = typer.Option(False, "--fix", help="Mend what servos have stored where that is safe; asks before each."),
+    yes: bool = typer.Option(False, "--yes", "-y", help="With --fix: do not ask."),
     json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
 ) -> None:
-    """Look before you run: port, adapter, every servo, wire budget. Reads only.
+    """Look before you run: port, adapter, every servo, what it has stored, wire budget. Reads only, unless told to fix.
 
     Exit code 0: fit to run. 3: the port cannot be opened. 4: a finding stops the head from running.
     """
     from sfms_robot.app.servo.doctor import examine
     from sfms_robot.app.servo.servo_wire import real_clock
-    from sfms_robot.cli.servo_tables import bar, print_doctor
+    from sfms_robot.cli.show_servo import bar, print_doctor
 
-    with bar("looking", hidden=json) as progress:
-        report = examine(port, head, family.value, baud, real_clock(), progress)
+    confirm = confirmation(yes) if fix else None
+    with bar("looking", hidden=json or fix) as progress:
+        report = examine(port, head, family.value, baud, real_clock(), progress, confirm)
     if json:
         print(json_module.dumps(report))
     else:

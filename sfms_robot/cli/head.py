@@ -68,9 +68,9 @@ def show(
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
-    from sfms_robot.config.origins import origins, refusals
+    from sfms_robot.config.provenance import provenance, refusals
 
-    joints, refused = origins(name), refusals(name)
+    joints, refused = provenance(name), refusals(name)
     if joint is not None:
         if joint not in joints:
             raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", joints)
@@ -79,9 +79,9 @@ def show(
         told = {j: {key: {"value": v, "from": o} for key, (v, o) in values.items()} for j, values in joints.items()}
         print(json_module.dumps({"name": name, "joints": told, "refused": refused}))
         return
-    from sfms_robot.cli.show_head import print_origins
+    from sfms_robot.cli.show_head import print_provenance
 
-    print_origins(name, joints, refused)
+    print_provenance(name, joints, refused)
 
 
 @app.command("calibrate")

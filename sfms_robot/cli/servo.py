@@ -6,19 +6,20 @@ import json as json_module
 import sys
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sfms_robot.cli import servo_maps
-from sfms_robot.cli.servo_wiring import Wiring, on_wire
+from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
 from sfms_robot.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
     from sfms_robot.app.servo.servo_wire import Seen, Wire
 
 app = typer.Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
-app.command("maps")(servo_maps.maps)
+
+_SHOWN = ("model", "family", "protocol", "number", "firmware", "watchdog")  # the rest is in --json
 
 
 class Keep(StrEnum):
@@ -38,14 +39,17 @@ def scan(
     ids: Annotated[str | None, typer.Option("--ids", help="Ask these one by one, as 1-9,12. Default: all.")] = None,
 ) -> None:
     """Who is there, at which rate."""
+    from sfms_robot.app.servo.protocol_hint import protocol_hint
     from sfms_robot.app.servo.servo_tools import parse_ids
     from sfms_robot.app.servo.servo_tools import scan as look
 
     asked = parse_ids(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
-        rows = [seen.row() for seen in look(wire, asked, progress)]
+        hint = protocol_hint(wire)
+        rows = [] if hint else [seen.row() for seen in look(wire, asked, progress)]
         where = wire.port.name
-    _show(rows, {"port": where, "servos": rows}, on.json, f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}")
+    title = f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}{f': {hint}' if hint else ''}"
+    _show(rows, {"port": where, "servos": rows, "hint": hint}, on.json, title)
 
 
 @app.command()
@@ -96,7 +100,7 @@ def write(
     """Write a register and read it back. What lasts (EEPROM) is asked about first, and refused while torque is on."""
     from sfms_robot.app.servo.servo_tools import write_register
 
-    confirm = _confirm(yes, ids)
+    confirm = confirmation(yes, ids)
 
     def change(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
         before, after = write_register(wire, seen, register, value, confirm)
@@ -105,6 +109,70 @@ def write(
                  "raw": row["raw"], "value": row["value"], "unit": row["unit"]}]  # fmt: skip
 
     _each(ids, on, change, "written")
+
+
+@app.command(context_settings={"ignore_unknown_options": True})
+@on_wire
+def move(
+    on: Wiring,
+    servo: Annotated[int, typer.Argument(metavar="ID")],
+    to: Annotated[str | None, typer.Option("--to", help="Ticks, or degrees of its shaft: 180deg.")] = None,
+    by: Annotated[str | None, typer.Option("--by", help="From where it stands: ticks, or -5deg.")] = None,
+) -> None:
+    """Move one servo slowly, and leave torque and profile as they were."""
+    from sfms_robot.app.servo.move import move as go
+
+    _each(str(servo), on, lambda wire, seen: [go(wire, seen, to, by)], "moved")
+
+
+@app.command()
+@on_wire
+def dump(
+    on: Wiring,
+    file: Annotated[Path, typer.Argument(help="Is written; must not be there yet.")],
+    ids: Annotated[str | None, typer.Option("--ids", help="1-9,12. Default: everybody.")] = None,
+) -> None:
+    """All registers of servos into a YAML file."""
+    from sfms_robot.app.servo.dump import dump as taken
+    from sfms_robot.app.servo.dump import save_dump
+    from sfms_robot.app.servo.servo_tools import scan as look
+
+    with on.open() as wire, _bar("reading", hidden=on.json) as progress:
+        servos = [wire.find(servo) for servo in _parsed(ids)] if ids is not None else look(wire, None, progress)
+        if not servos:
+            raise BusError(f"{wire.port.name}: nobody answers")
+        save_dump(taken(wire, servos), file)
+    _show([seen.row() for seen in servos], {"file": str(file), "servos": [seen.row() for seen in servos]}, on.json)
+
+
+@app.command()
+@on_wire
+def restore(
+    on: Wiring,
+    file: Annotated[Path, typer.Argument(help="As `servo dump` wrote it.")],
+    source: Annotated[
+        int | None, typer.Option("--from", help="Id in the file. Default: each servo of the file.")
+    ] = None,
+    into: Annotated[int | None, typer.Option("--into", help="Id on the wire, with --from. Default: the same.")] = None,
+    identity: Annotated[bool, typer.Option("--identity", help="Give it id and rate of the file as well.")] = False,
+    yes: YesOption = False,
+) -> None:
+    """Lasting settings (EEPROM) of a dumped servo into one of the same model. Shows the differences and asks."""
+    from sfms_robot.app.servo.dump import load_dump
+    from sfms_robot.app.servo.dump import restore as write_back
+
+    kept = {each.id: each for each in load_dump(file).servos}
+    if source is None and into is not None:
+        raise ConfigError("servo restore: --into needs --from, the id in the file")
+    if source is not None and source not in kept:
+        raise ConfigError.at(str(file), "--from", source, "is not in the file", kept)
+    pairs = {into if into is not None else servo: kept[servo] for servo in ([source] if source is not None else kept)}
+    confirm = confirmation(yes)
+    with on.open() as wire:
+        rows = [
+            row for servo, was in pairs.items() for row in write_back(wire, wire.find(servo), was, confirm, identity)
+        ]
+    _show(rows, {"written": rows}, on.json, None if rows else "nothing differs")
 
 
 @app.command("set-id")
@@ -122,7 +190,7 @@ def set_id(
     _each(
         str(old),
         on,
-        lambda wire, seen: [change(wire, seen, new, _confirm(yes), in_chain).row()],
+        lambda wire, seen: [change(wire, seen, new, confirmation(yes), in_chain).row()],
         "servos",
     )
 
@@ -138,7 +206,7 @@ def set_baud(
     """Give servos another rate, and check that they answer at it."""
     from sfms_robot.app.servo.servo_tools import set_baud as change
 
-    confirm = _confirm(yes, ids)
+    confirm = confirmation(yes, ids)
     _each(
         ids,
         on,
@@ -157,7 +225,7 @@ def reboot(
     """Start servos over: torque goes off, latched hardware errors go away."""
     from sfms_robot.app.servo.servo_tools import reboot as restart
 
-    confirm = _confirm(yes, ids)
+    confirm = confirmation(yes, ids)
     _each(
         ids,
         on,
@@ -180,7 +248,7 @@ def factory_reset(
     _each(
         str(servo),
         on,
-        lambda wire, seen: [reset(wire, seen, keep.value, _confirm(yes)).row()],
+        lambda wire, seen: [reset(wire, seen, keep.value, confirmation(yes)).row()],
         "servos",
     )
 
@@ -208,7 +276,7 @@ def monitor(
         if on.json:
             taken = list(looks(wire, servos, 1.0 / rate, count))
         else:
-            from sfms_robot.cli.servo_tables import live
+            from sfms_robot.cli.show_servo import live
 
             live(
                 looks(wire, servos, 1.0 / rate, count),
@@ -216,6 +284,35 @@ def monitor(
             )
     if on.json:
         print(json_module.dumps({"samples": taken}))
+
+
+@app.command()
+def maps(
+    files: list[Path] = typer.Argument(None, help="Firmware maps of your own, or folders of them, beside the shipped."),
+    check: bool = typer.Option(False, "--check", help="Look for mistakes in the maps; exit code 2 when there are any."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
+    """The servo models and boards that have a firmware map."""
+    from sfms_robot.app.servo.maps import check_maps, list_maps
+
+    if not check:
+        rows = list_maps(files or [])
+        if json:
+            print(json_module.dumps({"maps": rows}))
+        else:
+            from sfms_robot.cli.show import print_rows
+
+            print_rows([{key: row[key] for key in _SHOWN} for row in rows])
+        return
+    findings = check_maps(files or [])
+    if json:
+        print(json_module.dumps({"sound": not findings, "findings": [each._asdict() for each in findings]}))
+    else:
+        for each in findings:
+            print(f"{each.file}: {each.problem}")
+        print("the firmware maps are sound" if not findings else f"{len(findings)} problem(s)")
+    if findings:
+        raise typer.Exit(2)
 
 
 def _parsed(ids: str) -> list[int]:
@@ -248,7 +345,7 @@ def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, ti
     if json:
         print(json_module.dumps(result))
         return
-    from sfms_robot.cli.servo_tables import print_table
+    from sfms_robot.cli.show_servo import print_table
 
     print_table([_for_people(row) for row in rows], title)
 
@@ -263,21 +360,6 @@ def _for_people(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bar(text: str, hidden: bool) -> Any:
-    from sfms_robot.cli.servo_tables import bar
+    from sfms_robot.cli.show_servo import bar
 
     return bar(text, hidden)
-
-
-def _confirm(yes: bool, ids: str = "") -> Callable[[str], bool]:
-    """Ask once: a yes holds for the same change to the other servos of the command."""
-    alike = f" and the same for all of {ids}" if len(_parsed(ids or "0")) > 1 else ""
-    said: list[bool] = [True] if yes else []
-
-    def ask(question: str) -> bool:
-        if not said:
-            if not sys.stdin.isatty():
-                raise ConfigError(f"{question}: nobody is there to ask, say --yes")
-            said.append(typer.confirm(f"{question}{alike}. Do it?", err=True))
-        return said[0]
-
-    return ask

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -11,6 +12,8 @@ from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from sfms_robot.errors import ConfigError
 
 if TYPE_CHECKING:
     from sfms_robot.app.servo.servo_wire import Wire
@@ -60,3 +63,21 @@ def on_wire(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = inspect.Signature(seen)  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in seen}
     return run
+
+
+def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
+    """Asks, unless `yes`. With several `ids` one yes holds for the same change to all of them; else each is asked."""
+    alike = f" and the same for all of {ids}" if len(ids) > 1 and not ids.isdigit() else ""
+    said: list[bool] = [True] if yes else []
+
+    def ask(question: str) -> bool:
+        if said:
+            return said[0]
+        if not sys.stdin.isatty():
+            raise ConfigError(f"{question}: nobody is there to ask, say --yes")
+        answer = typer.confirm(f"{question}{alike}. Do it?", err=True)
+        if alike:
+            said.append(answer)
+        return answer
+
+    return ask

@@ -75,7 +75,9 @@ def print_check(checked: HeadCheck) -> None:
         console.print("calibrate first: on real servos it moves 20 % of its travel at 0.3 of its speed until then")
 
 
-def print_origins(name: str, joints: Mapping[str, Mapping[str, tuple[Any, str]]], refused: Sequence[str] = ()) -> None:
+def print_provenance(
+    name: str, joints: Mapping[str, Mapping[str, tuple[Any, str]]], refused: Sequence[str] = ()
+) -> None:
     """Every value of every joint with its origin, and what is known of this build but does not hold any more."""
     console = screen()
     for joint, values in joints.items():

@@ -5,19 +5,8 @@ from sfms_robot.config.arig_training import ArigPhase, ArigTraining, Stage, load
 from sfms_robot.config.base import Model, load, parse
 from sfms_robot.config.drives import drives
 from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
-from sfms_robot.config.head import (
-    Bus,
-    Faults,
-    Head,
-    Joint,
-    JointDefaults,
-    LimitClass,
-    LoadRule,
-    Safety,
-    Threshold,
-    load_head,
-)
-from sfms_robot.config.kinds import load_listener, parse_listener
+from sfms_robot.config.head import Head, load_head
+from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
 from sfms_robot.config.life import Gaze, Idle, Life
 from sfms_robot.config.listener import (
     ChannelGroup,
@@ -25,8 +14,11 @@ from sfms_robot.config.listener import (
     Sampling,
     Sfms,
 )
+from sfms_robot.config.listener_kinds import load_listener, parse_listener
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
+from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.recipe import Baseline, Dense, Grouped, Recipe
+from sfms_robot.config.safety_rules import Faults, LoadRule, Safety, Threshold
 from sfms_robot.config.training import Phase, PredictorTraining, TokenizerTraining, Training
 from sfms_robot.data import find
 

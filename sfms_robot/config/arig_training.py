@@ -8,9 +8,10 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from sfms_robot.config.arig import Arig
-from sfms_robot.config.base import Model, NonNegative, parse, read
+from sfms_robot.config.base import Model, NonNegative, parse
 from sfms_robot.config.listener import Count, Share
 from sfms_robot.config.training import Phase, Training
+from sfms_robot.config.yaml_file import read
 from sfms_robot.errors import ConfigError
 
 

@@ -1,4 +1,4 @@
-"""What every configuration file shares: strict frozen models, safe YAML, and errors of one line.
+"""What every configuration file shares: strict frozen models, and errors of one line.
 
 Files speak the units people use (degrees, milliseconds where the key says so); properties give radians and
 seconds. Nothing past `load` handles a plain dict.
@@ -7,12 +7,12 @@ seconds. Nothing past `load` handles a plain dict.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar, get_args
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from sfms_robot.config.yaml_file import read
 from sfms_robot.errors import ConfigError
 
 UNKNOWN_KEY: Final = "unknown_key"  # type of that problem, its key in the context
@@ -31,53 +31,27 @@ class Model(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, value: Any) -> Any:
-        for key in value if isinstance(value, dict) else ():
+        for key, given in value.items() if isinstance(value, dict) else ():
             if key not in cls.model_fields:
                 told = {"key": key, "choices": ", ".join(cls.model_fields), "shown": repr(key)}
                 raise PydanticCustomError(UNKNOWN_KEY, "{shown} is not a known key ({choices})", told)
+            # To Python true is 1: `id: true` would be servo 1.
+            if isinstance(given, bool) and not _takes_bool(cls.model_fields[key].annotation):
+                told = {"key": key, "shown": str(given).lower()}
+                raise PydanticCustomError("bool", "{key} = {shown} is neither a number nor a name", told)
         return value
+
+
+def _takes_bool(annotation: Any) -> bool:
+    return annotation in (bool, Any) or any(_takes_bool(part) for part in get_args(annotation))
 
 
 M = TypeVar("M", bound=BaseModel)
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # libyaml's is ten times faster
-    """Safe YAML that refuses a key given twice instead of keeping the last."""
-
-
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    seen: set[Any] = set()
-    for key_node, _ in node.value:
-        key = loader.construct_object(key_node)
-        if key in seen:
-            raise yaml.constructor.ConstructorError(None, None, f"{key!r} is given twice", key_node.start_mark)
-        seen.add(key)
-    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
-
-
-_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
-
-
 def load(model: type[M], file: Path) -> M:
     """Read one YAML file into `model`, or raise a ConfigError of one line."""
     return parse(model, read(file), file)
-
-
-def read(file: Path) -> Any:
-    """The plain data of one YAML file. Raises a ConfigError of one line."""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{file}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: cannot be read: {error}") from error
-    try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f":{mark.line + 1}" if mark else ""
-        problem = " ".join(str(getattr(error, "problem", None) or error).split())
-        raise ConfigError(f"{file}{where}: {problem}") from error
 
 
 def parse(model: type[M], raw: object, file: Path | str) -> M:

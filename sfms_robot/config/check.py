@@ -12,14 +12,21 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from sfms_robot.config.base import UNKNOWN_KEY, Name, one_line, read
-from sfms_robot.config.drives import expanded, problems
+from sfms_robot.config.base import UNKNOWN_KEY, Name, one_line
+from sfms_robot.config.consistency import problems, rates, wiring
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Bus, Head, Joint, LimitClass, load_head, wiring
+from sfms_robot.config.head import Head, load_head
+from sfms_robot.config.inheritance import expanded
+from sfms_robot.config.joint import Joint, LimitClass
 from sfms_robot.config.kinematics import Kinematics
 from sfms_robot.config.kinematics import problems as neck_problems
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
+from sfms_robot.config.migration import migrated
+from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.overlay import load_overlay
+from sfms_robot.config.register_rules import register_problems
+from sfms_robot.config.safety_rules import Safety
+from sfms_robot.config.yaml_file import read
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 
@@ -69,7 +76,10 @@ def check_head(name: str) -> list[str]:
 def _problems(raw: Any) -> list[str]:
     if not isinstance(raw, dict):
         return [f"a head is a table of {', '.join(Head.model_fields)}"]
-    full = expanded(raw)
+    try:
+        full = expanded(migrated(raw))
+    except ValueError as error:
+        return [str(error)]
     found: list[str] = []
     parts: dict[str, dict[Any, Any]] = {}
     for key, model in (_TABLES | _LISTS).items():
@@ -81,21 +91,29 @@ def _problems(raw: Any) -> list[str]:
     rest = {key: value if key not in parts else _names_only(key, value) for key, value in raw.items()}
     _parsed(_Rest, rest | {"kinematics": None}, "", found)
     table = {key: parts.get(key, {}) for key in (*_TABLES, *_LISTS)}
-    found += wiring(table["joints"], table["buses"], table["limits"]) + _unknown_servos(table["joints"])
+    found += wiring(table["joints"], table["buses"], table["limits"]) + rates(table["joints"], table["buses"])
+    found += _servos(table["joints"], full.get("safety", {}))
     couplings, folds = list(table["couplings"].values()), list(table["folds"].values())
     if neck is not None:
         found += neck_problems(neck, table["joints"], folds)
     return found + problems(table["joints"], table["expressions"], couplings, folds, table["regions"])
 
 
-def _unknown_servos(joints: dict[str, Joint | None]) -> list[str]:
-    found = []
+def _servos(joints: dict[str, Joint | None], safety: Any) -> list[str]:
+    """Servos without a firmware map, and registers that a run must not write."""
+    found: list[str] = []
+    shared = _parsed(Safety, safety, "safety", [])  # its own problems are told with the rest of the head
     for name, joint in joints.items():
+        if joint is None:
+            continue
         try:
-            if joint is not None:
-                load_firmware_map(joint.model)
+            table = load_firmware_map(joint.model)
         except ConfigError as error:
             found.append(f"joints.{name}.model: {error}")
+            continue
+        rules = (shared or Safety()).merged(joint.safety)
+        for key, value, problem, choices in register_problems(rules, table):
+            found.append(f"joints.{name}.safety.{key} = {value} {problem} ({', '.join(choices)})")
     return found
 
 

@@ -23,10 +23,12 @@ import yaml
 from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Model, Name, load
-from sfms_robot.config.drives import problems
+from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Head, Joint
+from sfms_robot.config.head import Head
+from sfms_robot.config.joint import Joint
 from sfms_robot.config.mapping import Expression
+from sfms_robot.config.safety_rules import Safety
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 
@@ -218,4 +220,8 @@ def calibrated(joint: Joint, found: Measured) -> Joint:
     zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
     low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
     ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
-    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, **ends})
+    known = {"homing_offset": found.homing_offset, "drive_mode": found.drive_mode}
+    safety = joint.safety or Safety()
+    stored = {**safety.stored, **{name: value for name, value in known.items() if value is not None}}
+    safety = safety.model_copy(update={"stored": stored})
+    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, "safety": safety, **ends})

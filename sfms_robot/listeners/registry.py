@@ -1,24 +1,25 @@
-"""Which predictor a folder holds. Families are strings, imported only when chosen."""
+"""Which predictor a folder holds: the kinds of `config.listener_kinds`, imported only when chosen."""
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
-from typing import Final, cast
+from typing import cast
 
-from sfms_robot.config import find
+from sfms_robot.config.listener_kinds import LISTENER_KINDS
 from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.listeners.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
-
-# kind -> module with load(folder) -> Listener
-LOADERS: Final = {"sfms": "sfms_robot.listeners.sfms", "arig": "sfms_robot.listeners.arig"}
 
 
 def load_listener(name: str | Path) -> Listener:
-    """A listener by shipped name, or of a folder with config.yaml and weights. Raises ConfigError or ModelError."""
-    folder = find("listeners", str(name), "config.yaml")
-    module = import_module(LOADERS[load_config(folder).kind])
-    return cast(Listener, module.load(folder))
+    """A listener by shipped name, of a folder with config.yaml and weights, or of another package.
+
+    Raises ConfigError or ModelError.
+    """
+    folder = listener_folder(str(name))
+    if folder is None:
+        return load_plugin(str(name))
+    return cast(Listener, LISTENER_KINDS[load_config(folder).kind].load_folder(folder))
 
 
 def one_thread() -> None:

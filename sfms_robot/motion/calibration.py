@@ -29,7 +29,8 @@ class Calibration:
         ticks_per_rad: (J,) with sign.
         low_ticks, high_ticks: (J,) first and last tick inside the position limits.
 
-    Raises ConfigError when the range of a joint leaves the one turn a servo in position mode has.
+    Raises ConfigError when the range of a joint leaves the one turn a servo in position mode has. A geared joint
+    (`ratio` other than 1) may need several: its servo then works in extended position mode, where the model has one.
     """
 
     def __init__(self, joints: Mapping[str, Joint], ticks_per_revolution: NDArray[np.floating]) -> None:
@@ -41,7 +42,7 @@ class Calibration:
         self.low_ticks = np.ceil(np.minimum(low, high) - _ROUNDING_TICKS).astype(np.int64)
         self.high_ticks = np.floor(np.maximum(low, high) + _ROUNDING_TICKS).astype(np.int64)
         for name, first, last, turn in zip(joints, self.low_ticks, self.high_ticks, turns, strict=True):
-            if first < 0 or last > turn - 1:
+            if joints[name].ratio == 1.0 and (first < 0 or last > turn - 1):
                 raise ConfigError(
                     f"joints.{name}: min_deg..max_deg is {first}..{last} ticks, outside the servo's 0..{turn - 1:.0f};"
                     f" change zero_ticks = {joints[name].zero_ticks}, ratio, or the range"

@@ -13,10 +13,8 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Final
 
+from sfms_robot.config.named_bus import BUS_GROUP, FORMER_FAMILIES
 from sfms_robot.errors import ConfigError
-
-GROUP: Final = "sfms_robot.buses"
-RENAMED: Final = {"dynamixel": "dynamixel2"}  # how heads of version 0.1.0 say it
 
 
 @dataclass(frozen=True)
@@ -106,12 +104,12 @@ _OWN: Final = {
 def families() -> Mapping[str, BusFamily]:
     """All of them by name: our own, then those of other packages. Raises ConfigError for an entry that is none."""
     found = dict(_OWN)
-    for entry in entry_points(group=GROUP):
+    for entry in entry_points(group=BUS_GROUP):
         family = entry.load()
         if not isinstance(family, BusFamily):
-            raise ConfigError(f"entry point {GROUP}: {entry.name} = {entry.value} is not a BusFamily")
+            raise ConfigError(f"entry point {BUS_GROUP}: {entry.name} = {entry.value} is not a BusFamily")
         if entry.name in found:
-            raise ConfigError(f"entry point {GROUP}: {entry.name} = {entry.value}: there is a family of that name")
+            raise ConfigError(f"entry point {BUS_GROUP}: {entry.name} = {entry.value}: there is a family of that name")
         found[entry.name] = family
     return found
 
@@ -132,7 +130,7 @@ def family_named(name: str) -> BusFamily:
 
 def current_name(name: str) -> str:
     """The name as it is said now."""
-    return RENAMED.get(name, name)
+    return FORMER_FAMILIES.get(name, name)
 
 
 def _resolved(path: str) -> Any:

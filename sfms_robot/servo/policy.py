@@ -7,7 +7,6 @@ outside a threshold of the head's own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -20,10 +19,7 @@ PINCH_S: Final = 0.5
 
 @dataclass(frozen=True)
 class BusServo:
-    """One servo of a bus and the joint it moves; the limits are those of the joint.
-
-    `stored`: EEPROM values, such as a homing offset, that zero and direction of the joint were written for.
-    """
+    """One servo of a bus and the joint it moves; the limits are those of the joint."""
 
     joint: str
     id: int
@@ -31,7 +27,6 @@ class BusServo:
     min_rad: float
     max_rad: float
     safety: Safety = field(default_factory=Safety)
-    stored: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ _EXTENDED_MODE: Final = 4  # Protocol 2.0: extended position
 _CURRENT_POSITION_MODE: Final = 5  # Protocol 2.0: position with bounded current, also over many turns
 _PROTECTIONS: Final = ("overheating", "overload", "electrical shock")
 _LIMITS: Final = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
+_OFFSETS: Final = ("homing_offset", "multi_turn_offset")
 _SCALES: Final = ("angular_resolution", "resolution_divider")  # other than 1: a tick is more than a tick
 
 
@@ -71,7 +72,10 @@ class Contradiction:
 
 
 def multi_turn(table: Table, needs: JointNeeds) -> bool:
-    """Whether the goals of a joint leave the one turn of position mode."""
+    """Whether the goals of a joint leave the one turn of position mode, and the model can follow."""
+    goal = table.role("goal_position")
+    if goal is None or goal.low <= needs.low_ticks and goal.high < table.ticks_per_revolution:
+        return False
     return needs.low_ticks < 0 or needs.high_ticks >= table.ticks_per_revolution
 
 
@@ -109,6 +113,7 @@ def contradictions(values: Mapping[str, int], table: Table, needs: JointNeeds) -
         *_mode(values, table, needs),
         *_limits(values, table, needs),
         *_zero_and_direction(values, table, needs),
+        *_named_in_the_file(values, needs),
         *_secondary_id(values, needs),
         *_startup(values),
         *_shutdown(values, table, needs),
@@ -159,7 +164,7 @@ def _unlimited(names: tuple[str, str], low: int, high: int, table: Table) -> Ite
 
 def _zero_and_direction(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
     """Homing offset, reverse bit and the like move or turn round every angle of the joint."""
-    for name in ("homing_offset", "multi_turn_offset"):
+    for name in _OFFSETS:
         if name in values and (values[name] or name in needs.stored):
             yield from _shifted(name, values[name], table, needs)
     if "drive_mode" in values:
@@ -187,6 +192,13 @@ def _shifted(name: str, now: int, table: Table, needs: JointNeeds) -> Iterator[C
     else:
         why = f"it shifts every angle by {degrees:+.1f} deg; the head's file says nothing of it"
         yield Contradiction(name, now, 0, why, "told", fixable=False)
+
+
+def _named_in_the_file(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
+    """Whatever else the head's file says is stored."""
+    for name, wanted in needs.stored.items():
+        if name not in (*_OFFSETS, "drive_mode") and values.get(name, wanted) != wanted:
+            yield Contradiction(name, values[name], wanted, "the head's file reckons with it", "refused")
 
 
 def _secondary_id(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import logging
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,6 +25,8 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, FRAME_HZ, MOTION_DIM, POSE_CHANNELS, Doubles, Floats
+
+logger = logging.getLogger(__name__)
 
 Signs = tuple[int, int, int]
 
@@ -76,6 +79,10 @@ _TIME_COLUMNS: Final = {
 _SHAPE_BY_KEY: Final = {name.lower(): name for name in BLENDSHAPES}
 _BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
 _LONGEST_GAP_S: Final = 0.25  # rows further apart than this have a lost face between them
+_USUAL_STEP_S: Final = (1e-3, 2.0)  # beyond these a time column is in another unit
+_SHAPE_RANGE: Final = (-0.5, 2.0)  # a tracker may overshoot 0..1, and is clipped; percent or another unit is refused
+_LARGEST_RAD: Final = 2 * math.pi
+_LARGEST_M: Final = 10.0
 _TIME_EPS_S: Final = 1e-6
 
 
@@ -112,19 +119,23 @@ def read_track(path: Path | str, source: str | None = None, flip: Iterable[str] 
     """Read a face track.
 
     `source` is a key of `SOURCES`, or None: told from the header. `flip` names pose channels whose sign is turned.
-    Raises ConfigError, in one line with file, row and column, for what cannot be used.
+    Raises ConfigError, in one line with file, row and column, for what cannot be used: ragged rows, cells divided by
+    something else than commas, values or times that are in another unit.
     """
     file = Path(path)
     header, rows = _cells(file)
+    if len(header) == 1 and (other := next((mark for mark in (";", "\t") if mark in header[0]), None)):
+        raise ConfigError(f"{file}: its cells are divided by {other!r}, a comma is needed")
     axes = _axes(file, source, header)
     columns = _columns(file, header, axes)
     time_column = _time_column(file, header)
+    rows = _even(file, header, rows, time_column)
     flipped = _flips(file, flip)
 
     motion = np.zeros((len(rows), MOTION_DIM), dtype=np.float64)
     for number, row in enumerate(rows):
         motion[number] = _motion_row(file, number + 2, row, header, columns)
-    times_s = _times(file, header[time_column], [row[time_column] if row else "" for row in rows])
+    times_s = _times(file, header[time_column], [row[time_column] for row in rows])
     if axes.from_camera:
         moved = slice(CHANNEL_INDEX["x"], CHANNEL_INDEX["z"] + 1)
         seen = np.isfinite(motion[:, 0])
@@ -182,6 +193,19 @@ def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
 
 
 # --- the parts of reading ---------------------------------------------------------------------------------------
+
+
+def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_column: int) -> list[list[str]]:
+    """Rows as long as the header: one that ends with its time has lost the face, a last one cut off is left out."""
+    lost = [""] * (len(header) - time_column - 1)
+    rows = [[*row, *lost] if len(row) == time_column + 1 else row for row in rows]
+    if len(rows) > 1 and len(rows[-1]) < len(header):
+        logger.warning("%s: its last row is cut off and left out", file)
+        rows = rows[:-1]
+    for number, row in enumerate(rows):
+        if len(row) != len(header):
+            raise ConfigError(f"{file}: row {number + 2} has {len(row)} cells, the header has {len(header)}")
+    return rows
 
 
 def _cells(file: Path) -> tuple[list[str], list[list[str]]]:
@@ -269,11 +293,23 @@ def _motion_row(
     """One row as motion (58,), all NaN when a cell is empty: the face was lost."""
     out = np.zeros(MOTION_DIM)
     for column in columns:
-        cell = row[column.index].strip() if column.index < len(row) else ""
+        cell = row[column.index].strip()
         if cell == "" or cell.lower() == "nan":
             return np.full(MOTION_DIM, np.nan)
-        out[CHANNEL_INDEX[column.channel]] = _number(file, number, header[column.index], cell) * column.factor
+        value = _number(file, number, header[column.index], cell) * column.factor
+        if problem := _out_of_range(column.channel, value):
+            raise ConfigError(f"{file}: row {number}, column {header[column.index]} = {cell} {problem}")
+        out[CHANNEL_INDEX[column.channel]] = value
     return out
+
+
+def _out_of_range(channel: str, value: float) -> str | None:
+    """What speaks against a value in our units: most likely it is in others."""
+    if channel in ("roll", "pitch", "yaw"):
+        return None if abs(value) <= _LARGEST_RAD else "is more than a turn: in degrees? (_deg at the column's name)"
+    if channel in ("x", "y", "z"):
+        return None if abs(value) <= _LARGEST_M else "is more than 10 m: in cm or mm? (_cm at the column's name)"
+    return None if _SHAPE_RANGE[0] <= value <= _SHAPE_RANGE[1] else "is no blendshape (0 to 1)"
 
 
 def _number(file: Path, row: int, column: str, cell: str) -> float:
@@ -293,11 +329,15 @@ def _times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
         times_s = _timecodes(file, name, cells)
     else:
         times_s = np.array([_number(file, n + 2, name, cell.strip()) * factor for n, cell in enumerate(cells)])
-    backwards = np.flatnonzero(np.diff(times_s) <= 0)
+    steps_s = np.diff(times_s)
+    backwards = np.flatnonzero(steps_s <= 0)
     if len(backwards):
         row = int(backwards[0]) + 1
         problem = f"is not later than the row before ({cells[row - 1]!r})"
         raise ConfigError(f"{file}: row {row + 2}, column {name} = {cells[row]!r} {problem}")
+    if len(steps_s) and not _USUAL_STEP_S[0] <= (usual_s := float(np.median(steps_s))) <= _USUAL_STEP_S[1]:
+        unit = "milliseconds: call it t_ms" if usual_s > 1 else "seconds: call it t_s"
+        raise ConfigError(f"{file}: column {name}: its rows are {usual_s:g} s apart; are they {unit}?")
     return times_s - times_s[0] if name.lower() == "timecode" or times_s[0] > 1e6 else times_s
 
 

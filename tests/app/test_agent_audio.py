@@ -17,7 +17,7 @@ from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.registry import load_listener
-from sfms_robot.sources.recording import open_source
+from sfms_robot.sources.registry import open_source
 
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
 RAW = {"kind": "arig", "width": 16, "feedforward": 24, "heads": 2, "context_chunks": 4, "context_layers": 1}

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.adversary import torment
+from sfms_robot.app.bench.adversary import CHUNK, adversarial, torment
 from sfms_robot.app.bench.lead import delay_ticks, delays
 from sfms_robot.app.bench.retarget import retarget
-from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
@@ -30,7 +29,7 @@ def test_a_joint_that_stands_still_has_no_delay():
 
 @pytest.mark.parametrize("name", QUICK)
 def test_led_by_its_lag_every_joint_is_less_than_a_tick_late(name):
-    found = delays(load_head(name), duration_s=4.0)
+    found = delays(name, duration_s=4.0)
     moved = np.isfinite(found.led_s)
     assert moved.any()
     assert np.abs(found.led_s[moved]).max() < 0.010
@@ -40,7 +39,7 @@ def test_led_by_its_lag_every_joint_is_less_than_a_tick_late(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in HEADS if name not in QUICK])
 def test_led_by_its_lag_every_joint_of_the_larger_heads_is_less_than_a_tick_late(name):
-    found = delays(load_head(name))
+    found = delays(name)
     moved = np.isfinite(found.led_s)
     assert moved.mean() > 0.8 and np.abs(found.led_s[moved]).max() < 0.010
 
@@ -62,3 +61,12 @@ def test_a_tick_is_measured_part_by_part_beside_a_matrix_product():
     parts = {f"retarget.{part}" for part in ("tick", "timeline", "mapping", "limits", "calibration", "stewart")}
     assert set(rows) == parts
     assert all(row["median"] > 0 and row["ratio"] > 0 and row["unit"] == "ms" for row in rows.values())
+
+
+@pytest.mark.slow
+def test_wild_frames_are_counted_over_all_heads_and_chunks():
+    rows = adversarial(CHUNK + 1, ("poppy_head",), seed=2) | adversarial(50, ("op3_head",), seed=2)
+    assert {name: (row["frames"], row["violations"]) for name, row in rows.items()} == {
+        "retarget.wild.op3_head": (50, 0),
+        "retarget.wild.poppy_head": (CHUNK + 1, 0),
+    }

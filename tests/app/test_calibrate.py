@@ -12,7 +12,7 @@ from sfms_robot.app.calibrated_head import calibrated_head, identify
 from sfms_robot.app.head.calibrate import Outcome, calibrate, calibrate_on
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
-from sfms_robot.config.caution import cautious
+from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.config.overlay import calibrated, head_hash, load_overlay, overlay_file
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
@@ -239,7 +239,7 @@ def test_a_run_takes_measured_joints_as_they_are_and_holds_the_others_back(name,
     with launch(emulated(head)["main"]) as chain:
         ready = calibrated_head(name, chain.device)
     assert ready.joints["jaw"] == calibrated(head.joints["jaw"], found.joints["jaw"])
-    assert ready.joints["brow"] == cautious(head).joints["brow"]
+    assert ready.joints["brow"] == held_back(head).joints["brow"]
     assert calibrated_head(name, "sim") == head
     assert "not calibrated in brow" in caplog.text
 
@@ -251,6 +251,6 @@ def test_a_run_holds_a_joint_back_whose_servo_is_another(name, caplog):
     servos = [EmulatedServo(1, registers={"homing_offset": 100}), EmulatedServo(2)]
     with launch(servos) as chain:
         ready = calibrated_head(name, chain.device)
-    assert ready.joints["jaw"] == cautious(head).joints["jaw"]
+    assert ready.joints["jaw"] == held_back(head).joints["jaw"]
     assert ready.joints["brow"].limits == "slow"
     assert "the calibration of jaw does not hold: homing_offset was 0 and is 100" in caplog.text

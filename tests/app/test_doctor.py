@@ -21,6 +21,7 @@ from sfms_robot.app.servo.diagnosis import (
     judge_port,
     judge_rate,
     judge_twins,
+    udev_rule,
 )
 from sfms_robot.app.servo.doctor import Line, examine, examine_line
 from sfms_robot.app.servo.servo_tools import parse_ids, reboot, set_baud, write_register
@@ -33,6 +34,7 @@ from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.servo.discovery import Holder, SerialDevice
 from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import SerialPort, VirtualTimePort
+from sfms_robot.servo.stored_settings import JointNeeds
 
 BAUD = 1_000_000
 COMMAND = Command("/dev/ttyUSB0", "dynamixel2")
@@ -49,9 +51,9 @@ class Patient:
     def port(self, baud: int = BAUD) -> VirtualTimePort:
         return VirtualTimePort(self.chain.device, self.chain.control, baud, self.clock)
 
-    def examined(self, rate_hz: float = 100.0) -> dict:
+    def examined(self, rate_hz: float = 100.0, fix=None) -> dict:
         line = Line("face", self.chain.device, "/dev/ttyUSB0", "dynamixel2", BAUD, rate_hz, self.wanted)
-        return examine_line(line, self.clock, lambda device, baud: self.port(baud))
+        return examine_line(line, self.clock, lambda device, baud: self.port(baud), fix=fix)
 
     @contextmanager
     def wire(self) -> Iterator[Wire]:
@@ -240,7 +242,7 @@ def test_a_wrong_mode_matters_only_under_torque():
         assert sick.examined()["exit_code"] == 0
         sick.set(1, "torque_enable", 1)
         report = sick.examined()
-    assert report["exit_code"] == 4 and "torque_enable 0" in fix_of(report, "operating mode")
+    assert report["exit_code"] == 4 and "torque_enable 0" in fix_of(report, "operating_mode")
 
 
 def test_a_watchdog_that_does_not_stop_the_motor_is_told():
@@ -260,7 +262,9 @@ def test_without_a_head_everybody_is_listed_at_their_rate():
 @pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
 def test_the_older_frame_is_examined_too(model):
     family = "feetech" if model == "sts3215" else "dynamixel1"
-    with patient(EmulatedServo(1, model), EmulatedServo(2, model), count=3, model=model) as sick:
+    center = load_firmware_map(model).center_ticks
+    servos = [EmulatedServo(i, model, start_ticks=center) for i in (1, 2)]
+    with patient(*servos, count=3, model=model) as sick:
         line = Line("neck", sick.chain.device, "/dev/ttyUSB0", family, BAUD, 50.0, sick.wanted)
         report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
     assert told(report, "error") == ["id 3 (joint3): no answer, at any rate"]
@@ -286,12 +290,27 @@ def test_every_model_that_has_a_map_can_be_examined(family):
     assert all(row["voltage_V"] and row["faults"] == "" for row in report["servos"])
 
 
-def test_a_board_of_hobby_servos_is_opened_and_reckoned_with():
-    with patient() as sick:
-        line = Line(
-            "face", sick.chain.device, "/dev/ttyACM0", "ssc32", 9_600, 50.0, dict(enumerate([sick.wanted] * 24))
-        )
+def board(model: str, family: str, baud: int, rate_hz: float) -> dict:
+    """What is said of 24 channels of a board."""
+    with launch([EmulatedServo(i, model, baud) for i in range(24)], virtual=True) as chain:
+        sick = Patient(chain, 1, "xl330-m288", ())
+        line = Line("face", chain.device, "/dev/ttyACM0", family, baud, rate_hz, dict(enumerate([sick.wanted[1]] * 24)))
+        return examine_line(line, sick.clock, lambda device, rate: sick.port(rate))
+
+
+@pytest.mark.parametrize("model", ["maestro-24", "ssc-32"])
+def test_a_board_that_answers_is_fit_and_one_that_does_not_comes_with_its_serial_mode(model):
+    family = load_firmware_map(model).family
+    assert told(board(model, family, 115_200, 50.0), "error") == []
+    with patient() as sick:  # servos on the port where the board should be
+        line = Line("face", sick.chain.device, "/dev/ttyACM0", family, BAUD, 50.0, sick.wanted)
         report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+    assert told(report, "error") == [f"bus: no {family} board answers"] and report["exit_code"] == 4
+    assert ("USB Dual Port" if family == "maestro" else "jumpers") in fix_of(report, "board answers")
+
+
+def test_a_board_of_hobby_servos_is_opened_and_reckoned_with():
+    report = board("ssc-32", "ssc32", 9_600, 50.0)
     assert report["exit_code"] == 0 and report["budget"]["write_only"]["ms"] == pytest.approx(225, abs=2)
     assert "reaches 4 Hz of 50" in told(report, "warning")[0] and "24 servos" in told(report, "note")[0]
 
@@ -327,8 +346,66 @@ def test_permissions_holders_and_latency_come_with_what_to_type():
     assert busy[0].fix == "kill 42" and "wizard.py" in busy[0].problem
     slow = SerialDevice("/dev/ttyUSB0", latency_ms=16, latency_file="/sys/bus/usb-serial/devices/ttyUSB0/latency_timer")
     (finding,) = judge_adapter(slow, [])
-    assert finding.fix == "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+    assert finding.fix.startswith("echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer ")
     assert list(judge_adapter(SerialDevice("/dev/ttyUSB0", latency_ms=1), [])) == []
+
+
+def test_a_udev_rule_names_the_adapter_and_sets_its_latency_timer():
+    ftdi = SerialDevice(
+        "/dev/ttyUSB0", vendor="0403", product="6014", serial="FT4TFS1T", driver="ftdi_sio", latency_file="/sys/x"
+    )
+    timer, name = udev_rule(ftdi).splitlines()
+    assert 'DRIVER=="ftdi_sio"' in timer and 'ATTR{latency_timer}="1"' in timer
+    assert 'ATTRS{serial}=="FT4TFS1T"' in name and 'SYMLINK+="servos-FT4TFS1T"' in name
+    assert udev_rule(SerialDevice("/dev/ttyS0")) is None
+
+
+# --- what servos have stored ------------------------------------------------------------------------------------
+
+
+NARROW = {"min_position_limit": 1900, "max_position_limit": 2200}
+
+
+def needing(sick, servo: int, needs: JointNeeds) -> None:
+    sick.wanted[servo] = replace(sick.wanted[servo], needs=needs)
+
+
+def test_limits_that_stop_a_joint_short_are_an_error_and_the_fix_cures_them():
+    with patient(EmulatedServo(1, registers=NARROW), EmulatedServo(2), EmulatedServo(3)) as sick:
+        for servo in sick.wanted:
+            needing(sick, servo, JointNeeds(1462, 2634))
+        errors = told(sick.examined(), "error")
+        assert [each.split(":")[0] for each in errors] == ["id 1 (joint1)"] * 2
+        assert "min_position_limit is 1900, wanted 1462" in errors[0]
+        asked: list[str] = []
+        report = sick.examined(fix=lambda question: not asked.append(question))
+        assert len(asked) == 2 and "min_position_limit 1900 -> 1462" in asked[0]
+        assert report["exit_code"] == 0 and len(report["fixed"]) == 2
+        assert told(sick.examined(), "error") == []
+
+
+def test_nothing_is_mended_when_the_answer_is_no():
+    with patient(EmulatedServo(1, registers=NARROW), count=1) as sick:
+        needing(sick, 1, JointNeeds(1462, 2634))
+        report = sick.examined(fix=lambda question: False)
+        assert report["fixed"] == [] and len(told(report, "error")) == 2
+
+
+def test_a_servo_turned_past_one_turn_is_brought_back_by_the_fix():
+    with patient(EmulatedServo(1, start_ticks=4150), count=1) as sick:
+        needing(sick, 1, JointNeeds(1462, 2634))
+        assert "present_position is 4150, wanted 54" in told(sick.examined(), "error")[0]
+        assert sick.examined(fix=lambda question: True)["fixed"] == ["id 1: present_position 4150 -> 54"]
+        assert told(sick.examined(), "error") == []
+
+
+def test_what_acts_by_itself_or_shifts_angles_is_told():
+    stored = {"startup_configuration": 1, "secondary_id": 2, "homing_offset": 100, "drive_mode": 1, "shutdown": 0}
+    with patient(EmulatedServo(1, registers=stored), EmulatedServo(3), count=1) as sick:
+        needing(sick, 1, JointNeeds(1462, 2634, other_ids=frozenset({2})))
+        report = sick.examined()
+    said = " ".join(told(report, "error") + told(report, "warning"))
+    assert all(f"{name} is {value}" in said for name, value in stored.items())
 
 
 # --- the budget and the wording ---------------------------------------------------------------------------------

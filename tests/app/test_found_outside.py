@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sfms_robot.config.caution import cautious
 
 from sfms_robot.app.session import HeadOptions, OpenHead, Programme, build_bus, build_motion, drive_head
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
-from sfms_robot.config.caution import cautious
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame

@@ -103,7 +103,7 @@ def test_the_list_has_every_head_with_its_families(capsys):
     assert code == 0 and set(FACES) < set(heads) and list(heads) == [head["name"] for head in shipped_heads()]
     assert heads["open_duck_mini_v2_head"]["buses"] == {"neck": "feetech", "antennas": "maestro"}
     families = {family for head in heads.values() for family in head["buses"].values()}
-    assert families == {"dynamixel", "dynamixel1", "feetech", "maestro", "ssc32"}
+    assert families == {"dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"}
     assert "reachy_mini  9 joints, stewart neck, dynamixel" in command(capsys, "list")[1]
 
 

@@ -9,7 +9,6 @@ import yaml
 
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.config.mapping import Expression
-from sfms_robot.config.origins import origins, refusals
 from sfms_robot.config.overlay import (
     OLD_FILE,
     CalibrateLayer,
@@ -25,6 +24,7 @@ from sfms_robot.config.overlay import (
     overlay_file,
     save_overlay,
 )
+from sfms_robot.config.provenance import provenance, refusals
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 
@@ -125,7 +125,7 @@ def test_a_fitted_drive_lies_over_a_measured_joint():
 
 def test_show_tells_calibrated_and_fitted_values_from_those_of_the_file():
     save_overlay(overlay(jaw=measured(), fit=FIT), overlay_file("face28"))
-    told = origins("face28")
+    told = provenance("face28")
     assert told["jaw"]["sign"] == (1, "calibrate 2026-05-17")
     assert told["jaw"]["max_deg"][1] == "calibrate 2026-05-17"
     assert told["jaw"]["id"][1] == "head file"
@@ -137,7 +137,7 @@ def test_show_tells_calibrated_and_fitted_values_from_those_of_the_file():
 def test_show_tells_what_does_not_hold():
     save_overlay(overlay("0" * 64, jaw=measured()), overlay_file("face28"))
     assert refusals("face28") == [f"jaw: its calibration does not hold: {OLD_FILE}"]
-    assert origins("face28")["jaw"]["sign"][1] == "built in"
+    assert provenance("face28")["jaw"]["sign"][1] == "built in"
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,39 @@ def test_a_tensor_that_is_not_finite_is_named(folder):
         sfms.load(folder)
 
 
+@pytest.mark.parametrize("factor", [1e30, 1e38])
+def test_weights_that_would_overflow_are_named(folder, factor):
+    _rewrite(folder, lambda tensors: tensors["predictor.slots"].fill_(factor))
+    with pytest.raises(ModelError, match=r"tensor predictor.slots holds 1e\+.*, no trained model is above 1e\+06"):
+        sfms.load(folder)
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.bool])
+def test_weights_that_are_no_floats_are_named(folder, dtype):
+    _rewrite(folder, lambda tensors: tensors.update({"predictor.slots": tensors["predictor.slots"].to(dtype)}))
+    with pytest.raises(ModelError, match=f"tensor predictor.slots is of {dtype}, the model needs torch.float32"):
+        sfms.load(folder)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_any_float_will_do(folder, dtype):
+    _rewrite(folder, lambda tensors: tensors.update({"predictor.slots": tensors["predictor.slots"].to(dtype)}))
+    assert next(iter(sfms.load(folder).model.parameters())).dtype == torch.float32
+
+
+def test_a_folder_that_cannot_be_written_is_one_line_and_nothing_is_left(tmp_path, tiny):
+    (tmp_path / "file").write_text("in the way")
+    for write in (
+        lambda: checkpoint.save_config(tmp_path / "file" / "x", tiny.settings),
+        lambda: checkpoint.save_weights(tmp_path / "file" / "x" / "model.safetensors", tiny.model),
+        lambda: checkpoint.save_weights(tmp_path, tiny.model),
+    ):
+        with pytest.raises(ModelError, match="cannot be written") as caught:
+            write()
+        assert "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_weights_of_another_configuration_are_told_by_their_shapes(folder):
     checkpoint.save_config(folder, tiny_settings(predictor_width=32))
     with pytest.raises(ModelError, match=r"tensor predictor\.\S+ has shape \(.*16.*\), the configuration needs \(.*32"):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.config import Head, load_firmware_map, load_head
-from sfms_robot.config.caution import cautious
+from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.motion.audit import Audit
 from sfms_robot.motion.calibration import Calibration
@@ -29,7 +29,7 @@ def sliver(head: Head) -> Head:
     return head.model_copy(update={"joints": joints})
 
 
-SIZES = [lambda head: head, cautious, sliver]
+SIZES = [lambda head: head, held_back, sliver]
 
 
 class Law:
@@ -124,7 +124,7 @@ def tormented(law: Law, seed: int, kinds, ticks: int) -> None:
 
 
 @pytest.mark.parametrize("chase", CHASES)
-@pytest.mark.parametrize("size", SIZES, ids=["whole", "cautious", "sliver"])
+@pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
 @pytest.mark.parametrize("name", HEADS)
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
@@ -133,7 +133,7 @@ def test_no_goal_is_refused_and_no_joint_goes_farther_out(name, size, chase, see
 
 
 @pytest.mark.parametrize("chase", CHASES)
-@pytest.mark.parametrize("size", SIZES, ids=["whole", "cautious", "sliver"])
+@pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
 @pytest.mark.parametrize("name", ["op3_head", "face28"])
 @settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))

@@ -23,14 +23,17 @@ RAD_PER_TICK = 2 * np.pi / 4096
 class Linear:
     """Middle of the servo is 0 rad; angles outside +-limit give the ticks of the limit."""
 
-    def __init__(self, limit_rad: float):
+    def __init__(self, limit_rad: float, center_ticks: int = 2048, rad_per_tick: float = RAD_PER_TICK):
         self.limit_rad = limit_rad
+        self.center_ticks = center_ticks
+        self.rad_per_tick = rad_per_tick
 
     def to_ticks(self, angles_rad):
-        return np.rint(2048 + np.clip(angles_rad, -self.limit_rad, self.limit_rad) / RAD_PER_TICK).astype(np.int64)
+        inside = np.clip(angles_rad, -self.limit_rad, self.limit_rad)
+        return np.rint(self.center_ticks + inside / self.rad_per_tick).astype(np.int64)
 
     def to_rad(self, ticks):
-        return (ticks - 2048) * RAD_PER_TICK
+        return (ticks - self.center_ticks) * self.rad_per_tick
 
 
 @dataclass
@@ -109,7 +112,7 @@ def rig_of(
         bus = DynamixelBus(
             "face",
             [BusServo(f"joint{i}", i, table, -LIMIT_RAD, LIMIT_RAD, safety or Safety()) for i in ids],
-            Linear(LIMIT_RAD),
+            Linear(LIMIT_RAD, table.center_ticks, 2 * np.pi / table.ticks_per_revolution),
             lambda: VirtualTimePort(chain.device, chain.control, baud, clock),
             baud,
             config=Bus(family="dynamixel", baud=baud, **config),

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from sfms_robot.emulator.chain import ServoChain
-from sfms_robot.emulator.protocol1 import Frame1Device
-
+from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
+from sfms_robot.emulator.protocol1_chain import Protocol1Chain
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.protocol1_link import Frame1Link
@@ -60,11 +59,11 @@ class LossyPort:
         self.inbox.clear()
 
 
-def device_of(table: Table, *rows: dict[str, object]) -> ServoChain | Frame1Device:
+def device_of(table: Table, *rows: dict[str, object]) -> Dynamixel2Chain | Protocol1Chain:
     """Emulated servos of one model in this process; a row may name id, start_ticks, firmware and registers."""
     usual = {"model": table.model, "baud": BAUD, "start_ticks": table.center_ticks, "firmware": table.firmware[0] or 1}
     filled = [{**usual, "registers": {}, "supply_v": None, "id": i + 1, **row} for i, row in enumerate(rows or ({},))]
-    kind = ServoChain if table.protocol == 2 else Frame1Device
+    kind = Dynamixel2Chain if table.protocol == 2 else Protocol1Chain
     return kind.from_rows(filled, {table.model: table})
 
 

@@ -1,9 +1,13 @@
 import numpy as np
 import pytest
 import soundfile
+import soxr
+from hypothesis import given
+from hypothesis import strategies as st
 
+from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.signals.audio import energy_db, read_audio
+from sfms_robot.signals.audio import AudioFile, Resampler, energy_db, read_audio
 
 
 def tone(rate_hz, seconds=0.5, frequency_hz=440):
@@ -47,3 +51,64 @@ def test_what_is_no_sound_is_refused_in_one_line(tmp_path):
         with pytest.raises(ConfigError, match=message) as error:
             read_audio(tmp_path / name)
         assert "\n" not in str(error.value)
+
+
+UNUSABLE = {
+    "one sample a second": (np.full(10, 0.1), 1, "PCM_16", "1 samples a second is no rate for speech"),
+    "integers as floats": (np.full(10, 1e6), 16000, "FLOAT", r"samples up to 1e\+06, full scale is 1"),
+    "the largest float": (np.full(100_000, 1e38), 48000, "FLOAT", r"samples up to 1e\+38"),
+    "one NaN late": (np.r_[np.zeros(200_000), np.nan], 16000, "DOUBLE", "not finite"),
+}
+
+
+@pytest.mark.parametrize(("samples", "rate_hz", "subtype", "told"), UNUSABLE.values(), ids=UNUSABLE.keys())
+def test_a_file_that_would_shake_the_listener_is_refused_before_it_is_played(tmp_path, samples, rate_hz, subtype, told):
+    soundfile.write(tmp_path / "a.wav", samples, rate_hz, subtype=subtype)
+    with pytest.raises(ConfigError, match=told) as error:
+        AudioFile(tmp_path / "a.wav")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("suffix", ["wav", "flac"])
+def test_a_file_cut_in_half_is_used_as_far_as_it_goes_and_said(tmp_path, caplog, suffix):
+    file = tmp_path / f"a.{suffix}"
+    soundfile.write(file, tone(16000, seconds=8.0) * np.linspace(0, 1, 128_000), 16000)
+    whole = read_audio(file)
+    assert not caplog.records
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    part = read_audio(file)
+    assert 40_000 < len(part) < 90_000 and (part == whole[: len(part)]).all()
+    assert "a." in caplog.text and len(caplog.records) == 1
+
+
+@given(
+    st.sampled_from([8000, 11025, 16000, 22050, 44100, 48000]),
+    st.lists(st.integers(0, 3000), min_size=1),
+    st.integers(),
+)
+def test_sound_in_pieces_is_the_sound_resampled_at_once(rate_hz, sizes, seed):
+    samples = np.random.default_rng(abs(seed)).uniform(-1, 1, sum(sizes)).astype(np.float32)
+    resampler = Resampler(rate_hz)
+    pieces = [resampler.push(piece) for piece in np.split(samples, np.cumsum(sizes)[:-1])]
+    pieces.append(resampler.push(np.zeros(0, dtype=np.float32), last=True))
+    at_once = samples if rate_hz == 16000 else soxr.resample(samples, rate_hz, 16000, quality="HQ")
+    np.testing.assert_array_equal(np.concatenate(pieces), np.clip(at_once, -1, 1))
+
+
+@pytest.mark.parametrize("rate_hz", [16000, 22050])
+def test_a_file_read_in_frames_is_the_file_read_at_once_and_can_start_again(tmp_path, rate_hz):
+    soundfile.write(tmp_path / "a.wav", np.stack([tone(rate_hz, 6.5), tone(rate_hz, 6.5, 300)], 1), rate_hz)
+    whole, file = read_audio(tmp_path / "a.wav"), AudioFile(tmp_path / "a.wav")
+    assert file.length == len(whole)
+    for _ in range(2):
+        frames = [file.read(640) for _ in range(len(whole) // 640 + 1)]
+        np.testing.assert_array_equal(np.concatenate(frames), whole)
+        assert not len(file.read(640))
+        file.rewind()
+    file.close()
+
+
+@pytest.mark.parametrize("name", ["facegood_1114_3_16", "katie"])
+def test_shipped_voices_are_what_soundfile_reads(name):
+    file = data_dir("sim") / "speakers" / name / "speech.wav"
+    np.testing.assert_array_equal(read_audio(file), soundfile.read(file, dtype="float32")[0])

@@ -1,5 +1,6 @@
 import gzip
 import math
+import re
 
 import numpy as np
 import pytest
@@ -156,3 +157,41 @@ def test_missing_file_binary_file_and_unknown_names_are_refused(tmp_path):
         read_track(good, source="phone")
     with pytest.raises(ConfigError, match="'jaw' is not a pose channel"):
         read_track(good, flip=["jaw"])
+
+
+FACE = ["t_s", "jawOpen", "eyeBlinkLeft"]
+UNUSABLE = {
+    "percent": (FACE, [[0, 0.1, 0.2], [0.04, 35, 0.2]], "row 3, column jawOpen = 35 is no blendshape"),
+    "negative": (FACE, [[0, 0.1, -4]], "row 2, column eyeBlinkLeft = -4 is no blendshape"),
+    "enormous": (FACE, [[0, 1e38, 0]], "row 2, column jawOpen = 1e.38 is no blendshape"),
+    "degrees": (["t_s", "headYaw"], [[0, 35]], r"row 2, column headYaw = 35 is more than a turn: .*_deg"),
+    "millimetres": (["t_s", "x"], [[0, 600]], "row 2, column x = 600 is more than 10 m"),
+    "too short": (FACE, [[0, 0.1, 0.2], [0.04, 0.1], [0.08, 0.1, 0.2]], "row 3 has 2 cells, the header has 3"),
+    "too long": (FACE, [[0, 0.1, 0.2, 0.3]], "row 2 has 4 cells, the header has 3"),
+    "milliseconds": (["time_s", "jawOpen"], [[40 * n, 0.1] for n in range(5)], "time_s: .*40 s apart.* milliseconds"),
+    "seconds": (["t_ms", "jawOpen"], [[n / 25, 0.1] for n in range(5)], "t_ms: .*4e-05 s apart.* seconds"),
+}
+
+
+@pytest.mark.parametrize(("header", "rows", "told"), UNUSABLE.values(), ids=UNUSABLE.keys())
+def test_what_is_in_another_unit_or_ragged_is_one_line(tmp_path, header, rows, told):
+    with pytest.raises(ConfigError, match=told) as caught:
+        read_track(written(tmp_path / "a.csv", header, *rows))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_a_table_with_other_dividers_is_refused_for_that(tmp_path, mark):
+    (tmp_path / "a.csv").write_text("\n".join(mark.join(row) for row in (["t_s", "jawOpen"], ["0", "0,1"])))
+    with pytest.raises(ConfigError, match=re.escape(f"divided by {mark!r}, a comma is needed")):
+        read_track(tmp_path / "a.csv")
+
+
+def test_a_last_row_that_is_cut_off_is_left_out_and_said(tmp_path, caplog):
+    track = read_track(written(tmp_path / "a.csv", FACE, [0, 0.1, 0.2], [0.04, 0.3, 0.2], [0.08, 0.3]))
+    assert len(track.times_s) == 2 and "last row is cut off" in caplog.text
+
+
+def test_a_tracker_that_overshoots_is_clipped(tmp_path):
+    track = read_track(written(tmp_path / "a.csv", FACE, [0, 1.2, -0.1]))
+    assert track.motion[0].max() == 1.0 and track.motion[0].min() == 0.0

@@ -1,3 +1,6 @@
+import struct
+import tracemalloc
+
 import numpy as np
 import pytest
 import soundfile
@@ -6,8 +9,10 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
+from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.tracks import Track, write_track
-from sfms_robot.sources.recording import Recording, open_source
+from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.registry import open_source
 from sfms_robot.sources.speakers import shipped_speaker, speakers
 
 
@@ -126,7 +131,7 @@ def test_the_robots_voice_does_not_start_again_with_the_persons():
 
 def test_a_robots_voice_alone_lasts_as_long_as_it_speaks():
     assert Recording(None, None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
-    assert Recording(voice(3), None, agent_audio=voice(7)).duration_s == pytest.approx(0.12)
+    assert Recording(voice(3), None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
 
 
 @pytest.mark.parametrize(("name", "said"), [("gone.wav", "no such file"), ("loopback", "not available yet")])
@@ -138,3 +143,37 @@ def test_a_robots_voice_that_is_not_there_is_named(name, said):
 def test_a_shipped_speaker_lends_the_robot_its_voice():
     source = open_source("none", "none", agent_audio=speakers()[0])
     assert any(frame.agent_audio.any() for frame in source.read(5.0))
+
+
+def test_a_recording_read_from_its_file_is_the_recording_held_in_memory(tmp_path):
+    rng = np.random.default_rng(5)
+    soundfile.write(tmp_path / "a.wav", rng.uniform(-1, 1, (30_000, 2)), 22050)
+    held = Recording(read_audio(tmp_path / "a.wav"), None, 7.0, agent_audio=read_audio(tmp_path / "a.wav"))
+    streamed = open_source(str(tmp_path / "a.wav"), "none", 7.0, agent_audio=str(tmp_path / "a.wav"))
+    for one, other in zip(held.read(7.0), streamed.read(7.0), strict=True):  # it starts again twice
+        np.testing.assert_array_equal(one.audio, other.audio)
+        np.testing.assert_array_equal(one.agent_audio, other.agent_audio)
+    streamed.close()
+
+
+def test_three_hours_are_not_loaded(tmp_path):
+    size = 3 * 3600 * 8000 * 2
+    header = struct.pack("<4sI4s4sIHHIIHH", b"RIFF", size + 36, b"WAVE", b"fmt ", 16, 1, 1, 8000, 16000, 2, 16)
+    header += struct.pack("<4sI", b"data", size)
+    with (tmp_path / "long.wav").open("wb") as file:
+        file.write(header)
+        file.truncate(len(header) + size)  # a hole: silence that takes no room on the disk
+    open_source(str(tmp_path / "long.wav"), "none").close()  # what is imported on first use is not counted
+    tracemalloc.start()
+    source = open_source(str(tmp_path / "long.wav"), "none")
+    assert source.duration_s == 3 * 3600 and len(source.read(20.0)) == 500
+    assert tracemalloc.get_traced_memory()[1] < 8_000_000
+    tracemalloc.stop()
+    source.close()
+
+
+def test_a_robots_voice_that_is_longer_is_not_cut_and_the_person_does_not_begin_again():
+    source = Recording(voice(3), None, agent_audio=voice(40))
+    frames = source.read(60.0)
+    assert len(frames) == 40 and source.duration_s == pytest.approx(1.6)
+    assert frames[38].agent_audio.any() and not any(frame.audio.any() for frame in frames[3:])

@@ -15,7 +15,7 @@ from sfms_robot.app.replay import replay_run
 from sfms_robot.config import load_head
 from sfms_robot.errors import MissingExtra
 from sfms_robot.ports import Observer
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 
 FOLDER: Final = "sfms-demo"

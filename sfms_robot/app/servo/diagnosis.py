@@ -14,13 +14,22 @@ from sfms_robot.app.servo.budget import Budget
 from sfms_robot.app.servo.servo_state import State
 from sfms_robot.app.servo.servo_wire import Seen
 from sfms_robot.servo.discovery import Holder, SerialDevice
+from sfms_robot.servo.registers import Table
+from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
 
 Severity = Literal["error", "warning", "note"]
 
 SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 FAST_ENOUGH_MS: Final = 1
+UDEV_FILE: Final = "/etc/udev/rules.d/99-servos.rules"
 _ROUND: Final = 0.95  # a bus that reaches this share of its rate reaches it
 _MEASURED: Final = {"input voltage": "voltage", "overheating": "temperature"}
+_POLOLU: Final = "1ffb"
+_BOARD_HELP: Final = {
+    "maestro": "use the first of its two USB ports (command port) with serial mode USB Dual Port or USB Chained, or "
+    "its RX and TX with serial mode UART at the baud of the head's file; Pololu's Maestro Control Center sets the mode",
+    "ssc32": "set the board's baud jumpers to the baud of the head's file; an SSC-32U leaves the factory at 9600",
+}
 _HOT_C: Final = 10  # this close to its limit a servo is about to switch off
 
 
@@ -52,6 +61,7 @@ class Wanted:
         model_number: None where it cannot be checked.
         masked: faults that the head lives with.
         thresholds: fault -> (lowest, highest) reading with which the head lives with it; None is open.
+        needs: what its joint needs the servo to have stored.
     """
 
     joint: str
@@ -59,6 +69,7 @@ class Wanted:
     model_number: int | None
     masked: frozenset[str] = frozenset()
     thresholds: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    needs: JointNeeds | None = None
 
     def lives_with(self, fault: str, state: State) -> bool:
         """Whether the head's file says that this fault does not count."""
@@ -77,6 +88,12 @@ class Command:
 
     port: str
     family: str
+    head: str | None = None
+
+    @property
+    def fix(self) -> str:
+        family = "" if self.family == "dynamixel2" else f" --family {self.family}"
+        return f"sfms-robot doctor --port {self.port}{f' --head {self.head}' if self.head else family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
         rate = f" --baud {baud}" if baud is not None else ""
@@ -119,27 +136,54 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
             "warning",
             device.path,
             f"the adapter holds every answer back for {device.latency_ms} ms",
-            f"echo 1 | sudo tee {device.latency_file}",
+            f"echo 1 | sudo tee {device.latency_file}  (until it is unplugged; for good: the udev rule below)",
         )
+
+
+def udev_rule(device: SerialDevice) -> str | None:
+    """Lines for `UDEV_FILE` that outlive replugging: the latency timer, and a name of its own for this adapter.
+
+    None for a port that is no USB adapter. An adapter without a serial number is told by the socket it is plugged
+    into, since two of a kind would share a name.
+    """
+    if device.vendor is None or device.product is None:
+        return None
+    which = f'ATTRS{{idVendor}}=="{device.vendor}", ATTRS{{idProduct}}=="{device.product}"'
+    if device.serial:
+        which += f', ATTRS{{serial}}=="{device.serial}"'
+        name = f"servos-{device.serial}"
+    else:
+        name = "servos-%k"
+    lines = [f'SUBSYSTEM=="tty", {which}, SYMLINK+="{name}"']
+    if device.latency_file is not None:
+        timer = f'ATTR{{latency_timer}}="{FAST_ENOUGH_MS}"'
+        lines.insert(0, f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="{device.driver}", {timer}')
+    return "\n".join(lines)
 
 
 # --- who is there -----------------------------------------------------------------------------------------------
 
 
 def judge_presence(
-    wanted: Mapping[int, Wanted], here: Mapping[int, Seen], elsewhere: Mapping[int, Seen], baud: int, command: Command
+    wanted: Mapping[int, Wanted],
+    here: Mapping[int, Seen],
+    elsewhere: Mapping[int, Seen],
+    baud: int,
+    command: Command,
+    hint: str = "",
 ) -> Iterator[Finding]:
     """Ids that the head wants and are not there, at another rate, or somebody else; and ids it does not know.
 
     Args:
         here: who answers at the head's rate, by id.
         elsewhere: who answers at another one.
+        hint: who answers to another protocol.
     """
     if wanted and not here and not elsewhere:
         yield Finding(
             "error",
             "bus",
-            f"nobody answers, at any rate: none of {len(wanted)} servos",
+            f"nobody answers, at any rate: none of {len(wanted)} servos{f'; {hint}' if hint else ''}",
             "check power, cable, data direction of the adapter, and --port",
         )
         return
@@ -198,6 +242,7 @@ def judge_servo(state: State, want: Wanted | None, command: Command) -> Iterator
     yield from _judge_firmware(state, about)
     yield from _judge_health(state, about, want, command)
     yield from _judge_settings(state, about, command)
+    yield from judge_stored(state, want, command)
 
 
 def _judge_firmware(state: State, about: str) -> Iterator[Finding]:
@@ -256,16 +301,47 @@ def _judge_settings(state: State, about: str, command: Command) -> Iterator[Find
     if level is not None and (now := state.value("status_level")) is not None and now < 1:
         fix = command.servo(f"write {{id}} {level.name} {level.high}", seen.baud)
         yield Finding("warning", about, f"status return level {now}: answers pings only", fix, seen.id)
-    mode = table.role("operating_mode")
-    position, now = table.position_mode, state.value("operating_mode")
-    if mode is not None and position is not None and now != position:
-        fix = command.servo(f"write {{id}} {mode.name} {position}", seen.baud)
-        if torque:
-            fix = f"{command.servo('write {id} torque_enable 0', seen.baud)}, then {fix}"
-        severity: Severity = "error" if torque else "note"
-        yield Finding(severity, about, f"operating mode {now} is not position control ({position})", fix, seen.id)
-    elif torque:
+    if torque:
         yield Finding("note", about, "torque is on", servo=seen.id)
+
+
+def judge_stored(state: State, want: Wanted | None, command: Command) -> Iterator[Finding]:
+    """What the unit has stored against what its joint needs; without a head, against itself."""
+    seen = state.seen
+    about, torque = _name(seen.id, want), state.value("torque_enable")
+    for each in stored_contradictions(state, want):
+        severity: Severity = "error" if each.then == "refused" else "note" if each.then == "set" else "warning"
+        fix = ""
+        if each.fixable and each.register in _own_registers(seen):
+            fix = command.servo(f"write {{id}} {each.register} {each.wanted}", seen.baud)
+            if torque:
+                severity = "error" if each.then == "set" else severity
+                fix = f"{command.servo('write {id} torque_enable 0', seen.baud)}, then {fix}"
+        elif each.fixable:
+            fix = command.fix
+        yield Finding(severity, about, str(each), fix, seen.id)
+
+
+def stored_contradictions(state: State, want: Wanted | None) -> list[Contradiction]:
+    """As startup sees them, and with the faults that the head's file says to live with."""
+    table = state.seen.table
+    if table is None or not state.table:
+        return []
+    values = state.values()
+    needs = want.needs if want is not None and want.needs is not None else _as_it_is(values, table)
+    if want is not None:
+        needs = replace(needs, allowed_faults=want.masked)
+    return contradictions(values, table, needs)
+
+
+def _as_it_is(values: Mapping[str, int], table: Table) -> JointNeeds:
+    """What a servo that is no joint of a head needs: to stay within its own limits."""
+    low, high = (values.get(name, table.center_ticks) for name in limit_names(table) or ("", ""))
+    return JointNeeds(low, high) if low < high else JointNeeds(table.center_ticks, table.center_ticks)
+
+
+def _own_registers(seen: Seen) -> list[str]:
+    return [name for name, field in seen.table.fields.items() if field.writable] if seen.table is not None else []
 
 
 # --- the bus ----------------------------------------------------------------------------------------------------
@@ -297,8 +373,12 @@ def judge_rate(budget: Budget, rate_hz: float, fast_works: bool | None, command:
     yield Finding("warning", "bus", f"reaches {hertz} of {rate_hz:g} with {what} ({slow} takes most)", fix)
 
 
-def judge_board(family: str, channels: int) -> Iterator[Finding]:
-    """A bus of hobby servos: there is nothing to ask."""
+def judge_board(family: str, channels: int, answers: bool | None, device: SerialDevice) -> Iterator[Finding]:
+    """A bus of hobby servos: there is little to ask. `answers`: whether the board did; None where it was not asked."""
+    if answers is False:
+        yield Finding("error", "bus", f"no {family} board answers", _BOARD_HELP[family])
+    elif device.vendor == _POLOLU and device.path.startswith("/dev/ttyACM"):
+        yield Finding("note", "bus", "a Maestro on USB has two ports: the first takes commands, the second is its TTL")
     yield Finding(
         "note", "bus", f"a {family} board does not tell which of its {channels} servos are there, nor where they stand"
     )

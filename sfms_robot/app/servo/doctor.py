@@ -1,4 +1,4 @@
-"""`sfms-robot doctor`: look at a port, its adapter and every servo on it, and say what to do. Reads only.
+"""`sfms-robot doctor`: look at a port, its adapter and every servo on it, and say what to do. Reads only, but to fix.
 
 Without a head it tells who is there, at every rate. With a head it also tells who is missing, at another rate, of
 another model or not in the file, and whether the bus reaches the head's rate.
@@ -26,24 +26,34 @@ from sfms_robot.app.servo.diagnosis import (
     judge_rate,
     judge_servo,
     judge_twins,
+    stored_contradictions,
     summary,
+    udev_rule,
 )
+from sfms_robot.app.servo.protocol_hint import protocol_hint
 from sfms_robot.app.servo.servo_state import State, read_all
-from sfms_robot.app.servo.servo_tools import Progress, scan, twins
+from sfms_robot.app.servo.servo_tools import Confirm, Progress, field_named, guard, put, scan, twins
 from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
 from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.config.overlay import head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
-from sfms_robot.servo.families import current_name, servo_families
+from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
+from sfms_robot.servo.stored_settings import JointNeeds
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_RATE_HZ: Final = 100.0
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
+_NOTHING_SEEN: Final[dict[str, Any]] = {
+    "adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": [],
+}  # fmt: skip
+_BOARD_S: Final = 0.2  # a board answers at once; 9600 baud and a USB adapter take the rest
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
 
 OpenPort = Callable[[str, int], Port]
@@ -60,12 +70,21 @@ class Line:
     baud: int | None
     rate_hz: float
     wanted: dict[int, Wanted]
+    head: str | None = None
 
 
 def examine(
-    port: str | None, head: str | None, family: str, baud: int | None, clock: Clock, progress: Progress | None = None
+    port: str | None,
+    head: str | None,
+    family: str,
+    baud: int | None,
+    clock: Clock,
+    progress: Progress | None = None,
+    fix: Confirm | None = None,
 ) -> dict[str, Any]:
     """Every bus of a head, or one port; the report, whose `exit_code` is that of the command.
+
+    `fix` is asked before each stored value that can be mended without harm is; None mends nothing.
 
     Raises ConfigError for a head, a family or a port description that cannot be used.
     """
@@ -73,7 +92,7 @@ def examine(
         raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
-        buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress) for line in lines]
+        buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress, fix) for line in lines]
     return {
         "version": 1,
         "head": head,
@@ -86,8 +105,10 @@ def examine(
     }
 
 
-def examine_line(line: Line, clock: Clock, open_port: OpenPort, progress: Progress | None = None) -> dict[str, Any]:
-    """One port: report with `adapter`, `servos`, `budget`, `findings`, `exit_code`."""
+def examine_line(
+    line: Line, clock: Clock, open_port: OpenPort, progress: Progress | None = None, fix: Confirm | None = None
+) -> dict[str, Any]:
+    """One port: report with `adapter`, `servos`, `budget`, `fixed`, `findings`, `exit_code`."""
     path = line.device
     problem = None if "://" in path else access_problem(path)
     report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
@@ -103,16 +124,17 @@ def examine_line(line: Line, clock: Clock, open_port: OpenPort, progress: Progre
                 adapter = describe(path)  # after opening, which may have set the latency
                 findings += judge_adapter(adapter, held_by)
                 if line.family in BOARDS:
-                    found, facts = _look_at_board(line)
+                    found, facts = _look_at_board(line, port, adapter)
                 else:
-                    found, facts = _look(line, port, clock, adapter, progress)
+                    found, facts = _look(line, port, clock, adapter, progress, fix)
             except BusError as error:
                 findings.append(Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable"))
-                return _finished({**report, "adapter": asdict(adapter), "servos": [], "budget": None}, findings)
+                return _finished({**report, **_NOTHING_SEEN, "adapter": asdict(adapter)}, findings)
             finally:
                 port.close()
-            return _finished({**report, "adapter": asdict(adapter), **facts}, [*findings, *found])
-    return _finished({**report, "adapter": None, "servos": [], "budget": None}, findings, PORT_FAILED)
+            facts |= {"adapter": asdict(adapter), "udev_rule": udev_rule(adapter)}
+            return _finished({**report, **facts}, [*findings, *found])
+    return _finished({**report, **_NOTHING_SEEN}, findings, PORT_FAILED)
 
 
 def _is_terminal(path: str) -> bool:
@@ -137,34 +159,44 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         }
     else:
         where = devices(described, port or only_port())
+        described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
     for name, device in where.items():
         bus = described.buses[name]
-        speaks = current_name(bus.family)
         shown = SIM if port == SIM else device
-        yield Line(name, device, shown, speaks, bus.baud, bus.rate_hz, _wanted(described, name))
+        yield Line(name, device, shown, bus.family, bus.baud, bus.rate_hz, _wanted(described, name), head)
 
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
     masked = frozenset(head.faults.mask)
     thresholds = {name: (each.min, each.max) for name, each in head.faults.thresholds.items()}
     joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
-    return {
-        joint.id: Wanted(name, joint.model, load_firmware_map(joint.model).model_number, masked, thresholds)
-        for name, joint in joints.items()
-    }
+    maps = {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
+    from sfms_robot.app.wiring import calibration_of
+
+    ranges = calibration_of(joints)
+    ids = frozenset(joint.id for joint in joints.values())
+    found = {}
+    for name, low, high in zip(joints, ranges.low_ticks, ranges.high_ticks, strict=True):
+        joint = joints[name]
+        bounded = head.safety_of(name).current_limit_mA is not None
+        needs = JointNeeds(int(low), int(high), head.safety_of(name).stored, ids - {joint.id}, bounded)
+        found[joint.id] = Wanted(name, joint.model, maps[joint.model].model_number, masked, thresholds, needs)
+    return found
 
 
 def _look(
-    line: Line, port: Port, clock: Clock, adapter: SerialDevice, progress: Progress | None
+    line: Line, port: Port, clock: Clock, adapter: SerialDevice, progress: Progress | None, fix: Confirm | None
 ) -> tuple[list[Finding], dict[str, Any]]:
     """Everything that needs the open port."""
-    command = Command(line.shown, line.family)
+    command = Command(line.shown, line.family, line.head)
     wire = Wire(port, line.family, clock, _first_baud(line))
     here, elsewhere = (
         {servo: _as_wanted(seen, line) for servo, seen in found.items()} for found in _who(wire, line, progress)
     )
     baud = line.baud or next(iter(seen.baud for seen in here.values()), wire.baud)
-    findings = list(judge_presence(line.wanted, here, elsewhere, baud, command))
+    hint = "" if here or elsewhere else protocol_hint(wire)
+    findings = list(judge_presence(line.wanted, here, elsewhere, baud, command, hint))
+    fixed: list[str] = []
     states: list[State] = []
     double: list[int] = []
     for done, seen in enumerate([*here.values(), *elsewhere.values()]):
@@ -173,7 +205,11 @@ def _look(
         wire.at(seen.baud)
         double += [seen.id] if twins(wire, seen.id) else []
         try:
-            states.append(read_all(wire, seen))
+            state = read_all(wire, seen)
+            if fix is not None and (done_here := _fix(wire, state, line.wanted.get(seen.id), fix)):
+                fixed += done_here
+                state = read_all(wire, seen)
+            states.append(state)
         except ServoError as error:
             findings.append(Finding("error", f"id {seen.id}", str(error), _speak_again(seen, command), seen.id))
     findings += judge_twins(double)
@@ -189,18 +225,59 @@ def _look(
         "baud": baud,
         "rate_hz": line.rate_hz,
         "servos": [_servo_row(state, line) for state in states],
+        "fixed": fixed,
         "fast_sync_read": fast,
         "budget": budget and budget.plain_data(),
     }
     return findings, facts
 
 
-def _look_at_board(line: Line) -> tuple[list[Finding], dict[str, Any]]:
+def _fix(wire: Wire, state: State, want: Wanted | None, confirm: Confirm) -> list[str]:
+    """Write what can be mended without harm, each asked about and verified; what was done.
+
+    Raises ServoError for a servo that has torque on, or does not take it.
+    """
+    seen, done = state.seen, []
+    for each in stored_contradictions(state, want):
+        change = f"{each.register} {each.value} -> {each.wanted}"
+        if not each.fixable or not confirm(f"id {seen.id} ({seen.model}): {change} ({each.why})"):
+            continue
+        guard(wire, seen, change, lambda question: True)
+        field = field_named(seen.registers(), each.register)
+        if field.writable:
+            put(wire, seen, field, each.wanted)
+        else:
+            _clear_turns(wire, seen)
+        done.append(f"id {seen.id}: {change}")
+    return done
+
+
+def _clear_turns(wire: Wire, seen: Seen) -> None:
+    """Forget whole turns; the shaft stays where it is."""
+    answer = cast(Dxl2Link, wire.link).clear_turns(seen.id)
+    if answer is None or (refusal := wire.link.refusal(answer)):
+        raise ServoError(f"id {seen.id} does not forget its turns: {refusal if answer else 'no answer'}")
+
+
+def _board_answers(family: str, port: Port) -> bool | None:
+    """Whether the board answers the one question that it has; None where nothing can be asked."""
+    question, size = (maestro.addressed(maestro.get_errors()), 2) if family == "maestro" else (ssc32.query_moving(), 1)
+    port.discard_input()
+    port.write(question)
+    end_s, data = port.now_s() + _BOARD_S, bytearray()
+    while len(data) < size and (part := port.read(size, end_s)):
+        data += part
+    return len(data) >= size
+
+
+def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], dict[str, Any]]:
     """What can be said of a board of hobby servos, whose port could be opened."""
     budget = board_budget(line.family, max(1, len(line.wanted)), _first_baud(line))
     command = Command(line.shown, line.family)
-    findings = [*judge_board(line.family, len(line.wanted)), *judge_rate(budget, line.rate_hz, None, command)]
-    facts = {"baud": budget.baud, "rate_hz": line.rate_hz, "servos": [], "fast_sync_read": None}
+    answers = _board_answers(line.family, port)
+    found = judge_board(line.family, len(line.wanted), answers, adapter)
+    findings = [*found, *judge_rate(budget, line.rate_hz, None, command)]
+    facts = {"baud": budget.baud, "rate_hz": line.rate_hz, "servos": [], "fixed": [], "fast_sync_read": None}
     return findings, {**facts, "budget": budget.plain_data()}
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sfms_robot.app.servo.servo_tools import read_block, refused
+from sfms_robot.app.servo.servo_tools import read_block
 from sfms_robot.app.servo.servo_wire import TRIES, Seen, Wire
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
@@ -40,6 +40,11 @@ class State:
         if field is None or field.address < self.start or field.address + field.size > self.start + len(self.table):
             return None
         return field.from_bytes(self.table[field.address - self.start :])
+
+    def values(self) -> dict[str, int]:
+        """Raw values of all registers that were read, by name."""
+        fields = self.seen.table.fields if self.seen.table is not None else {}
+        return {name: value for name in fields if (value := self.value(name)) is not None}
 
     def in_unit(self, name: str) -> float | None:
         """As `value`, in the unit of the firmware map."""
@@ -108,7 +113,7 @@ def _watched(wire: Wire, seen: Seen) -> dict[str, Any]:
     start = min(field.address for field in fields)
     length = max(field.address + field.size for field in fields) - start
     answer = wire.at(seen.baud).read(seen.id, start, length)
-    if answer is None or refused(wire, answer):
+    if answer is None or wire.link.refusal(answer):
         return {**State(seen, 0, b"", 0).row(), "faults": "silent"}
     return State(seen, start, answer.data, answer.error).row()
 

@@ -15,8 +15,7 @@ from sfms_robot.app.servo.servo_wire import PATIENCE_S, TRIES, Seen, Wire
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.duplicate_ids import hear_ping
-from sfms_robot.servo.chain.link import Answer
-from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.chain.verified_write import finish, verified_write
 from sfms_robot.servo.registers import Field, Table
 
 Confirm = Callable[[str], bool]
@@ -24,7 +23,6 @@ Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is 
 
 BACK_S: Final = 2.0  # a servo that restarts is back by then
 _STEP_S: Final = 0.1
-_REFUSALS: Final = {"dynamixel2": 0x7F, "dynamixel1": 0x5A, "feetech": 0x00}  # bits that mean "not done"
 _RESETS: Final = {"all": 0xFF, "keep-id": 1, "keep-id-and-baud": 2}
 
 
@@ -133,12 +131,9 @@ def write_register(wire: Wire, seen: Seen, name: str, text: str, confirm: Confir
     before = None if mute else Value(field, read(wire, seen, field))
     if field.eeprom:
         change = f"{field.name} := {raw}" if before is None else f"{field.name} {before.raw} -> {raw}"
-        _guard(wire, seen, change, confirm, mute)
+        guard(wire, seen, change, confirm, mute)
     put(wire, seen, field, raw)
-    now = read(wire, seen, field)
-    if now != raw:
-        raise ServoError(f"id {seen.id}: {field.name} was set to {raw} and reads {now}")
-    return before, Value(field, now)
+    return before, Value(field, raw)
 
 
 def parse_value(model: str, field: Field, text: str) -> int:
@@ -163,33 +158,15 @@ def read_block(wire: Wire, seen: Seen, address: int, length: int, what: str) -> 
     for _ in range(TRIES):
         answer = wire.link.read(seen.id, address, length)
         if answer is not None:
-            if refusal := refused(wire, answer):
+            if refusal := wire.link.refusal(answer):
                 raise ServoError(f"id {seen.id} does not tell {what}: {refusal}")
             return answer.data
     raise ServoError(f"id {seen.id} does not answer when asked for {what} (status return level 0?)")
 
 
 def put(wire: Wire, seen: Seen, field: Field, raw: int) -> None:
-    """Write a register; a lock is opened before EEPROM and closed after it. Raises ServoError when it is refused.
-
-    A missing acknowledgement is no error: the status return level may forbid it, and an id or rate just set does.
-    """
-    lock = _lock(wire, seen) if field.eeprom else None
-    if lock is not None:
-        wire.link.write(seen.id, lock.address, lock.to_bytes(0))
-    answer = wire.link.write(seen.id, field.address, field.to_bytes(raw))
-    if lock is not None:
-        wire.link.write(seen.id, lock.address, lock.to_bytes(1))
-    if answer is not None and (refusal := refused(wire, answer)):
-        raise ServoError(f"id {seen.id} refuses {field.name} := {raw}: {refusal}")
-
-
-def refused(wire: Wire, answer: Answer) -> str:
-    """What an error byte says about the request; empty when it was done, whatever else the servo complains of."""
-    bits = answer.error & _REFUSALS[wire.family]
-    if not bits:
-        return ""
-    return dxl2.error_text(bits) if wire.family == "dynamixel2" else f"error bits 0x{bits:02x}"
+    """A verified write, through the lock of the EEPROM where there is one. Raises ServoError."""
+    finish(verified_write(wire.link, seen.id, field, raw, lock=_lock(seen), tries=TRIES))
 
 
 # --- id, rate, start over ---------------------------------------------------------------------------------------
@@ -214,7 +191,7 @@ def set_id(wire: Wire, seen: Seen, new: int, confirm: Confirm, in_chain: bool = 
             raise ConfigError(
                 f"other servos are on the wire (id {', '.join(map(str, others))}): unplug them, or say --in-chain"
             )
-    _guard(wire, seen, f"id {seen.id} -> {new}", confirm)
+    guard(wire, seen, f"id {seen.id} -> {new}", confirm)
     _put_in_eeprom_and_go(wire, seen, _register(seen, "id"), new, new)
     changed = wire.ping(new)
     if changed is None:
@@ -232,7 +209,7 @@ def set_baud(wire: Wire, seen: Seen, baud: int, confirm: Confirm) -> Seen:
     before = wire.baud
     wire.at(baud)  # an adapter that cannot do it says so while the servo can still be reached
     wire.at(before)
-    _guard(wire, seen, f"baud {before} -> {baud}", confirm)
+    guard(wire, seen, f"baud {before} -> {baud}", confirm)
     _put_in_eeprom_and_go(wire, seen, _register(seen, "baud_rate"), codes[baud], seen.id, baud)
     wire.at(baud)
     changed = wire.ping(seen.id)
@@ -249,7 +226,7 @@ def reboot(wire: Wire, seen: Seen, confirm: Confirm) -> Seen:
     if torque is not None and read(wire, seen, torque):
         _ask(f"id {seen.id} has torque on; a reboot lets go of what it holds", confirm)
     answer = wire.link.reboot(seen.id)
-    if answer is not None and (refusal := refused(wire, answer)):
+    if answer is not None and (refusal := wire.link.refusal(answer)):
         raise ServoError(f"id {seen.id} refuses to reboot: {refusal}")
     back = _wait_for(wire, seen.id)
     if back is None:
@@ -269,9 +246,9 @@ def factory_reset(wire: Wire, seen: Seen, keep: str, confirm: Confirm) -> Seen:
         if rate is not None and wire.at(rate).ping(new_id) is not None:
             raise ConfigError(f"id {new_id}, which a new servo has, is taken by another one at {rate} baud: unplug it")
         wire.at(home)
-    _guard(wire, seen, f"every setting of id {seen.id} to its factory value ({keep})", confirm)
+    guard(wire, seen, f"every setting of id {seen.id} to its factory value ({keep})", confirm)
     answer = wire.link.factory_reset(seen.id, _RESETS[keep])
-    if answer is not None and (refusal := refused(wire, answer)):
+    if answer is not None and (refusal := wire.link.refusal(answer)):
         raise ServoError(f"id {seen.id} refuses the reset: {refusal}")
     expected = wire.baud if keep == "keep-id-and-baud" or rate is None else rate
     for baud in dict.fromkeys((expected, wire.baud)):
@@ -305,12 +282,12 @@ def _register(seen: Seen, role: str) -> Field:
     return field
 
 
-def _lock(wire: Wire, seen: Seen) -> Field | None:
+def _lock(seen: Seen) -> Field | None:
     """The register that opens EEPROM. Not that of Dynamixel 1.0: closed once, it stays closed until power is off."""
-    return seen.registers().role("lock") if wire.family == "feetech" else None
+    return seen.registers().role("lock")
 
 
-def _guard(wire: Wire, seen: Seen, what: str, confirm: Confirm, mute: bool = False) -> None:
+def guard(wire: Wire, seen: Seen, what: str, confirm: Confirm, mute: bool = False) -> None:
     """Before EEPROM: torque off (which a `mute` servo cannot say), and somebody wants it.
 
     Raises ServoError, ConfigError.
@@ -330,11 +307,11 @@ def _ask(question: str, confirm: Confirm) -> None:
 
 def _put_in_eeprom_and_go(wire: Wire, seen: Seen, field: Field, raw: int, new_id: int, baud: int | None = None) -> None:
     """As `put`, for a register after which the servo is elsewhere: the lock has to be closed there."""
-    lock = _lock(wire, seen)
+    lock = _lock(seen)
     if lock is not None:
         wire.link.write(seen.id, lock.address, lock.to_bytes(0))
     answer = wire.link.write(seen.id, field.address, field.to_bytes(raw))
-    if answer is not None and (refusal := refused(wire, answer)):
+    if answer is not None and (refusal := wire.link.refusal(answer)):
         raise ServoError(f"id {seen.id} refuses {field.name} := {raw}: {refusal}")
     if lock is not None:
         wire.at(baud or wire.baud).write(new_id, lock.address, lock.to_bytes(1))

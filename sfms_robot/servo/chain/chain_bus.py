@@ -86,7 +86,7 @@ class ChainBus(WireBus[L], Generic[L]):
         config: BusConfig | None = None,
         faults: Faults | None = None,
     ) -> None:
-        config = config or BusConfig(family="dynamixel", baud=baud)
+        config = config or BusConfig(family="dynamixel2", baud=baud)
         self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
         self._tables = [Table.of(servo.map) for servo in servos]

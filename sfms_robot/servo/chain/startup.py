@@ -268,9 +268,8 @@ def needs_of(servos: Sequence[BusServo], conversion: TickConversion) -> list[Joi
         conversion.to_ticks(np.array([servo.max_rad for servo in servos])),
     ]
     ids = frozenset(servo.id for servo in servos)
-    return [
-        JointNeeds(
-            int(min(a, b)), int(max(a, b)), servo.stored, ids - {servo.id}, servo.safety.current_limit_mA is not None
-        )
-        for servo, a, b in zip(servos, *ends, strict=True)
-    ]
+    needs = []
+    for servo, a, b in zip(servos, *ends, strict=True):
+        bounded = servo.safety.current_limit_mA is not None
+        needs.append(JointNeeds(int(min(a, b)), int(max(a, b)), servo.safety.stored, ids - {servo.id}, bounded))
+    return needs

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Final
 
-from sfms_robot.config.head import Head, Joint, LimitClass
+from sfms_robot.config.head import Head
+from sfms_robot.config.joint import Joint, LimitClass
 
 TRAVEL: Final = 0.2
 PACE: Final = 0.3
 _SUFFIX: Final = "_calibrate_first"
 
 
-def cautious(head: Head, joints: Collection[str] | None = None) -> Head:
+def held_back(head: Head, joints: Collection[str] | None = None) -> Head:
     """The head with `joints` (all of them by default) at 20 % of their travel and 0.3 of their limits."""
     names = set(head.joints if joints is None else joints)
     classes = {head.joints[name].limits for name in head.joints if name in names}

@@ -81,7 +81,12 @@ def _bus(bus: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield _table([{key: row[key] for key in columns} for row in bus["servos"]])
     if bus["budget"]:
         yield from _budget(bus)
+    for each in bus.get("fixed", ()):
+        yield Text(f"fixed   {each}", style="green")
     yield from _findings(bus["findings"])
+    if bus["udev_rule"] and any("udev rule" in each["fix"] for each in bus["findings"]):
+        yield Text("udev rule, for /etc/udev/rules.d/99-servos.rules (then sudo udevadm control --reload, and replug):")
+        yield Text(bus["udev_rule"], style="cyan")
     counts = bus["counts"]
     verdict = "not fit to run" if counts["error"] else "fit to run"
     numbers = [f"{number} {name}{'s' if number != 1 else ''}" for name, number in counts.items()]

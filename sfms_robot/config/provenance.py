@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sfms_robot.config.base import Model, read
-from sfms_robot.config.drives import NOT_SHARED
-from sfms_robot.config.head import Joint, load_head
+from sfms_robot.config.base import Model
+from sfms_robot.config.head import load_head
+from sfms_robot.config.inheritance import NOT_SHARED
+from sfms_robot.config.joint import Joint
 from sfms_robot.config.overlay import CALIBRATE, FIT, head_hash, layered, load_overlay
+from sfms_robot.config.yaml_file import read
 from sfms_robot.data import find
 
 SHOWN: Final = (
@@ -22,7 +24,7 @@ MEASURED: Final = ("zero_ticks", "sign", "min_deg", "max_deg")  # what a calibra
 OWN, DEFAULTS, BUILT_IN = "head file", "joint_defaults", "built in"
 
 
-def origins(name: str) -> dict[str, dict[str, tuple[Any, str]]]:
+def provenance(name: str) -> dict[str, dict[str, tuple[Any, str]]]:
     """Per joint and key, the value and its origin.
 
     Measurements count here whichever servos are plugged in now. Raises ConfigError for a head that is not sound.

@@ -1,0 +1,133 @@
+"""`sfms-robot servo move`: one servo, gently, and left as it was found."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+from sfms_robot.app.servo.servo_tools import field_named, put, read
+from sfms_robot.app.servo.servo_wire import Seen, Wire
+from sfms_robot.errors import ConfigError, ServoError
+from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.stored_settings import limit_names
+
+SPEED_DEG_S: Final = 20.0
+STEP_S: Final = 0.02
+BEHIND_DEG: Final = 8.0  # farther behind its goal than this, something is in the way
+SETTLE_S: Final = 1.0
+CLOSE_DEG: Final = 1.5  # a loaded servo without integral gain stops that short
+
+
+def move(wire: Wire, seen: Seen, to: str | None, by: str | None) -> dict[str, Any]:
+    """Move a servo to a place or by a way: raw ticks, or degrees of its shaft as `-5deg`.
+
+    Its own profile is limited and its goal goes in steps of at most `SPEED_DEG_S`; torque comes on where it stands.
+    Torque and profile are put back afterwards, also after Ctrl-C. Blocks for as long as the way takes, and `SETTLE_S`.
+
+    Raises ConfigError for a goal outside its limits, ServoError for one that is not in position mode, refuses, or does
+    not get there; it then stops where it is.
+    """
+    table = seen.registers()
+    goal_field, present_field = field_named(table, "goal_position"), field_named(table, "present_position")
+    _in_position_mode(wire, seen)
+    start = read(wire, seen, present_field)
+    target = _target(wire, seen, table, start, to, by)
+    step = max(1, math.floor(_ticks(table, SPEED_DEG_S) * STEP_S))
+    with _gently(wire, seen, start):
+        goal, due_s = start, wire.clock.now_s()
+        while goal != target:
+            goal += max(-step, min(step, target - goal))
+            put(wire, seen, goal_field, goal)
+            due_s += STEP_S
+            wire.clock.wait_until(due_s)
+            _in_the_way(wire, seen, goal, read(wire, seen, present_field))
+        reached = _settled(wire, seen, present_field, target)
+    return {"id": seen.id, "from": start, "to": target, "reached": reached}
+
+
+def _target(wire: Wire, seen: Seen, table: Table, start: int, to: str | None, by: str | None) -> int:
+    if (to is None) == (by is None):
+        raise ConfigError("servo move: say --to TICKS or --by TICKS, one of them (or degrees: --by -5deg)")
+    target = _parsed(table, to) if to is not None else start + _parsed(table, by or "")
+    low, high = 0, math.ceil(table.ticks_per_revolution) - 1
+    names = limit_names(table)
+    if names is not None:
+        own = tuple(read(wire, seen, table[name]) for name in names)
+        low, high = own if own[0] < own[1] else (low, high)
+    if not low <= target <= high:
+        raise ConfigError.at(f"id {seen.id}", "goal", target, "is outside its limits", [f"{low}..{high}"])
+    if not low <= start <= high:
+        raise ServoError(f"id {seen.id} stands at {start}, outside its limits {low}..{high}: turn it in by hand")
+    return target
+
+
+def _parsed(table: Table, text: str) -> int:
+    match = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*(deg)?\s*", text)
+    if match is None or (match[2] is None and "." in match[1]):
+        raise ConfigError.at("servo move", "goal", text, "is no place", ["ticks: 2048", "degrees: 12.5deg"])
+    return round(_ticks(table, float(match[1]))) if match[2] else int(match[1])
+
+
+def _in_position_mode(wire: Wire, seen: Seen) -> None:
+    table = seen.registers()
+    mode = table.role("operating_mode")
+    if mode is None or table.position_mode is None:
+        return
+    if (now := read(wire, seen, mode)) != table.position_mode:
+        raise ServoError(
+            f"id {seen.id} is in operating mode {now}, not in position control: "
+            f"sfms-robot servo write {seen.id} {mode.name} {table.position_mode}"
+        )
+
+
+@contextmanager
+def _gently(wire: Wire, seen: Seen, start: int) -> Iterator[None]:
+    """Torque on at `start` with a slow profile; afterwards both are as before."""
+    table = seen.registers()
+    torque, goal = field_named(table, "torque_enable"), field_named(table, "goal_position")
+    speed = table.role("moving_speed")
+    was_on, was_fast = read(wire, seen, torque), None if speed is None else read(wire, seen, speed)
+    try:
+        if speed is not None:
+            put(wire, seen, speed, _slow(speed))
+        if not was_on:
+            put(wire, seen, goal, start)
+            put(wire, seen, torque, 1)
+        yield
+    finally:
+        if not was_on:
+            put(wire, seen, torque, 0)
+        if speed is not None and was_fast is not None:
+            put(wire, seen, speed, was_fast)
+
+
+def _slow(speed: Field) -> int:
+    """Twice the speed of the steps, so that the servo keeps up with them and does no more."""
+    per_unit = 6.0 if speed.unit == "rpm" else 1.0  # deg/s
+    return min(speed.high, max(1, round(2.0 * SPEED_DEG_S / per_unit / speed.scale)))
+
+
+def _in_the_way(wire: Wire, seen: Seen, goal: int, present: int) -> None:
+    table = seen.registers()
+    if abs(goal - present) > _ticks(table, BEHIND_DEG):
+        put(wire, seen, field_named(table, "goal_position"), present)
+        raise ServoError(f"id {seen.id} stays at {present} while its goal is {goal}: something is in the way")
+
+
+def _settled(wire: Wire, seen: Seen, present: Field, target: int) -> int:
+    """Where it stands once it is close. Raises ServoError."""
+    end_s = wire.clock.now_s() + SETTLE_S
+    while True:
+        now = read(wire, seen, present)
+        if abs(now - target) <= _ticks(seen.registers(), CLOSE_DEG):
+            return now
+        if wire.clock.now_s() >= end_s:
+            raise ServoError(f"id {seen.id} stopped at {now}, its goal is {target}")
+        wire.clock.wait_until(wire.clock.now_s() + STEP_S)
+
+
+def _ticks(table: Table, degrees: float) -> float:
+    return degrees * table.ticks_per_revolution / 360.0

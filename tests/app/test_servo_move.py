@@ -1,0 +1,106 @@
+"""`servo move`: slowly there, and the servo left as it was found, whatever happens on the way."""
+
+import pytest
+from test_servo_tools import put, wire_on
+
+from sfms_robot.app.servo.move import BEHIND_DEG, SPEED_DEG_S, move
+from sfms_robot.app.servo.servo_tools import field_named, read
+from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo
+from sfms_robot.errors import ConfigError, ServoError
+
+MODELS = {"xl330-m288": "dynamixel2", "xl-320": "dynamixel2", "ax-12a": "dynamixel1", "sts3215": "feetech"}
+
+
+class Watched:
+    """The servo's state each time the clock is waited for."""
+
+    def __init__(self, wire, chain):
+        self.wire, self.chain, self.clock, self.seen = wire, chain, wire.clock, []
+
+    def now_s(self):
+        return self.clock.now_s()
+
+    def wait_until(self, time_s):
+        self.clock.wait_until(time_s)
+        self.chain.time_is(self.clock.now_s())
+        self.seen.append((self.clock.now_s(), self.chain.state(1)["position"]))
+
+
+def at(model, **more):
+    return EmulatedServo(1, model, start_ticks=load_firmware_map(model).center_ticks, **more)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("by", [90, -90, 3])
+def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
+    with wire_on(at(model), family=MODELS[model]) as (wire, chain):
+        seen = wire.find(1)
+        table = seen.registers()
+        speed, torque = table.role("moving_speed"), field_named(table, "torque_enable")
+        before = read(wire, seen, speed)
+        wire.clock = watched = Watched(wire, chain)
+        result = move(wire, seen, None, str(by))
+        assert abs(result["reached"] - (table.center_ticks + by)) <= table.ticks_per_revolution / 200
+        assert (read(wire, seen, torque), read(wire, seen, speed)) == (0, before)
+        degrees = 360.0 / table.ticks_per_revolution
+        steps = zip(watched.seen, watched.seen[1:], strict=False)
+        speeds = [abs(b - a) * degrees / (t - s) for (s, a), (t, b) in steps if t > s]
+        assert max(speeds, default=0.0) <= 2.5 * SPEED_DEG_S
+
+
+def test_a_servo_that_held_goes_on_holding():
+    with wire_on(at("xl330-m288")) as (wire, _):
+        put(wire, 1, "torque_enable", 1)
+        move(wire, wire.find(1), "2100", None)
+        assert read(wire, wire.find(1), wire.find(1).registers()["torque_enable"]) == 1
+
+
+def test_degrees_are_those_of_the_shaft():
+    with wire_on(at("xl330-m288")) as (wire, _):
+        assert move(wire, wire.find(1), None, "-9deg")["to"] == 2048 - 102
+
+
+@pytest.mark.parametrize(
+    ("to", "by", "problem"),
+    [
+        ("9999", None, "outside its limits"),
+        (None, None, "one of them"),
+        ("5", "5", "one of them"),
+        ("x", None, "no place"),
+    ],
+)
+def test_what_is_no_goal_is_refused_with_nothing_moved(to, by, problem):
+    with wire_on(at("xl330-m288")) as (wire, chain):
+        with pytest.raises(ConfigError, match=problem):
+            move(wire, wire.find(1), to, by)
+        assert not chain.state(1)["torque"]
+
+
+def test_its_own_limits_hold():
+    registers = {"min_position_limit": 2000, "max_position_limit": 2100}
+    with wire_on(at("xl330-m288", registers=registers)) as (wire, _):
+        with pytest.raises(ConfigError, match="2000..2100"):
+            move(wire, wire.find(1), "2200", None)
+
+
+def test_something_in_the_way_ends_it_without_torque():
+    with wire_on(at("xl330-m288")) as (wire, chain):
+
+        class Blocked(Watched):
+            """A hand that keeps the shaft where it is."""
+
+            def wait_until(self, time_s):
+                super().wait_until(time_s)
+                self.chain.turn(1, 2048)
+
+        wire.clock = Blocked(wire, chain)
+        with pytest.raises(ServoError, match="something is in the way"):
+            move(wire, wire.find(1), None, "60deg")
+        assert not chain.state(1)["torque"] and abs(chain.state(1)["position"] - 2048) < BEHIND_DEG * 4096 / 360
+
+
+def test_another_mode_is_refused_with_what_to_type():
+    with wire_on(at("xl330-m288", registers={"operating_mode": 1})) as (wire, _):
+        with pytest.raises(ServoError, match="sfms-robot servo write 1 operating_mode 3"):
+            move(wire, wire.find(1), "2050", None)

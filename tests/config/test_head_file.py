@@ -1,0 +1,149 @@
+"""Values of a head's file that would hurt, older words, and what a run may write into a servo."""
+
+import logging
+
+import pytest
+
+from sfms_robot.config import Bus, FirmwareMap, load_firmware_map, load_head, map_files
+from sfms_robot.config.check import check_head
+from sfms_robot.config.named_bus import highest_rate_hz
+from sfms_robot.config.register_rules import is_harmless, register_problems
+from sfms_robot.config.safety_rules import Safety
+from sfms_robot.errors import ConfigError
+
+HEAD = """
+{more}
+name: small
+description: two joints
+buses: {{main: {{family: dynamixel2, baud: 57600, rate_hz: 50{bus}}}}}
+limits: {{slow: {{speed_deg_s: 90, acceleration_deg_s2: 900, jerk_deg_s3: 9000}}}}
+joint_defaults: {{bus: main, model: xl330-m288, zero_ticks: 2048, min_deg: -10, max_deg: 20, limits: slow}}
+joints:
+  jaw: {{id: 1{joint}}}
+  lid: {{id: 2}}
+"""
+
+
+def written(folder, more="", bus="", joint=""):
+    (folder / "head.yaml").write_text(HEAD.format(more=more, bus=bus, joint=joint))
+    return str(folder)
+
+
+WRONG = {
+    "rate of a baud slip": (dict(bus=", rate_hz: 1000000"), "'rate_hz' is given twice"),
+    "id by yes": (dict(joint=", ratio: yes"), "joints.jaw.ratio = 'yes'"),
+    "id by true": (dict(joint=", ratio: true"), "joints.jaw: ratio = true is neither a number nor a name"),
+    "lag of days": (dict(joint=", lag_ms: 1.0e9"), "joints.jaw.lag_ms = 1000000000.0: .*less than or equal to 500"),
+    "deadline of days": (dict(bus=", read_deadline_ms: 1.0e9"), "buses.main.read_deadline_ms = .* to 100"),
+    "stagger of days": (dict(bus=", stagger_ms: 1.0e9"), "buses.main.stagger_ms = .* equal to 1000"),
+    "register by true": (dict(joint=", safety: {registers: {led: true}}"), "joints.jaw.safety.registers.led = True"),
+    "a newer version": (dict(more="version: 2\nunheard_of: 3"), "version = 2 is of a newer sfms-robot; .* version 1"),
+    "no version": (dict(more="version: -1"), "version = -1"),
+    "octal": (dict(joint=", ratio: 010"), "leading zero"),
+}
+
+
+@pytest.mark.parametrize(("change", "told"), WRONG.values(), ids=WRONG.keys())
+def test_what_would_hurt_is_one_line(tmp_path, change, told):
+    name = written(tmp_path, **change)
+    with pytest.raises(ConfigError, match=told) as caught:
+        load_head(name)
+    assert "\n" not in str(caught.value)
+    assert check_head(name) and all("\n" not in line for line in check_head(name))
+
+
+def with_rate(tmp_path, rate):
+    name = written(tmp_path)
+    file = tmp_path / "head.yaml"
+    file.write_text(file.read_text().replace("rate_hz: 50", f"rate_hz: {rate}"))
+    return name
+
+
+def test_a_rate_that_the_wire_cannot_carry_is_refused_with_the_highest_it_can(tmp_path):
+    highest = highest_rate_hz("dynamixel2", 57600, 2)
+    assert highest == 240  # 14 bytes and 5 for each of two servos, 10 bits each
+    with pytest.raises(ConfigError, match=r"buses.main.rate_hz = 241 is more than 57600 baud carry .* \(at most 240\)"):
+        load_head(with_rate(tmp_path, 241))
+    assert any("at most 240" in line for line in check_head(str(tmp_path)))
+    assert load_head(with_rate(tmp_path, 240)).buses["main"].rate_hz == 240
+    with pytest.raises(ConfigError, match="rate_hz = 1000000.*less than or equal to 1000"):
+        load_head(with_rate(tmp_path, 1_000_000))
+
+
+@pytest.mark.parametrize("family", ["dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"])
+@pytest.mark.parametrize("baud", [1200, 57_600, 4_000_000])
+def test_no_family_goes_beyond_a_thousand_and_none_comes_to_a_stop(family, baud):
+    rates = [highest_rate_hz(family, baud, joints) for joints in range(1, 60)]
+    assert all(1 <= rate <= 1000 for rate in rates) and rates == sorted(rates, reverse=True)
+
+
+def test_files_of_0_1_0_load_and_say_what_their_words_are_now(tmp_path, caplog):
+    name = written(tmp_path, joint=", safety: {registers: {drive_mode: 1, position_p_gain: 300}}")
+    file = tmp_path / "head.yaml"
+    file.write_text(file.read_text().replace("dynamixel2", "dynamixel"))
+    with caplog.at_level(logging.WARNING):
+        head = load_head(name)
+    assert head.buses["main"].family == "dynamixel2" and head.version == 1
+    assert head.safety_of("jaw").registers == {"position_p_gain": 300}
+    assert head.safety_of("jaw").stored == {"drive_mode": 1}
+    assert [record.getMessage().partition(": ")[2] for record in caplog.records] == [
+        "buses.main.family: 'dynamixel' is called 'dynamixel2' now",
+        "joints.jaw.safety.registers.drive_mode is joints.jaw.safety.stored.drive_mode now: compared, never written",
+    ]
+    assert check_head(name) == []
+
+
+def test_shipped_heads_use_the_words_of_now(caplog):
+    with caplog.at_level(logging.WARNING):
+        for name in ("face28", "interbotix_wxxms", "poppy_head"):
+            load_head(name)
+    assert not caplog.records
+
+
+MAPS = [load_firmware_map(file.stem) for file in map_files()]
+HURTS = {
+    "goal_position", "torque_enable", "id", "baud_rate", "status_level", "lock", "torque_limit", "bus_watchdog",
+    "operating_mode", "return_delay", "error_status",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("table", MAPS, ids=lambda table: table.model)
+def test_nothing_that_says_who_a_servo_is_or_what_it_does_may_be_written_unasked(table: FirmwareMap):
+    names = HURTS | {table.roles.get(role) or role for role in HURTS}
+    for name, register in table.registers.items():
+        if (
+            name in names
+            or register.area == "EEPROM"
+            or register.access == "R"
+            or name.startswith(("goal", "indirect"))
+        ):
+            assert not is_harmless(table, name), name
+
+
+@pytest.mark.parametrize(
+    "register", ["id", "baud_rate", "operating_mode", "secondary_id", "homing_offset", "drive_mode"]
+)
+def test_a_register_that_renumbers_or_turns_a_servo_is_refused_by_name(tmp_path, register):
+    low = load_firmware_map("xl330-m288").registers[register].low
+    safety = Safety(registers={register: low})
+    ((key, value, problem, choices),) = register_problems(safety, load_firmware_map("xl330-m288"))
+    assert (key, value) == (f"registers.{register}", low) and "stored in xl330-m288 for good" in problem
+    assert "position_p_gain" in choices and register not in choices
+
+
+def test_head_check_tells_registers_too(tmp_path):
+    (line,) = check_head(written(tmp_path, more="safety: {registers: {goal_position: 1}}", joint=", safety: {}"))[:1]
+    assert "joints.jaw.safety.registers.goal_position = 1" in line and "not the file's to set" in line
+
+
+def test_what_is_stored_is_stored_for_good_and_fits():
+    table = load_firmware_map("xl330-m288")
+    assert not [*register_problems(Safety(stored={"drive_mode": 1, "homing_offset": -5}), table)]
+    (forgotten,) = register_problems(Safety(stored={"led": 1}), table)
+    assert "is forgotten" in forgotten[2]
+    (too_large,) = register_problems(Safety(stored={"drive_mode": 999}), table)
+    assert "does not fit" in too_large[2]
+
+
+def test_names_of_0_1_0_hold_when_a_bus_is_made_in_code():
+    assert Bus(family="dynamixel", baud=57600) == Bus(family="dynamixel2", baud=57600)

@@ -1,0 +1,55 @@
+"""What is read from a YAML file, and what is refused with its line."""
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.config.yaml_file import DEEPEST, read
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+
+SHIPPED = sorted(file for name in ("configs", "firmware_maps", "sim") for file in data_dir(name).rglob("*.yaml"))
+
+
+def of(tmp_path, text):
+    file = tmp_path / "head.yaml"
+    file.write_text(text, encoding="utf-8")
+    return read(file)
+
+
+@pytest.mark.parametrize(
+    ("scalar", "value"),
+    [
+        *((word, word) for word in ("yes", "no", "on", "off", "Yes", "NO", "y", "1:30", "2026-05-17", "1_000", "0x17")),
+        ("true", True), ("FALSE", False), ("~", None), ("", None), ("0", 0), ("-17", -17), ("+5", 5), ("0.5", 0.5),
+        (".5", 0.5), ("1e3", 1000.0), ("-1.5E-2", -0.015), (".inf", float("inf")), ("'023'", "023"),
+    ],
+)  # fmt: skip
+def test_scalars_are_those_of_yaml_1_2(tmp_path, scalar, value):
+    found = of(tmp_path, f"key: {scalar}\n")["key"]
+    assert found == value and type(found) is type(value)
+
+
+@pytest.mark.parametrize("number", ["023", "-01", "00", "09"])
+def test_a_leading_zero_is_refused_with_its_line(tmp_path, number):
+    with pytest.raises(ConfigError, match=rf"head.yaml:2: {number} has a leading zero: write {int(number)}"):
+        of(tmp_path, f"name: a\nid: {number}\n")
+
+
+@pytest.mark.parametrize("text", ["[" * 5000 + "]" * 5000, "[" * 30_000, "- " * 5000, "{a: " * 5000])
+def test_what_is_nested_too_deeply_is_one_line(tmp_path, text):
+    with pytest.raises(ConfigError, match=f"head.yaml:1: (nested more than {DEEPEST} levels deep|.*)") as caught:
+        of(tmp_path, text)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}/{file.name}")
+def test_shipped_files_mean_what_they_meant_to_yaml_1_1(file):
+    assert read(file) == yaml.safe_load(file.read_text(encoding="utf-8"))
+
+
+@given(st.dictionaries(st.text(), st.one_of(st.integers(), st.booleans(), st.none(), st.text(), st.floats(width=32))))
+def test_what_we_write_is_what_we_read(tmp_path_factory, value):
+    text = yaml.safe_dump(value, allow_unicode=False)
+    assert repr(of(tmp_path_factory.mktemp("yaml"), text)) == repr(yaml.safe_load(text))

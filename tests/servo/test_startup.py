@@ -1,0 +1,337 @@
+"""Startup: who is absent stops nobody, and what a unit has stored against its head's file keeps its torque off."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lossy_port import BAUD, LossyPort, device_of, link_on
+
+from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.errors import BusError, ServoError
+from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
+from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
+from sfms_robot.servo.chain.startup import PATIENCE_S, needs_of
+from sfms_robot.servo.chain.verified_write import Silent, finish
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.registers import Table
+from sfms_robot.servo.stored_settings import contradictions
+
+LIMIT_RAD = 0.9
+MODELS = ("xl330-m288", "mx-28-2.0", "xl-320", "ax-12a", "mx-28-1.0", "sts3215", "scs0009")
+WITH_TURNS = ("xl330-m288", "mx-28-2.0")
+
+
+class Straight:
+    """The middle of the servo is 0 rad."""
+
+    def __init__(self, table, ratio=1.0):
+        self.center, self.rad = table.center_ticks, 2 * np.pi / table.ticks_per_revolution / ratio
+
+    def to_ticks(self, angles_rad):
+        return np.rint(self.center + np.asarray(angles_rad) / self.rad).astype(np.int64)
+
+    def to_rad(self, ticks):
+        return (ticks - self.center) * self.rad
+
+
+class Rig:
+    """A few servos of one model, and the startup of a bus that wants ids 1, 2, ..."""
+
+    def __init__(self, model, *rows, limit_rad=LIMIT_RAD, ratio=1.0, wanted=None, stored=None, safety=None, tries=3):
+        firmware_map = load_firmware_map(model)
+        self.table = Table.of(firmware_map)
+        self.device = device_of(self.table, *rows)
+        self.port = LossyPort(self.device)
+        servos = [
+            BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety or Safety(stored=stored or {}))
+            for i in wanted or range(1, 1 + max(1, len(rows)))
+        ]
+        kind = Dynamixel2Startup if self.table.protocol == 2 else Protocol1Startup
+        self.conversion = Straight(self.table, ratio)
+        self.needs = needs_of(servos, self.conversion)
+        link = link_on(self.port, self.table)
+        self.startup = kind("face", link, servos, [self.table] * len(servos), self.conversion, BAUD, tries)
+
+    def held(self, name, servo=1):
+        field = self.table.role(name) or self.table[name]
+        return field.from_bytes(self.device.servo(servo).read(field.address, field.size, self.port.t)[1])
+
+    def values(self):
+        """All registers, as doctor reads them."""
+        return {name: self.held(name) for name in self.table.fields}
+
+    def found(self):
+        return {each.register: each for each in contradictions(self.values(), self.table, self.needs[0])}
+
+
+def limits_of(table):
+    return ("cw_angle_limit", "ccw_angle_limit") if "cw_angle_limit" in table.fields else (
+        "min_position_limit", "max_position_limit")  # fmt: skip
+
+
+# --- who is there -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_absent_servos_do_not_stop_the_others(model):
+    rig = Rig(model, {"id": 1}, {"id": 3}, wanted=[1, 2, 3, 4])
+    assert rig.startup.run() == {0: 0, 2: 0}
+    assert rig.startup.switch_on(2) == rig.table.center_ticks
+    assert [rig.held("torque_enable", i) for i in (1, 3)] == [0, 1]
+    assert rig.port.t < 2 * 3 * 2 * PATIENCE_S  # two absent, three pings each, with room for the others
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_nobody_at_all_is_a_failed_bus(model):
+    rig = Rig(model, {"id": 9}, wanted=[1, 2])
+    with pytest.raises(
+        BusError, match=r"no answer from id 1 \(joint1\), 2 \(joint2\); look for them: sfms-robot servo"
+    ):
+        rig.startup.run()
+
+
+@pytest.mark.parametrize("model", MODELS)
+@given(fate=st.lists(st.sampled_from(["", "", "", "request", "answer"]), max_size=60))
+def test_torque_is_on_only_where_the_servo_stands_whatever_is_lost(model, fate):
+    rig = Rig(model, {"id": 1, "start_ticks": 500})
+    rig.port.fate = iter(fate)
+    try:
+        rig.startup.run()
+        assert rig.startup.switch_on(0) == 500
+    except (BusError, ServoError):
+        assert set(fate) - {""}
+    if rig.held("torque_enable"):
+        assert rig.held("goal_position") == 500
+    assert rig.device.servo(1).state(rig.port.t)["position"] == pytest.approx(500, abs=1)
+
+
+def test_a_servo_that_was_away_and_is_mute_is_silent_and_not_refused():
+    rig = Rig("xl330-m288", {"id": 2}, wanted=[1, 2])
+    rig.startup.run()
+    with pytest.raises(Silent):
+        finish(rig.startup.bring_back(0, reboot=False))
+
+
+# --- position limits --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_limits_narrower_than_the_joint_are_refused_with_what_to_type(model):
+    """Goals of 0.9 rad would be clipped or refused by the servo, and the joint stop short of them without a word."""
+    table = Table.of(load_firmware_map(model))
+    low, high = limits_of(table)
+    stored = {low: table.center_ticks - 50, high: table.center_ticks + 50}
+    rig = Rig(model, {"registers": stored})
+    with pytest.raises(
+        ServoError,
+        match=rf"joint1 \(id 1\).*{low} is {stored[low]}, wanted {rig.needs[0].low_ticks}"
+        r".*sfms-robot doctor --port lossy .*--fix, or sfms-robot servo write 1 ",
+    ):
+        rig.startup.run()
+    assert {low, high} <= rig.found().keys()
+    assert rig.held("torque_enable") == 0
+
+
+@pytest.mark.parametrize("model", MODELS)
+@given(data=st.data())
+def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_limits(model, data):
+    table = Table.of(load_firmware_map(model))
+    names = limits_of(table)
+    ends = sorted(data.draw(st.lists(st.integers(0, table[names[1]].high), min_size=2, max_size=2, unique=True)))
+    rig = Rig(model, {"registers": dict(zip(names, ends, strict=True))})
+    reached = ends[0] <= rig.needs[0].low_ticks and rig.needs[0].high_ticks <= ends[1]
+    if reached:
+        rig.startup.run()
+    else:
+        with pytest.raises(ServoError, match="position_limit|angle_limit"):
+            rig.startup.run()
+    for each in rig.found().values():  # what is proposed mends it
+        rig = Rig(model, {"registers": rig.values() | {each.register: each.wanted}})
+        assert each.register not in rig.found()
+
+
+@pytest.mark.parametrize("model", ["ax-12a", "mx-28-1.0", "xl-320"])
+def test_wheel_mode_is_ended(model):
+    rig = Rig(model, {"registers": {"cw_angle_limit": 0, "ccw_angle_limit": 0}})
+    rig.startup.run()
+    assert (rig.held("cw_angle_limit"), rig.held("ccw_angle_limit")) == (0, rig.table["ccw_angle_limit"].high)
+
+
+# --- zero and direction -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", ["xl330-m288", "sts3215"])
+def test_another_homing_offset_than_the_head_s_file_reckons_with_is_refused(model):
+    rig = Rig(model, {"registers": {"homing_offset": 100}}, stored={"homing_offset": 612})
+    with pytest.raises(ServoError, match="homing_offset is 100, wanted 612: every angle would be -45.0 deg off"):
+        rig.startup.run()
+    Rig(model, {"registers": {"homing_offset": 612}}, stored={"homing_offset": 612}).startup.run()
+
+
+@pytest.mark.parametrize("model", ["xl330-m288", "sts3215"])
+def test_an_offset_of_which_the_head_s_file_says_nothing_is_told(model):
+    rig = Rig(model, {"registers": {"homing_offset": 100}})
+    rig.startup.run()
+    assert rig.found()["homing_offset"].then == "told"
+
+
+def test_a_servo_that_runs_the_other_way_is_refused_where_the_file_says_which():
+    rig = Rig("xl330-m288", {"registers": {"drive_mode": 1}}, stored={"drive_mode": 0})
+    with pytest.raises(ServoError, match="drive_mode is 1, wanted 0: the joint would move the other way"):
+        rig.startup.run()
+    rig = Rig("xl330-m288", {"registers": {"drive_mode": 1}})
+    rig.startup.run()
+    assert rig.found()["drive_mode"].then == "told"
+
+
+# --- what acts by itself ----------------------------------------------------------------------------------------
+
+
+def test_torque_at_power_up_is_refused():
+    rig = Rig("xl330-m288", {"registers": {"startup_configuration": 3}})
+    with pytest.raises(ServoError, match="startup_configuration is 3, wanted 2: its torque comes on at power-up"):
+        rig.startup.run()
+
+
+def test_a_secondary_id_that_is_another_servo_of_the_head_is_refused():
+    rig = Rig("xl330-m288", {"id": 1, "registers": {"secondary_id": 2}}, {"id": 2})
+    with pytest.raises(ServoError, match="secondary_id is 2, wanted 255: it would follow the goals of id 2 too"):
+        rig.startup.run()
+    rig = Rig("xl330-m288", {"id": 1, "registers": {"secondary_id": 77}})
+    rig.startup.run()
+    assert rig.found()["secondary_id"].then == "told"
+
+
+@pytest.mark.parametrize("model", ["xl330-m288", "ax-12a", "sts3215"])
+def test_a_shutdown_mask_without_its_protections_is_told(model):
+    name = "unloading_condition" if model == "sts3215" else "shutdown"
+    rig = Rig(model, {"registers": {name: 0}})
+    rig.startup.run()
+    told = rig.found()[name]
+    assert told.then == "told" and "overload" in told.why and "overheating" in told.why
+    assert told.wanted and Rig(model, {"registers": {name: told.wanted}}).found().get(name) is None
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_servo_as_it_leaves_the_factory_contradicts_nothing(model):
+    rig = Rig(model)
+    assert [each for each in rig.found().values() if each.then != "set"] == []
+    rig.startup.run()
+    assert rig.found() == {}
+
+
+# --- turns ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", WITH_TURNS)
+@pytest.mark.parametrize("found", [4150, -100, 9000])
+def test_a_joint_turned_by_hand_past_one_turn_starts_where_it_stands(model, found):
+    rig = Rig(model, {"start_ticks": found})
+    rig.startup.run()
+    assert rig.startup.switch_on(0) == found % 4096
+    assert rig.held("torque_enable") == 1
+    assert rig.device.servo(1).state(rig.port.t + 1.0)["position"] == found % 4096
+
+
+def test_turns_are_not_cleared_under_torque():
+    rig = Rig("xl330-m288", {"start_ticks": 4150, "registers": {"operating_mode": 4}})
+    servo = rig.device.servo(1)
+    for name, value in (("goal_position", 4150), ("torque_enable", 1)):
+        servo.write(rig.table[name].address, rig.table[name].to_bytes(value), 0.0)
+    with pytest.raises(ServoError, match="present_position is 4150, wanted 54: it was turned past one turn"):
+        rig.startup.run()
+    assert servo.state(rig.port.t)["torque"]
+
+
+def test_a_servo_that_cannot_forget_its_turns_is_refused_with_the_way_out():
+    rig = Rig("sts3215", {"start_ticks": 5000})
+    with pytest.raises(ServoError, match="present_position is 5000.*turn it back by hand, or switch its supply off"):
+        rig.startup.run()
+
+
+def test_an_offset_shifts_the_one_turn_that_there_is():
+    """Of a servo with a homing offset of a quarter turn, readings up to 5119 are no turn too many."""
+    rig = Rig("xl330-m288", {"start_ticks": 5000, "registers": {"homing_offset": 1024}}, stored={"homing_offset": 1024})
+    rig.startup.run()
+    assert rig.device.servo(1).state(rig.port.t)["position"] == 5000
+
+
+# --- more than one turn -----------------------------------------------------------------------------------------
+
+GEARED = {"ratio": 4.0, "limit_rad": 1.2}  # 2048 +- 3129 ticks
+
+
+@pytest.mark.parametrize("model", WITH_TURNS)
+def test_a_geared_joint_works_in_extended_position_control(model):
+    rig = Rig(model, **GEARED)
+    rig.startup.run()
+    assert rig.held("operating_mode") == 4 and rig.startup.wanted(0)["operating_mode"] == 4
+    rig.startup.switch_on(0)
+    servo, goal = rig.device.servo(1), rig.table["goal_position"]
+    assert servo.write(goal.address, goal.to_bytes(5000), rig.port.t) == 0
+    assert servo.state(rig.port.t + 60.0)["position"] == pytest.approx(5000, abs=2)
+
+
+@given(ticks=st.integers(-1081, 5177))
+def test_torque_comes_on_only_where_the_lost_count_of_turns_leaves_one_place(ticks):
+    """After power-up a servo reads its place within one turn: of all places it may be at, none other is in range."""
+    read = ticks % 4096
+    rig = Rig("xl330-m288", {"start_ticks": read}, **GEARED)
+    places = [read + turn * 4096 for turn in (-2, -1, 0, 1, 2)]
+    if [each for each in places if -1081 <= each <= 5177] == [read] == [ticks]:
+        rig.startup.run()
+        assert rig.startup.switch_on(0) == ticks
+    else:
+        with pytest.raises(ServoError, match="turns is lost.*by hand to where it will read 1082..3014"):
+            rig.startup.run()
+        assert not rig.device.servo(1).state(rig.port.t)["torque"]
+
+
+def test_a_geared_joint_that_kept_its_torque_kept_its_count():
+    rig = Rig("xl330-m288", **GEARED)
+    rig.startup.run()
+    rig.startup.switch_on(0)
+    servo, goal = rig.device.servo(1), rig.table["goal_position"]
+    servo.write(goal.address, goal.to_bytes(5000), rig.port.t)
+    servo.advance(60.0)
+    rig.port.t = 60.0
+    assert rig.startup.run() == {0: 0}
+    assert finish(rig.startup.bring_back(0, reboot=False)) == pytest.approx(5000, abs=2)
+
+
+def test_a_geared_joint_whose_supply_failed_far_out_stays_without_torque():
+    rig = Rig("xl330-m288", {"start_ticks": 2000}, **GEARED)
+    rig.startup.run()
+    servo = rig.device.servo(1)
+    servo.turn(5150, rig.port.t)
+    servo.reboot(rig.port.t)
+    rig.port.t += 1.0
+    with pytest.raises(ServoError, match="present_position is 1054.*count of turns"):
+        finish(rig.startup.bring_back(0, reboot=False))
+
+
+# --- settings ---------------------------------------------------------------------------------------------------
+
+
+def test_a_register_above_those_that_are_polled_is_written_too():
+    """XL-320: punch lies behind everything that tells the present."""
+    rig = Rig("xl-320", safety=Safety(registers={"punch": 40}))
+    rig.startup.run()
+    assert rig.held("punch") == 40
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_register_that_the_model_does_not_have_is_named(model):
+    rig = Rig(model, safety=Safety(registers={"no_such_register": 1}))
+    with pytest.raises(ServoError, match=rf"is a {model}, which has no register no_such_register"):
+        rig.startup.run()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_wanted_is_in_force_after_startup(model):
+    rig = Rig(model, safety=Safety(torque_limit_percent=50))
+    rig.startup.run()
+    rig.startup.switch_on(0)
+    wanted = rig.startup.wanted(0)
+    assert wanted
+    assert {name: rig.held(name) for name in wanted} == dict(wanted)
