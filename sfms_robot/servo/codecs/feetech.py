@@ -9,7 +9,7 @@ byte 5:
     RESET TURNS (0A)       none; STS only
     CALIBRATE OFFSET (0B)  none; the present position becomes the middle
 
-Byte 4 of an answer is the status of the servo. Bit 4 is not used, and nothing there says whether a request was taken.
+Byte 4 of an answer is the status of the servo. Nothing there says whether a request was taken.
 
 Sources: Feetech communication protocol manual (matthieuvigne/STS_servos @bdff048, extras/); ftservo/FTServo_Arduino
 @64922cd, src/INST.h.
