@@ -1,4 +1,4 @@
-# Two commands matter: `make run` (a simulated head listens) and `make test`. Both make .venv first if it is missing.
+# Two commands matter: `make run` (an emulated head listens, and two pictures show it) and `make test`. Both make .venv first if it is missing.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: run test test-all lint bench install clean
 
 run: install
-	$(BIN)/sfms-robot run --duration 20
+	$(BIN)/sfms-robot demo
 
 install: $(VENV)/.installed
 

@@ -1,3 +1,99 @@
-"""A robot head that listens: voice in, servo goals out."""
+"""A robot head that listens: voice in, servo goals out.
+
+    head = load_head("face28")
+    Retargeter(head).angles(face58)                       faces to joint angles
+    load_listener("sfms-small").stream(seed=0)            voice and face to plans
+    with open_bus(head, "sim") as bus: ...                servos alone
+    with Robot("face28", port="sim") as robot: ...        all of it, in a thread of its own
+
+Every name is loaded when it is first used, so that importing this package costs nothing. docs/api.md has them all.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from sfms_robot.app.api.listener_stream import ListenerStream, LoadedListener, load_listener
+    from sfms_robot.app.api.robot import Robot
+    from sfms_robot.app.api.servos import Servos, open_bus
+    from sfms_robot.config import Head, load_head
+    from sfms_robot.errors import (
+        BusError,
+        ConfigError,
+        InputError,
+        MissingExtra,
+        ModelError,
+        PacketError,
+        PortError,
+        RobotError,
+        ServoError,
+    )
+    from sfms_robot.frames import BLENDSHAPES, CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
+    from sfms_robot.ports import Listener, Source
+    from sfms_robot.retarget.head import HeadRetargeter as Retargeter
+    from sfms_robot.runtime.planned_events import MotionEvent
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "BLENDSHAPES",
+    "CHANNELS",
+    "BusError",
+    "ConfigError",
+    "FaceFrame",
+    "Head",
+    "InputError",
+    "Listener",
+    "ListenerStream",
+    "LoadedListener",
+    "MissingExtra",
+    "ModelError",
+    "MotionEvent",
+    "PacketError",
+    "Plan",
+    "PortError",
+    "Reading",
+    "Retargeter",
+    "Robot",
+    "RobotError",
+    "ServoError",
+    "Servos",
+    "Source",
+    "SpeakerFrame",
+    "load_head",
+    "load_listener",
+    "open_bus",
+]
+
+# Module -> what comes from there. `Retargeter` is called otherwise in its module.
+_NAMES: Final = {
+    "app.api.listener_stream": ("ListenerStream", "LoadedListener", "load_listener"),
+    "app.api.robot": ("Robot",),
+    "app.api.servos": ("Servos", "open_bus"),
+    "config": ("Head", "load_head"),
+    "errors": (
+        "BusError", "ConfigError", "InputError", "MissingExtra", "ModelError", "PacketError", "PortError",
+        "RobotError", "ServoError",
+    ),
+    "frames": ("BLENDSHAPES", "CHANNELS", "FaceFrame", "Plan", "Reading", "SpeakerFrame"),
+    "ports": ("Listener", "Source"),
+    "retarget.head": ("Retargeter",),
+    "runtime.planned_events": ("MotionEvent",),
+}  # fmt: skip
+_MODULE_OF: Final = {name: module for module, names in _NAMES.items() for name in names}
+_CALLED: Final = {"Retargeter": "HeadRetargeter"}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a public name from its module (PEP 562)."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), _CALLED.get(name, name))
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

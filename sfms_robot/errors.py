@@ -3,6 +3,7 @@
 RobotError                      base; `exit_code` is what the command line returns
 +-- ConfigError          (2)    a file, a flag or a value in it is wrong; names file, key, value, choices
 |   +-- MissingExtra     (2)    a feature needs a package that is not installed; names the pip install
+|   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
 +-- PortError            (3)    a port cannot be opened, or is held by somebody else
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
 |   +-- ServoError       (4)    a servo is not what the configuration says, or refuses a command
@@ -48,6 +49,13 @@ class MissingExtra(ConfigError):
     @classmethod
     def of(cls, feature: str, extra: str) -> MissingExtra:
         return cls(f"{feature} needs an optional part: pip install 'sfms-robot[{extra}]'")
+
+
+class InputError(ConfigError, ValueError):
+    """A value handed to a function of this package cannot be used: its shape, its range, or it is not finite.
+
+    A ValueError too, as Python's own are.
+    """
 
 
 class PortError(RobotError):

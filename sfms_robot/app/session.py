@@ -27,16 +27,17 @@ from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import run_report
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
-from sfms_robot.config import Head, Joint, find, load_head
+from sfms_robot.config import Head, Joint, load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.frames import Doubles, Floats
+from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.motion.audit import Audit
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
-from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Source, Timeline
+from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Timeline
 from sfms_robot.retarget.head import HeadRetargeter
 from sfms_robot.retarget.life import Life
 from sfms_robot.runtime.clock import RealClock, VirtualClock
@@ -45,6 +46,7 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
+from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
@@ -135,6 +137,17 @@ def prepare_head(options: HeadOptions) -> Head:
 
 
 @contextmanager
+def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
+    """Where each bus of the head is: emulated servos, which live as long as this does, or devices. Opens no port."""
+    with ExitStack() as stack:
+        if options.port != SIM:
+            yield devices(head, options.port)
+            return
+        chains = plugged_in(options.head, head)
+        yield {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
+
+
+@contextmanager
 def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     """Connect to every servo of a head. Blocks for as long as identifying takes. Raises RobotError."""
     prepare_head(options)
@@ -143,12 +156,7 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     motion = build_motion(head, rate_hz)
     clock: Clock = VirtualClock() if options.fast else RealClock()
     with ExitStack() as stack:
-        opened: Opened
-        if options.port == SIM:
-            chains = plugged_in(options.head, head)
-            opened = {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
-        else:
-            opened = devices(head, options.port)
+        opened = stack.enter_context(open_wires(head, options))
         bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without)
         stack.callback(bus.close)
         bus.connect()
@@ -200,22 +208,28 @@ def build_bus(head: Head, opened: Opened, clock: Clock, *, confirmed: bool = Fal
     """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
-        joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
-        buses[name] = _build_one(head, name, joints, where, clock, confirmed)
+        joints = {key: joint for key, joint in head.joints.items() if joint.bus == name and key not in without}
+        if joints:
+            buses[name] = _build_one(head, name, joints, where, clock, confirmed)
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
+    if without:
+        buses[LEFT_OUT] = AbsentBus(_bus_servos(head, {joint: head.joints[joint] for joint in without}))
+        rates = rates and {**rates, LEFT_OUT: max(rates.values())}
     return CompositeBus(buses, list(head.joints), rates)
+
+
+def _bus_servos(head: Head, joints: Mapping[str, Joint]) -> list[BusServo]:
+    maps = firmware_maps(dict(joints))
+    return [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()]
 
 
 def _build_one(
     head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool
 ) -> Bus:
     config = head.buses[name]
-    maps = firmware_maps(joints)
-    check_safety(head, joints, maps)
-    servos = [
-        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()
-    ]
+    check_safety(head, joints, firmware_maps(joints))
+    servos = _bus_servos(head, joints)
     family = family_named(config.family)
     if family.board:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])
@@ -249,6 +263,7 @@ class Programme:
         source, feed: the person, and who answers.
         duration_s: None for ever.
         timeline: None for that of plans.
+        retargeter: None for the head's own.
         life: what the head does of itself; None for nothing.
         knobs: see `Parts`.
         overlay: see `Parts`.
@@ -259,6 +274,7 @@ class Programme:
     feed: PlanFeed
     duration_s: float | None
     timeline: Timeline | None = None
+    retargeter: Retargeter | None = None
     life: Life | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
@@ -291,9 +307,9 @@ def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, 
     """
     motion = opened.motion
     parts = Parts(
-        programme.source, programme.feed, programme.timeline or motion.timeline, motion.retargeter, motion.limiter,
-        opened.bus, programme.observers, motion.leads_s, motion.rest_rad, programme.life, programme.knobs,
-        programme.overlay,
+        programme.source, programme.feed, programme.timeline or motion.timeline,
+        programme.retargeter or motion.retargeter, motion.limiter, opened.bus, programme.observers, motion.leads_s,
+        motion.rest_rad, programme.life, programme.knobs, programme.overlay,
     )  # fmt: skip
     log = RunLog(motion.retargeter.joints, 1.0 / opened.rate_hz, motion.audit, EVENTS)
     duration_s = math.inf if programme.duration_s is None else programme.duration_s
@@ -424,7 +440,7 @@ def run(
 
 def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     """Inline in virtual time, so that one seed is one run; else in a process of its own, which loads from now on."""
-    find("listeners", options.listener, "config.yaml")
+    listener_folder(options.listener)
     feed: PlanFeed
     if options.fast:
         from sfms_robot.listeners.registry import load_listener, one_thread  # torch: only here in this process

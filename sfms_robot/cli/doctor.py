@@ -27,7 +27,7 @@ def doctor(
     """
     from sfms_robot.app.servo.doctor import examine
     from sfms_robot.app.servo.servo_wire import real_clock
-    from sfms_robot.cli.servo_tables import bar, print_doctor
+    from sfms_robot.cli.show_servo import bar, print_doctor
 
     confirm = confirmation(yes) if fix else None
     with bar("looking", hidden=json or fix) as progress:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json as json_module
 import sys
 from enum import StrEnum
 from typing import Any, cast
@@ -31,14 +32,21 @@ def emulate(
     fault: list[str] = typer.Option(
         [], help="KIND[:IDS][@START[-END]][=VALUE], as in drop:3@2-4=0.5, or a FILE of such lines. Repeatable."
     ),
+    stored: list[str] = typer.Option(
+        [], help="IDS:REGISTER=VALUE stored in servos before, as in 3:min_position_limit=1900. Repeatable."
+    ),
+    start: list[str] = typer.Option(
+        [], help="IDS=TICKS: where servos are found, outside their limits or beyond one turn, too. Repeatable."
+    ),
     behind_silent: BehindSilent = typer.Option(
         BehindSilent.chain_break, help="Whether the ids behind a silent one in a sync read are silent too."
     ),
     virtual: bool = typer.Option(False, help="Virtual time: answers only through the control socket."),
     seed: int = typer.Option(0, min=0, help="Of the faults that are left to chance."),
+    json: bool = typer.Option(False, "--json", help="Print devices and servos as one JSON object when all is up."),
 ) -> None:
     """Serve emulated servos until SIGTERM or Ctrl-C; prints the device to open, one line per bus."""
-    from sfms_robot.app.servo.emulated_chains import EmulateOptions, emulators, until_stopped
+    from sfms_robot.app.servo.emulated_chains import EmulateOptions, described, emulators, until_stopped
 
     options = EmulateOptions(
         head,
@@ -51,9 +59,14 @@ def emulate(
         virtual,
         cast(Any, behind_silent.value),
         seed,
+        tuple(stored),
+        tuple(start),
     )
     with emulators(options) as chains:
-        for bus, chain in chains.items():
-            print(chain.device if len(chains) == 1 else f"{bus}={chain.device}", flush=True)
-            print(f"control socket of {bus}: {chain.control}", file=sys.stderr)
+        if json:
+            print(json_module.dumps(described(chains, head)), flush=True)
+        else:
+            for bus, chain in chains.items():
+                print(chain.device if len(chains) == 1 else f"{bus}={chain.device}", flush=True)
+                print(f"control socket of {bus}: {chain.control}", file=sys.stderr)
         until_stopped(chains)

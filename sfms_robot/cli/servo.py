@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sfms_robot.cli import servo_maps
 from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
 from sfms_robot.errors import BusError, ConfigError
 
@@ -19,7 +18,8 @@ if TYPE_CHECKING:
     from sfms_robot.app.servo.servo_wire import Seen, Wire
 
 app = typer.Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
-app.command("maps")(servo_maps.maps)
+
+_SHOWN = ("model", "family", "protocol", "number", "firmware", "watchdog")  # the rest is in --json
 
 
 class Keep(StrEnum):
@@ -276,7 +276,7 @@ def monitor(
         if on.json:
             taken = list(looks(wire, servos, 1.0 / rate, count))
         else:
-            from sfms_robot.cli.servo_tables import live
+            from sfms_robot.cli.show_servo import live
 
             live(
                 looks(wire, servos, 1.0 / rate, count),
@@ -284,6 +284,35 @@ def monitor(
             )
     if on.json:
         print(json_module.dumps({"samples": taken}))
+
+
+@app.command()
+def maps(
+    files: list[Path] = typer.Argument(None, help="Firmware maps of your own, or folders of them, beside the shipped."),
+    check: bool = typer.Option(False, "--check", help="Look for mistakes in the maps; exit code 2 when there are any."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
+    """The servo models and boards that have a firmware map."""
+    from sfms_robot.app.servo.maps import check_maps, list_maps
+
+    if not check:
+        rows = list_maps(files or [])
+        if json:
+            print(json_module.dumps({"maps": rows}))
+        else:
+            from sfms_robot.cli.show import print_rows
+
+            print_rows([{key: row[key] for key in _SHOWN} for row in rows])
+        return
+    findings = check_maps(files or [])
+    if json:
+        print(json_module.dumps({"sound": not findings, "findings": [each._asdict() for each in findings]}))
+    else:
+        for each in findings:
+            print(f"{each.file}: {each.problem}")
+        print("the firmware maps are sound" if not findings else f"{len(findings)} problem(s)")
+    if findings:
+        raise typer.Exit(2)
 
 
 def _parsed(ids: str) -> list[int]:
@@ -316,7 +345,7 @@ def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, ti
     if json:
         print(json_module.dumps(result))
         return
-    from sfms_robot.cli.servo_tables import print_table
+    from sfms_robot.cli.show_servo import print_table
 
     print_table([_for_people(row) for row in rows], title)
 
@@ -331,6 +360,6 @@ def _for_people(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bar(text: str, hidden: bool) -> Any:
-    from sfms_robot.cli.servo_tables import bar
+    from sfms_robot.cli.show_servo import bar
 
     return bar(text, hidden)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from sfms_robot.config.base import Model, Name, parse
 from sfms_robot.config.consistency import problems, rates, wiring
@@ -47,6 +48,12 @@ class Head(Model):
     regions: dict[Name, Region] = Field(default_factory=dict)
     kinematics: Kinematics | None = None
     life: Life = Life()
+    _folder: Path | None = PrivateAttr(None)
+
+    @property
+    def folder(self) -> Path | None:
+        """Where its file lies; None for a head that was made otherwise."""
+        return self._folder
 
     @model_validator(mode="before")
     @classmethod
@@ -73,8 +80,11 @@ class Head(Model):
 
 def load_head(name: str) -> Head:
     """A head by shipped name or folder. Words of an older version are taken, and each is told in the log."""
-    file = find("heads", name, "head.yaml") / "head.yaml"
+    folder = find("heads", name, "head.yaml")
+    file = folder / "head.yaml"
     raw = read(file)
     for line in former_words(raw):
         logger.warning("%s: %s", file, line)
-    return parse(Head, raw, file)
+    head = parse(Head, raw, file)
+    head._folder = folder
+    return head

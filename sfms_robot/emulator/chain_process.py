@@ -12,7 +12,7 @@ control socket says how many there are and what time it is. Control requests and
     digest                           digest SHA256 COUNT  of every byte the host sent
     kill ID | revive ID              ok          the servo falls silent, or answers again
     fault ID BITS                    ok          latch hardware errors
-    turn ID TICKS                    ok          somebody turns the shaft by hand
+    turn ID TICKS                    ok          somebody turns the shaft by hand to where its position reads TICKS
     state ID                         json {...}  what an onlooker sees: position, goal, torque, ...
     inject SPEC                      ok          a fault (see `faults`), from now on unless it says
     clear                            ok          no more faults

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from itertools import groupby
 from typing import Any, Final
 
-from sfms_robot.emulator.operating_modes import POSITION, TORQUE_ON_BY_GOAL, TickFrames, motor_command
+from sfms_robot.emulator.dynamixel2_modes import POSITION, TORQUE_ON_BY_GOAL, TickFrames, motor_command
 from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.emulator.present_values import PresentValues
 from sfms_robot.emulator.register_file import RegisterFile
@@ -34,6 +34,7 @@ class Dynamixel2Servo:
 
     Attributes:
         dead: silent, as with its cable out; its motor keeps doing what it was told.
+        mute: it obeys, and never answers.
         plant: what turns; its ticks are those of the shaft.
     """
 
@@ -48,12 +49,12 @@ class Dynamixel2Servo:
         supply_v: float | None = None,
     ) -> None:
         self.table = table
-        self.dead = False
+        self.dead = self.mute = False
         self.fault_status = 0
         self.firmware = firmware
         self.supply_v = _usual_supply(table) if supply_v is None else supply_v
-        self._memory = RegisterFile(table)
-        self._get, self._put = self._memory.get, self._memory.put
+        self._file = RegisterFile(table)
+        self._get, self._put = self._file.get, self._file.put
         self._registered = b""
         self._heard_at_s = 0.0
         self._deaf_until_s = 0.0
@@ -67,11 +68,17 @@ class Dynamixel2Servo:
         self._put("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == baud))
         for name, value in (registers or {}).items():
             self._put(name, value)
+        self._put("torque_limit", self._get("max_torque"))
         self.plant = Plant(0.0)
-        self.plant.position = self.plant.reference = TickFrames(self._memory).shaft(float(start_ticks))
+        self.plant.position = self.plant.reference = TickFrames(self._file).shaft(float(start_ticks))
         self._put("goal_position", table.center_ticks)
         self._settings()
         self._watch_supply()
+
+    @property
+    def return_level(self) -> int:
+        """0 answers pings, 1 reads too, 2 everything; below 0 nothing."""
+        return -1 if self.mute else self._return_level
 
     # --- instructions -------------------------------------------------------------------------------------------
 
@@ -81,26 +88,26 @@ class Dynamixel2Servo:
     def read(self, address: int, length: int, now_s: float) -> tuple[int, bytes]:
         """(error, data)."""
         self.advance(now_s)
-        memory, end = self._memory, address + length
-        if length == 0 or end > len(memory.raw):
+        file, end = self._file, address + length
+        if length == 0 or end > len(file.raw):
             return dxl2.DATA_RANGE_ERROR, b""
-        windows = memory.has_windows(address, length)
+        windows = file.has_windows(address, length)
         if windows or (address < self._live.end and end > self._live.address):
-            self._live.put(memory.raw, self._live_values(now_s))
+            self._live.put(file.raw, self._live_values(now_s))
         if windows:
-            return 0, bytes(memory.raw[at] for at in memory.seen_through(address, length))
-        return 0, bytes(memory.raw[address:end])
+            return 0, bytes(file.raw[at] for at in file.seen_through(address, length))
+        return 0, bytes(file.raw[address:end])
 
     def write(self, address: int, data: bytes, now_s: float) -> int:
         """Error number, 0 when it was taken. Nothing is changed unless all of it is allowed."""
         self.advance(now_s)
-        memory = self._memory
+        file = self._file
         pieces = [(address, data)]
-        if memory.has_windows(address, len(data)):
-            pieces = _pieces(list(memory.seen_through(address, len(data))), data)
+        if file.has_windows(address, len(data)):
+            pieces = _pieces(list(file.seen_through(address, len(data))), data)
         names: set[str] = set()
         for start, part in pieces:
-            fields = memory.covered(start, len(part))
+            fields = file.covered(start, len(part))
             if not fields:
                 return dxl2.ACCESS_ERROR
             for field in fields:
@@ -108,9 +115,9 @@ class Dynamixel2Servo:
                     return error
                 names.add(field.name)
         for start, part in pieces:
-            for field in memory.covered(start, len(part)):
+            for field in file.covered(start, len(part)):
                 offset = field.address - start
-                memory.raw[field.address : field.address + field.size] = part[offset : offset + field.size]
+                file.raw[field.address : field.address + field.size] = part[offset : offset + field.size]
         if names == {"goal_position"}:
             self._goal_written()
         else:
@@ -139,7 +146,7 @@ class Dynamixel2Servo:
             return _RESULT_FAIL
         self.plant.position %= self.table.ticks_per_revolution
         self.plant.reference = self.plant.position
-        self._put("goal_position", round(self._gearing.told(self.plant.position)))
+        self._put("goal_position", round(self._frames.told(self.plant.position)))
         self._settings()
         return 0
 
@@ -148,10 +155,9 @@ class Dynamixel2Servo:
         self.advance(now_s)
         self.fault_status, self._tripped, self._registered = 0, False, b""
         self._deaf_until_s = now_s + REBOOT_S
-        turn = self.table.ticks_per_revolution
-        if not -turn / 4 <= self.plant.position < turn * 5 / 4:
-            self.plant.position %= turn
+        self.plant.position %= self.table.ticks_per_revolution
         self._reset(keep={}, areas=(False,))
+        self._put("torque_limit", self._get("max_torque"))  # XL-320
         self._put("goal_position", self.table.center_ticks)
         self._settings()
         self._watch_supply()
@@ -189,14 +195,14 @@ class Dynamixel2Servo:
     def turn(self, ticks: float, now_s: float) -> None:
         """Somebody turns the shaft by hand, to where its position reads `ticks`."""
         self.advance(now_s)
-        self.plant.position = self._gearing.shaft(ticks)
+        self.plant.position = self._frames.shaft(ticks)
 
     def state(self, now_s: float) -> dict[str, Any]:
         """What an onlooker sees, whatever the wire says."""
         self.advance(now_s)
         return {
-            "position": self._gearing.told(self.plant.position),
-            "speed": self._gearing.sign * self.plant.speed,
+            "position": self._frames.told(self.plant.position),
+            "speed": self._frames.sign * self.plant.speed,
             "goal": self._get("goal_position"),
             "torque": bool(self.torque),
             "faults": self.table.fault_names(self.fault_status),
@@ -218,7 +224,7 @@ class Dynamixel2Servo:
                 self._put("bus_watchdog", -1)
                 self._tripped = True
                 if self.table.watchdog != "flags_only":
-                    self._put("goal_position", round(self._gearing.told(self.plant.position)))
+                    self._put("goal_position", round(self._frames.told(self.plant.position)))
                     self._put("goal_velocity", 0)
                 self._settings()
         self.plant.advance(now_s, self._drive)
@@ -271,7 +277,7 @@ class Dynamixel2Servo:
                 self._put("torque_enable", 1)
                 self._settings()
         elif self._drive is not None:
-            goal = self._gearing.shaft(float(self._get("goal_position")))
+            goal = self._frames.shaft(float(self._get("goal_position")))
             if self._by_time:
                 self._settings()
             elif not self._drive.by_speed:
@@ -279,10 +285,10 @@ class Dynamixel2Servo:
 
     def _written(self, names: set[str]) -> None:
         if "operating_mode" in names:
-            self._gearing = TickFrames(self._memory)
+            self._frames = TickFrames(self._file)
             for name in ("profile_velocity", "profile_acceleration", "goal_velocity", "goal_pwm", "goal_current"):
                 self._put(name, 0)
-            self._put("goal_position", round(self._gearing.told(self.plant.position)))
+            self._put("goal_position", round(self._frames.told(self.plant.position)))
         if "bus_watchdog" in names:
             self._tripped = False
         self._settings()
@@ -298,12 +304,12 @@ class Dynamixel2Servo:
         second = get("secondary_id", 255)
         self.second_id: int | None = second if second <= _MAX_ID else None
         self.baud: int | None = self.table.baud_codes.get(get("baud_rate"))
-        self.return_level: int = get("status_return_level", 2)
+        self._return_level: int = get("status_return_level", 2)
         self.return_delay_s: float = get("return_delay_time") * _DELAY_TICK_S
         self.torque: int = get("torque_enable")
         self.watchdog: int = get("bus_watchdog")
-        self._gearing = TickFrames(self._memory)
-        self.mode: int = self._gearing.mode
+        self._frames = TickFrames(self._file)
+        self.mode: int = self._frames.mode
         self._by_time = bool(get("drive_mode") & 0x04)
         ends = [get(name) for name in ("min_position_limit", "cw_angle_limit") if name in self.table.fields]
         self._lowest: int = ends[0] if ends else 0
@@ -312,10 +318,10 @@ class Dynamixel2Servo:
         self._hottest_c: float = float(get("temperature_limit", 255))
         self._drive = None
         if self.torque:
-            self._drive = motor_command(self._memory, self._gearing, self.plant.reference, self.table.top_speed_ticks_s)
+            self._drive = motor_command(self._file, self._frames, self.plant.reference, self.table.top_speed_ticks_s)
 
     def _live_values(self, now_s: float) -> tuple[int, ...]:
-        plant, table, sign = self.plant, self.table, self._gearing.sign
+        plant, table, sign = self.plant, self.table, self._frames.sign
         per_tick = self._live.speed_per_tick
         top = table.top_speed_ticks_s
         speed, current = sign * plant.speed, sign * plant.current_mA(top)
@@ -334,9 +340,9 @@ class Dynamixel2Servo:
             round(1000.0 * sign * plant.effort),
             round(speed * per_tick),
             round(speed * per_tick),
-            round(self._gearing.told(plant.position)),
+            round(self._frames.told(plant.position)),
             round(sign * plant.reference_speed * per_tick),
-            round(self._gearing.told(plant.reference)),
+            round(self._frames.told(plant.reference)),
             volts,
             volts,
             round(plant.temperature_C),

@@ -191,6 +191,8 @@ class EmulatedWire:
         for servo in self._servos(fault):
             if kind == "silent":
                 servo.dead = began
+            elif kind == "mute":
+                servo.mute = began
             elif kind in ("stuck", "load"):
                 servo.advance(now_s)
                 setattr(servo.plant, kind, began if kind == "stuck" else fault.value * began)

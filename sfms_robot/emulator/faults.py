@@ -32,20 +32,21 @@ class Kind(NamedTuple):
     ids: bool = True
 
 
-_SHARE: Final = "share of replies"
+_FRACTION: Final = "fraction of replies"
 KINDS: Final[dict[str, Kind]] = {
-    "drop": Kind(_SHARE),
+    "drop": Kind(_FRACTION),
     "delay": Kind("seconds", 0.02, 0.0, 60.0),
-    "corrupt": Kind(_SHARE),
-    "duplicate": Kind(_SHARE),
-    "truncate": Kind(_SHARE),
-    "echo": Kind("share of requests", ids=False),
-    "noise": Kind("share of requests", ids=False),
+    "corrupt": Kind(_FRACTION),
+    "duplicate": Kind(_FRACTION),
+    "truncate": Kind(_FRACTION),
+    "echo": Kind("fraction of requests", ids=False),
+    "noise": Kind("fraction of requests", ids=False),
     "silent": Kind(""),
+    "mute": Kind(""),
     "stuck": Kind(""),
     "overload": Kind(""),
     "overheat": Kind(""),
-    "load": Kind("share of full torque", 0.1, -1.0, 1.0),
+    "load": Kind("fraction of full torque", 0.1, -1.0, 1.0),
     "voltage": Kind("volts", 0.0, 0.0, 60.0, ids=False),
     "brownout": Kind("volts", 0.0, 0.0, 60.0, lasts_s=0.2, ids=False),
     "hangup": Kind("", lasts_s=1.0, ids=False),

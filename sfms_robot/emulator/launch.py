@@ -33,8 +33,9 @@ _START_S = 20.0
 class EmulatedServo:
     """What is plugged in, or on a board one of its channels.
 
-    `start_ticks`: where its position stands at power-up, torque off. `registers`: what somebody stored in it before,
-    by name (homing offset, shutdown, ...). `supply_v` None: a voltage that it is content with.
+    `start_ticks`: what its position reads when the host comes, torque off: outside its limits, or beyond one turn where
+    somebody has turned it by hand since it was switched on. `registers`: what somebody stored in it before, by name
+    (homing offset, position limits, shutdown, ...). `supply_v` None: a voltage that it is content with.
     """
 
     id: int
@@ -53,9 +54,19 @@ class Chain:
         device: path of the serial device; it stays the same when the adapter is unplugged and comes back.
         control: path of the control socket.
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
+        servos: what is plugged in.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], virtual: bool, device: str, control: str, folder: str) -> None:
+    def __init__(
+        self,
+        process: subprocess.Popen[bytes],
+        servos: Sequence[EmulatedServo],
+        virtual: bool,
+        device: str,
+        control: str,
+        folder: str,
+    ) -> None:
+        self.servos = tuple(servos)
         self.virtual = virtual
         self.device = device
         self.control = control
@@ -78,7 +89,7 @@ class Chain:
         self.ask(f"fault {servo_id} {bits}")
 
     def turn(self, servo_id: int, ticks: int) -> None:
-        """Turn the shaft by hand."""
+        """Turn the shaft by hand to where its position reads `ticks`; beyond one turn, too."""
         self.ask(f"turn {servo_id} {ticks}")
 
     def state(self, servo_id: int) -> dict[str, Any]:
@@ -200,6 +211,12 @@ def launch(
         "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
+    process, told = _started(description)
+    return Chain(process, servos, virtual, told["device"], told["control"], told["folder"])
+
+
+def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:
+    """The process, and what it says when it is ready. Raises ConfigError for what it refuses, BusError."""
     process = subprocess.Popen(
         [sys.executable, "-m", "sfms_robot.emulator.chain_process"],
         stdin=subprocess.PIPE,
@@ -219,8 +236,7 @@ def launch(
         if ready.startswith(b"refused "):
             raise ConfigError(ready.removeprefix(b"refused ").decode().strip())
         raise BusError(f"the emulated chain did not start (exit code {process.returncode})")
-    told = json.loads(ready.removeprefix(b"ready "))
-    return Chain(process, virtual, told["device"], told["control"], told["folder"])
+    return process, json.loads(ready.removeprefix(b"ready "))
 
 
 def wait(chains: Sequence[Chain]) -> Chain:

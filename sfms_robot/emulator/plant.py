@@ -34,7 +34,7 @@ _STRAINED: Final = 0.95  # of full effort
 class MotorCommand(NamedTuple):
     """What a motor is told. Ticks and seconds; a profile limit of 0 is no limit.
 
-    goal: a position, or a speed when `by_speed`. torque: share of its full torque that the motor may use.
+    goal: a position, or a speed when `by_speed`. torque: fraction of its full torque that the motor may use.
     """
 
     goal: float
@@ -49,7 +49,7 @@ class MotorCommand(NamedTuple):
 class Plant:
     """State of one motor, in ticks and seconds. `drive` None = no torque: it stays where it is.
 
-    effort: share of full torque that the motor uses now, signed. load: share that holding its place takes.
+    effort: fraction of full torque that the motor uses now, signed. load: fraction that holding its place takes.
     """
 
     position: float

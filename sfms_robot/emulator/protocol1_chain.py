@@ -139,7 +139,7 @@ def _single(servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> by
     asked = servo.id  # it answers under this one also when the request changes it
     error, data, answers = 0, b"", servo.answers_writes
     if code == protocol1.PING:
-        answers = True
+        answers = not servo.mute
         servo.advance(now_s)
     elif code == protocol1.READ:
         (error, data), answers = servo.read(params[0], params[1], now_s), servo.answers_reads
@@ -155,7 +155,9 @@ def _single(servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> by
     elif code == feetech.CALIBRATE_OFFSET and servo.is_sync_reader:
         torque = servo.table["torque_enable"]
         error = servo.write(torque.address, torque.to_bytes(feetech.CALIBRATE_HERE), now_s)
-    elif not (code == feetech.RESET_TURNS and servo.is_sync_reader):
+    elif code == feetech.RESET_TURNS and servo.is_sync_reader:
+        servo.reset_turns(now_s)
+    else:
         error, answers = dxl1.INSTRUCTION, not is_feetech and servo.answers_writes
     return encode(asked, error | servo.fault_status, data) if answers else None
 

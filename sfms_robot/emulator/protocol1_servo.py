@@ -4,8 +4,7 @@ The servo is as unkind as the worst real one: at power-up its goal is the middle
 written goal switches its torque on; a locked EEPROM takes what is written and forgets it at the next power-up
 (Feetech), or does not take it and says nothing (Dynamixel).
 
-Where the sources are silent it does the least helpful thing. Not modelled: wheel and multi-turn modes, PWM, and any
-Feetech mode but position: in these the motor has no drive. A frame with a wrong sum is not heard at all.
+Where the sources are silent it does the least helpful thing. A frame with a wrong sum is not heard at all.
 """
 
 from __future__ import annotations
@@ -14,6 +13,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from sfms_robot.emulator.plant import MotorCommand, Plant
+from sfms_robot.emulator.protocol1_modes import POSITIONING, Mode, PositionFrame, angle_limits, mode_of, motor_command
+from sfms_robot.emulator.register_file import RegisterFile
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.registers import Field, Table
 
@@ -24,7 +25,8 @@ _VOLTAGE: Final = 0x01
 _FULL_TORQUE: Final = 1000
 _BROWN_OUT: Final = 0.7  # of the lowest supply it allows: below that the controller itself stops
 _CENTER_ON_STS: Final = 2048
-_EVERYTHING: Final = 256
+_WHOLE_FILE: Final = 256  # a Feetech answers a read of any address
+_PENDING: Final = ("registered", "async_write_flag")  # 1 from REG WRITE to ACTION; Dynamixel, Feetech
 
 
 class Protocol1Servo:
@@ -32,6 +34,7 @@ class Protocol1Servo:
 
     Attributes:
         dead: True while its cable is out; its motor keeps doing what it was told.
+        mute: it obeys, and never answers.
         fault_status: bits that every answer carries.
     """
 
@@ -46,24 +49,25 @@ class Protocol1Servo:
         supply_v: float | None = None,
     ) -> None:
         self.table = table
-        self.dead = False
+        self.dead = self.mute = False
         self.fault_status = 0
         self._feetech = table.family == "feetech"
-        self._memory = bytearray(_EVERYTHING if self._feetech else table.size)
+        self._file = RegisterFile(table, _WHOLE_FILE if self._feetech else None)
+        self._get, self._put = self._file.get, self._file.put
         self._firmware = firmware
         self._registered: tuple[int, bytes] | None = None
         self._checks = 0
         self._drive: MotorCommand | None = None
-        for field in table.fields.values():
-            self._put(field, field.initial)
-        self._identify()
+        self._reset_registers()
         self._put_role("id", servo_id)
         self._put_role("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == baud))
         for name, value in (registers or {}).items():
-            self._put(table[name], value)
-        self._stored = bytes(self._memory)
+            self._put(name, value)
+        self._stored = bytes(self._file.raw)
+        self._mode = mode_of(self._file)
+        self._frame = PositionFrame(self._file, self._mode)
         self.plant = Plant(0.0)
-        self.plant.position = self.plant.reference = float(start_ticks + self._offset())
+        self.plant.position = self.plant.reference = self._frame.shaft(float(start_ticks))
         self.supply_v = self._content_v() if supply_v is None else supply_v
         self._powered = True
         self._power_up()
@@ -82,11 +86,11 @@ class Protocol1Servo:
 
     @property
     def answers_writes(self) -> bool:
-        return self._role("status_level") >= (1 if self._feetech else 2)
+        return not self.mute and self._role("status_level") >= (1 if self._feetech else 2)
 
     @property
     def answers_reads(self) -> bool:
-        return self._feetech or self._role("status_level") >= 1
+        return not self.mute and (self._feetech or self._role("status_level") >= 1)
 
     @property
     def return_delay_s(self) -> float:
@@ -101,16 +105,15 @@ class Protocol1Servo:
         """(error, data)."""
         self.advance(now_s)
         end = address + length
-        if length == 0 or end > len(self._memory):
+        if length == 0 or end > len(self._file.raw):
             return (0 if self._feetech else dxl1.RANGE), b""
-        self._look()
-        return 0, bytes(self._memory[address:end])
+        self._measure()
+        return 0, bytes(self._file.raw[address:end])
 
     def write(self, address: int, data: bytes, now_s: float) -> int:
         """Error bits, 0 when it was taken. A Dynamixel changes nothing unless all of it is allowed."""
         self.advance(now_s)
-        end = address + len(data)
-        touched = [f for f in self.table.fields.values() if f.address < end and f.address + f.size > address]
+        touched = self._file.covered(address, len(data))
         wanted: dict[str, int] = {}
         error = 0 if touched or self._feetech else dxl1.RANGE
         for field in touched:
@@ -130,10 +133,12 @@ class Protocol1Servo:
     def register(self, address: int, data: bytes) -> int:
         """Keep a write for `action`."""
         self._registered = (address, data)
+        self._show_pending()
         return 0
 
     def action(self, now_s: float) -> int:
         kept, self._registered = self._registered, None
+        self._show_pending()
         if kept is None:
             return 0 if self._feetech else dxl1.INSTRUCTION
         return self.write(*kept, now_s)
@@ -141,18 +146,24 @@ class Protocol1Servo:
     def factory_reset(self, now_s: float) -> None:
         """Everything, id and baud rate included; then as at power-up."""
         self.advance(now_s)
-        for field in self.table.fields.values():
-            self._put(field, field.initial)
-        self._identify()
-        self._stored = bytes(self._memory)
+        self._reset_registers()
+        self._stored = bytes(self._file.raw)
         self.power_cycle(now_s)
+
+    def reset_turns(self, now_s: float) -> None:
+        """Whole turns are forgotten; it stays where it is."""
+        self.advance(now_s)
+        self.plant.position %= self.table.ticks_per_revolution
+        self._put("goal_position", round(self._frame.told(self.plant.position)))
+        self._settings()
 
     # --- what happens to it -------------------------------------------------------------------------------------
 
     def power_cycle(self, now_s: float) -> None:
-        """Supply off and on: RAM and whatever a locked EEPROM did not keep are gone; the shaft stays."""
+        """Supply off and on: RAM, whole turns and whatever a locked EEPROM did not keep are gone; the shaft stays."""
         self.advance(now_s)
-        self._memory[:] = self._stored
+        self._file.raw[:] = self._stored
+        self.plant.position %= self.table.ticks_per_revolution
         self.fault_status, self._registered = 0, None
         self._power_up()
 
@@ -192,13 +203,13 @@ class Protocol1Servo:
     def turn(self, ticks: float, now_s: float) -> None:
         """Somebody turns the shaft by hand, to where its position reads `ticks`."""
         self.advance(now_s)
-        self.plant.position = ticks + self._offset()
+        self.plant.position = self._frame.shaft(ticks)
 
     def state(self, now_s: float) -> dict[str, Any]:
         """What an onlooker sees, whatever the wire says."""
         self.advance(now_s)
         return {
-            "position": self.plant.position - self._offset(),
+            "position": self._frame.told(self.plant.position),
             "speed": self.plant.speed,
             "goal": self._get("goal_position"),
             "torque": self._powered and self._role("torque_enable") == 1,
@@ -221,50 +232,59 @@ class Protocol1Servo:
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _refusal(self, field: Field, value: int) -> int:
-        if not field.low <= value <= field.high:
+        signed_duty = field.name == "goal_time" and self._mode is Mode.PWM
+        if not (-field.high if signed_duty else field.low) <= value <= field.high:
             return dxl1.RANGE
         if field.name == "goal_position" and not self._feetech:
-            lowest, highest = self._limits()
+            lowest, highest = angle_limits(self._file)
             return 0 if lowest == highest or lowest <= value <= highest else dxl1.ANGLE_LIMIT
         return 0
 
     def _apply(self, wanted: dict[str, int]) -> None:
-        table = self.table
-        lock = table.fields.get("lock")
+        lock = self.table.fields.get("lock")
         locked = lock is not None and self._get(lock.name) == 1
         for name, value in wanted.items():
-            field = table[name]
-            if field.eeprom and locked and not self._feetech:
-                continue
-            if lock is not None and name == lock.name and locked and not self._feetech:
-                continue  # once locked, until the supply is switched off
-            if name == "goal_position" and self._feetech:
-                lowest, highest = self._limits()
-                value = min(max(value, lowest), highest) if lowest < highest else value
-            self._put(field, value)
-            if field.eeprom and not locked:
-                self._keep(field)
-        if self._drive is not None and wanted.keys() == {"goal_position"}:  # what comes in every tick
-            self._drive = self._drive._replace(goal=float(self._get("goal_position") + self._offset()))
-            return
-        torque = table.role("torque_enable")
+            self._store(name, value, locked)
+        torque = self.table.role("torque_enable")
         if torque is not None and torque.name in wanted:
             self._torque_written(wanted[torque.name], locked)
         elif "goal_position" in wanted and not self._role("torque_enable") and not self._shut_down():
             self._put_role("torque_enable", 1)
-        self._settings()
+        if self._drive is not None and wanted.keys() == {"goal_position"}:  # what comes in every tick
+            if self._mode in POSITIONING:
+                told = self._frame.shaft(float(self._get("goal_position")))
+                self._drive = self._drive._replace(goal=self._stepped(wanted) if self._mode is Mode.STEP else told)
+            return
+        self._settings(self._stepped(wanted))
+
+    def _store(self, name: str, value: int, locked: bool) -> None:
+        field = self.table[name]
+        if locked and not self._feetech and (field.eeprom or name == "lock"):
+            return  # once locked, until the supply is switched off
+        if name == "goal_position" and self._feetech and self._mode is Mode.JOINT:
+            lowest, highest = angle_limits(self._file)
+            value = min(max(value, lowest), highest) if lowest < highest else value
+        self._put(name, value)
+        if field.eeprom and not locked:
+            self._keep(field)
+
+    def _stepped(self, wanted: Mapping[str, int]) -> float:
+        """In step mode: where the steps written so far lead, shaft ticks."""
+        going = self._drive is not None and self._mode is Mode.STEP
+        start = self._drive.goal if going and self._drive is not None else self.plant.position
+        return start + wanted.get("goal_position", 0)
 
     def _keep(self, field: Field) -> None:
         """In the EEPROM, over the next power-up."""
         end = field.address + field.size
-        self._stored = self._stored[: field.address] + bytes(self._memory[field.address : end]) + self._stored[end:]
+        self._stored = self._stored[: field.address] + bytes(self._file.raw[field.address : end]) + self._stored[end:]
 
     def _torque_written(self, value: int, locked: bool) -> None:
         if value == feetech.CALIBRATE_HERE and "homing_offset" in self.table.fields:
-            offset = self.table["homing_offset"]
-            self._put(offset, round(self.plant.position) - _CENTER_ON_STS)
+            one_turn = round(self.plant.position % self.table.ticks_per_revolution)
+            self._put("homing_offset", one_turn - _CENTER_ON_STS)
             if not locked:
-                self._keep(offset)
+                self._keep(self.table["homing_offset"])
             self._put_role("torque_enable", 0)
         elif value == 1 and self._role("torque_limit"):
             self.fault_status &= ~_BITS["overload"]
@@ -275,63 +295,41 @@ class Protocol1Servo:
         name = "unloading_condition" if self._feetech else "shutdown"
         return bool(self.fault_status & self._get(name)) if name in self.table.fields else False
 
-    def _limits(self) -> tuple[int, int]:
-        names = ("min_position_limit", "max_position_limit") if self._feetech else ("cw_angle_limit", "ccw_angle_limit")
-        return self._get(names[0]), self._get(names[1])
-
-    def _offset(self) -> int:
-        return self._get("homing_offset") if "homing_offset" in self.table.fields else 0
-
     def _power_up(self) -> None:
-        torque, goal = self.table.role("torque_enable"), self.table["goal_position"]
         for field in self.table.fields.values():
             if not field.eeprom:
-                self._put(field, field.initial)
-        if torque is not None:
-            self._put(torque, 0)
-        self._put(goal, self.table.center_ticks)
+                self._put(field.name, field.initial)
+        self._put_role("torque_enable", 0)
+        self._put("goal_position", self.table.center_ticks)
         self._put_role("torque_limit", self._get("max_torque") or _FULL_TORQUE)
         self._settings()
         self._watch_supply()
 
-    def _settings(self) -> None:
-        """Take over what the registers say now."""
-        table = self.table
+    def _settings(self, stepped: float | None = None) -> None:
+        """Take over what the registers say now. `stepped`: as `_stepped`; None: no step was written."""
         self.id: int = self._role("id")
-        self.baud: int | None = table.baud_codes.get(self._role("baud_rate"))
+        self.baud: int | None = self.table.baud_codes.get(self._role("baud_rate"))
+        stepped = self._stepped({}) if stepped is None else stepped
+        self._mode = mode_of(self._file)
+        self._frame = PositionFrame(self._file, self._mode)
         self._drive = None
-        mode = table.role("operating_mode")
-        positioning = mode is None or table.position_mode in (None, self._get(mode.name))
-        if not self._feetech:
-            lowest, highest = self._limits()
-            positioning = lowest < highest
-        strength = table.role("torque_limit")
-        share = 1.0 if strength is None else min(1.0, self._get(strength.name) / 1000.0)
-        if self._role("torque_enable") == 1 and positioning and share:
-            self._drive = MotorCommand(
-                float(self._get("goal_position") + self._offset()),
-                table.top_speed_ticks_s,
-                self._rate(table.role("moving_speed")),
-                self._rate(table.fields.get("acceleration") or table.fields.get("goal_acceleration")),
-                torque=share,
-            )
+        strength = self.table.role("torque_limit")
+        torque = 1.0 if strength is None else min(1.0, self._get(strength.name) / 1000.0)
+        if self._role("torque_enable") == 1 and torque:
+            self._drive = motor_command(self._file, self._mode, self._frame, stepped, torque)
 
-    def _rate(self, field: Field | None) -> float:
-        """A speed or acceleration register in ticks and seconds; 0 where there is none."""
-        if field is None:
-            return 0.0
-        per_turn = 60.0 if field.unit == "rpm" else 360.0
-        return abs(field.to_unit(self._get(field.name))) * self.table.ticks_per_revolution / per_turn
+    def _show_pending(self) -> None:
+        for name in _PENDING:
+            self._put(name, int(self._registered is not None))
 
-    def _look(self) -> None:
+    def _measure(self) -> None:
         """Put what is measured into the registers that show it."""
         plant, table = self.plant, self.table
         speed = table.role("present_speed")
         per_turn = 60.0 if speed is not None and speed.unit == "rpm" else 360.0
-        current_mA = plant.current_mA(table.top_speed_ticks_s)
         scale = speed.scale if speed is not None else 1.0
         measured = {
-            "present_position": round(plant.position) - self._offset(),
+            "present_position": self._frame.shown(plant.position),
             "present_speed": round(plant.speed * per_turn / (table.ticks_per_revolution * scale)),
             "present_load": round(1000.0 * plant.effort),
             "voltage": round(10.0 * self.supply_v),
@@ -340,11 +338,10 @@ class Protocol1Servo:
         }
         current = table.role("present_current")
         if current is not None:
-            measured["present_current"] = round(current_mA / (current.scale or 1.0))
+            measured["present_current"] = round(plant.current_mA(table.top_speed_ticks_s) / (current.scale or 1.0))
         for role, value in measured.items():
             self._put_role(role, value)
-        if "moving" in table.fields:
-            self._put(table["moving"], int(plant.speed != 0.0))
+        self._put("moving", int(plant.speed != 0.0))
 
     def _volts(self, name: str) -> float:
         return self.table[name].to_unit(self._get(name))
@@ -361,16 +358,14 @@ class Protocol1Servo:
         else:
             self._fail(_VOLTAGE)
 
-    def _identify(self) -> None:
-        values = {
-            "model_number": self.table.model_number or 0,
-            "firmware_version": self._firmware,
-            "firmware_major": self._firmware,
-            "endianness_flag": int(self.table.byte_order == "big"),
-        }
-        for name, value in values.items():
-            if name in self.table.fields:
-                self._put(self.table[name], value)
+    def _reset_registers(self) -> None:
+        """As it leaves the factory."""
+        for field in self.table.fields.values():
+            self._put(field.name, field.initial)
+        self._put("model_number", self.table.model_number or 0)
+        self._put("firmware_version", self._firmware)
+        self._put("firmware_major", self._firmware)
+        self._put("endianness_flag", int(self.table.byte_order == "big"))
 
     def _role(self, role: str) -> int:
         """Value of a role's register; a role that the model does not have reads as 1: it limits nothing."""
@@ -380,15 +375,4 @@ class Protocol1Servo:
     def _put_role(self, role: str, value: int) -> None:
         field = self.table.role(role)
         if field is not None:
-            self._put(field, value)
-
-    def _get(self, name: str) -> int:
-        field = self.table.fields[name]
-        return field.from_bytes(self._memory[field.address : field.address + field.size])
-
-    def _put(self, field: Field, value: int) -> None:
-        """Store a value, at most what the register can show."""
-        bits = int(field.sign[9:]) if field.sign.startswith("sign_bit_") else 8 * field.size - field.signed
-        most = (1 << bits) - 1 if field.sign != "offset_2048" else 2047
-        least = -most if field.signed else 0
-        self._memory[field.address : field.address + field.size] = field.to_bytes(min(max(value, least), most))
+            self._put(field.name, value)

@@ -4,7 +4,8 @@ A board makes pulses; the servos behind it only follow them and tell nobody wher
 things: the pulse, which the board knows and moves under its speed limits, and a shaft, which a plant moves and only a
 test can see. Nothing about the shaft ever reaches the wire.
 
-Every row of a description is one channel with a servo on it; a board all of whose channels are dead is unplugged.
+Every row of a description is one channel with a servo on it; a board all of whose channels are dead is unplugged, one
+all of whose channels are mute obeys and never answers.
 
 Not modelled: the script, serial timeout, PWM output and daisy chain of a Maestro; the inputs, sequencer and offsets
 of an SSC-32.
@@ -12,6 +13,7 @@ of an SSC-32.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -31,7 +33,7 @@ class Channel:
 
     def __init__(self, number: int, board: Board, start_ticks: int) -> None:
         self.id = number
-        self.dead = False
+        self.dead = self.mute = False
         self.on = False
         self.goal = 0.0
         self.speed = 0.0  # ticks/s, 0 = no limit
@@ -89,7 +91,7 @@ class Channel:
         return self.on and bool(self.speed or self.acceleration) and self.plant.reference != self.goal
 
 
-class Board:
+class Board(ABC):
     """What the boards have in common. `rows` are plain: `id` is the channel; `baud`, `start_ticks`."""
 
     def __init__(self, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -134,9 +136,15 @@ class Board:
             channel.off(now_s)
             channel.speed = channel.acceleration = 0.0
 
-    @property
-    def unplugged(self) -> bool:
-        return bool(self._plugged) and all(self.channels[i].dead for i in self._plugged)
+    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
+        """Take what the host sent at `baud` (None = unknown); what the board answers."""
+        if not data or baud is None or (self.servos and all(channel.dead for channel in self.servos)):
+            return b""
+        answer = self._obey_all(data, baud, now_s)
+        return b"" if self.servos and all(channel.mute for channel in self.servos) else answer
+
+    @abstractmethod
+    def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes: ...
 
     def _ticks(self, shortest_us: float, longest_us: float) -> tuple[float, float]:
         tick_us = self.table.tick_us or 1.0
@@ -159,10 +167,7 @@ class MaestroBoard(Board):
         self.baud: int | None = None
         self.limits = [self._ticks(*maestro.FACTORY_PULSE_US) for _ in self.channels]
 
-    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
-        """Take what the host sent at `baud` (None = unknown); what the board answers."""
-        if self.unplugged or not data or baud is None:
-            return b""
+    def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes:
         if self.baud is None:
             start = data.find(maestro.BAUD_INDICATION)
             if start < 0:
@@ -241,9 +246,8 @@ class Ssc32Board(Board):
         super().__init__(table, rows)
         self.baud: int = rows[0]["baud"]
 
-    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
-        """Take what the host sent at `baud` (None = unknown); what the board answers."""
-        if self.unplugged or baud != self.baud:
+    def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes:
+        if baud != self.baud:
             return b""
         self._buffer += data
         out = b""

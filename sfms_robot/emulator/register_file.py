@@ -12,11 +12,14 @@ from sfms_robot.servo.registers import Field, Table
 
 
 class RegisterFile:
-    """Values by register name; raw bytes by address. Reading an absent register gives its default."""
+    """Values by register name; raw bytes by address. Reading an absent register gives its default.
 
-    def __init__(self, table: Table) -> None:
+    `size`: bytes that can be read; default: the whole table and no more.
+    """
+
+    def __init__(self, table: Table, size: int | None = None) -> None:
         self.table = table
-        self.raw = bytearray(table.size)
+        self.raw = bytearray(table.size if size is None else size)
         self._covers: dict[tuple[int, int], tuple[Field, ...]] = {}
         fields = table.fields
         self._windows = {  # address of an indirect data byte -> address of the word that says what it shows
@@ -32,10 +35,10 @@ class RegisterFile:
         return default if field is None else field.from_bytes(self.raw[field.address : field.address + field.size])
 
     def put(self, name: str, value: int) -> None:
-        """Does nothing where the model has no such register."""
+        """At most what the register can show; does nothing where the model has no such register."""
         field = self.table.fields.get(name)
         if field is not None:
-            self.raw[field.address : field.address + field.size] = field.to_bytes(value)
+            self.raw[field.address : field.address + field.size] = field.to_bytes(_shown(field, value))
 
     def covered(self, address: int, length: int) -> tuple[Field, ...]:
         """The registers that lie, wholly or in part, in a block."""
@@ -59,3 +62,15 @@ class RegisterFile:
                 continue
             target = self.raw[word] | self.raw[word + 1] << 8
             yield target if target < len(self.raw) and target not in self._windows else at
+
+
+def _shown(field: Field, value: int) -> int:
+    """The nearest value that fits the register's size and sign rule."""
+    if field.sign == "twos_complement":
+        half = 1 << 8 * field.size - 1
+        return min(max(value, -half), half - 1)
+    if field.sign == "offset_2048":
+        return min(max(value, -2048), 2047)
+    bits = int(field.sign.removeprefix("sign_bit_")) if field.signed else 8 * field.size
+    most = (1 << bits) - 1
+    return min(max(value, -most if field.signed else 0), most)

@@ -79,10 +79,6 @@ class NodTable:
         others = [counts for name, counts in self.series.items() if name != series]
         return Counts.total(others or self.series.values()).rates()
 
-    def has_seen(self, series: str) -> bool:
-        """True when `rates_for` cannot leave the series out."""
-        return set(self.series) == {series}
-
 
 def save(file: Path, table: NodTable, comment: str) -> None:
     """Write the table as YAML below a comment of any lines. Raises ConfigError when that fails."""

@@ -22,8 +22,7 @@ from sfms_robot.corpora.compose.voices import Voice
 from sfms_robot.evaluation.nod_table import Counts, Ints, NodTable, cells
 from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, SpeakerFrame
-from sfms_robot.signals import events as timing
-from sfms_robot.signals import phase
+from sfms_robot.signals import events, phase
 from sfms_robot.signals.events import Bools
 
 WITHIN_S: Final = 0.5  # a generated nod this close counts for an instant
@@ -60,7 +59,7 @@ class Scene:
     @property
     def listening(self) -> Bools:
         """(N,) others spoke in the last 2 s, he is silent and in view."""
-        return timing.listening_mask(self.others, FRAME_HZ, self.own) & ~self.unseen
+        return events.listening_mask(self.others, FRAME_HZ, self.own) & ~self.unseen
 
     @property
     def cell(self) -> Ints:
@@ -118,15 +117,15 @@ def kinds_of_time(one: Scene) -> dict[str, Bools]:
     least: right after a phrase of over 3 s, in the first second of one, eight seconds into one, and in long silence.
     """
     frames, listening = len(one.others), one.listening
-    spoken = timing.runs(one.others)
-    ends = timing.phrase_ends(one.others, FRAME_HZ)
+    spoken = events.runs(one.others)
+    ends = events.phrase_ends(one.others, FRAME_HZ)
     long_ends = [end / FRAME_HZ for start, end in spoken if end - start > 3 * FRAME_HZ and end < frames]
     speech_s, silence_s, _ = phase.times(one.others.tolist()).T
     return {
         "listening": listening,
-        "after_phrase": timing.window_after(ends, timing.AFTER_S, frames, FRAME_HZ) & listening,
-        "later": timing.window_after(ends, timing.LATER_S, frames, FRAME_HZ) & listening,
-        "after_long_phrase": timing.window_after(long_ends, (0.0, 0.4), frames, FRAME_HZ) & listening,
+        "after_phrase": events.window_after(ends, events.AFTER_S, frames, FRAME_HZ) & listening,
+        "later": events.window_after(ends, events.LATER_S, frames, FRAME_HZ) & listening,
+        "after_long_phrase": events.window_after(long_ends, (0.0, 0.4), frames, FRAME_HZ) & listening,
         "first_second": (speech_s > 0) & (speech_s <= 1) & listening,
         "late_in_phrase": (speech_s > 8) & listening,
         "long_silence": (silence_s > 2) & ~one.own & ~one.unseen,
@@ -158,7 +157,7 @@ def per_minute(counted: Rates, kind: str) -> float:
 
 
 def phrase_end_ratio(counted: Rates) -> float:
-    return timing.ratio_of((*counted["after_phrase"], *counted["later"]))
+    return events.ratio_of((*counted["after_phrase"], *counted["later"]))
 
 
 # --- what the listener did --------------------------------------------------------------------------------------
@@ -188,13 +187,13 @@ class Answer:
 
 def observe(motions: Floats) -> Answer:
     """What is to be seen in motion (S, N, 58)."""
-    nods = [timing.find_nods(motion[:, CHANNEL_INDEX["pitch"]], FRAME_HZ) for motion in motions]
+    nods = [events.find_nods(motion[:, CHANNEL_INDEX["pitch"]], FRAME_HZ) for motion in motions]
     return Answer(
         tuple(np.array([event[:2] for event in found], np.float64).reshape(-1, 2) for found in nods),
         tuple(size for found in nods for _, _, size in found),
-        sum(len(timing.find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ)) for motion in motions),
-        sum(len(timing.find_smiles(motion[:, CHANNEL_INDEX["mouthSmileLeft"]], FRAME_HZ)) for motion in motions),
-        sum(len(timing.find_gaze_shifts(*gaze_rad(motion), FRAME_HZ)) for motion in motions),
+        sum(len(events.find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ)) for motion in motions),
+        sum(len(events.find_smiles(motion[:, CHANNEL_INDEX["mouthSmileLeft"]], FRAME_HZ)) for motion in motions),
+        sum(len(events.find_gaze_shifts(*gaze_rad(motion), FRAME_HZ)) for motion in motions),
     )
 
 
@@ -240,10 +239,10 @@ def nod_ranks(
     onsets = one.onsets[listening[one.onsets]]
     if len(onsets) < LEAST_NODS:
         return None
-    without = listening & ~timing.near(one.nods_s, frames, FRAME_HZ, WITHIN_S)
+    without = listening & ~events.near(one.nods_s, frames, FRAME_HZ, WITHIN_S)
 
     def auc(scores: Doubles) -> float:
-        return timing.rank_auc(scores, onsets, without)
+        return events.rank_auc(scores, onsets, without)
 
     seeds = len(answer.nods_s)
     chance = rates[cell] / 60 / FRAME_HZ
@@ -260,7 +259,7 @@ def nod_ranks(
 
 def nod_share(nods_s: Sequence[Doubles], frames: int) -> Doubles:
     """(frames,) share of the runs with a nod within 0.5 s: the nod probability of every instant."""
-    runs = [timing.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in nods_s]
+    runs = [events.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in nods_s]
     return np.asarray(np.mean(runs, axis=0), np.float64)
 
 
@@ -270,7 +269,7 @@ def fit_table(people: Sequence[Person]) -> NodTable:
     for person in people:
         whole = Stretch(person, 0.0, person.until_s)
         others, own, unseen = (active(spans, whole) for spans in (person.others, person.talk, person.unseen))
-        listening = timing.listening_mask(others, FRAME_HZ, own) & ~unseen
+        listening = events.listening_mask(others, FRAME_HZ, own) & ~unseen
         onsets = np.round(person.nods[:, 0] * FRAME_HZ).astype(np.int64)
         counts = Counts.of(cells(phase.times(others.tolist())), onsets, listening)
         parts.setdefault(series(person.meeting), []).append(counts)

@@ -22,9 +22,6 @@ def sinusoidal(length: int, width: int) -> Tensor:
     return torch.cat([torch.sin(position * rate), torch.cos(position * rate)], dim=-1)
 
 
-Keys = tuple[Tensor, Tensor]
-
-
 class Attention(nn.Module):
     """Multi-head attention of `x` (B, T, D) over `memory` (B, S, D)."""
 
@@ -35,17 +32,11 @@ class Attention(nn.Module):
         self.key_value = nn.Linear(width, 2 * width)
         self.out = nn.Linear(width, width)
 
-    def keys(self, memory: Tensor) -> Keys:
-        """Keys and values of `memory` (B, S, D), for many queries: (B, h, S, D/h) each."""
-        b, s, _ = memory.shape
-        k, v = self.key_value(memory).view(b, s, 2, self.heads, -1).permute(2, 0, 3, 1, 4)
-        return k, v
-
-    def forward(self, x: Tensor, memory: Tensor | Keys, seen: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, memory: Tensor, seen: Tensor | None = None) -> Tensor:
         """`seen` (B, S): True where the memory may be looked at; at least one per row."""
-        b, t, d = x.shape
+        (b, t, d), s = x.shape, memory.shape[1]
         q = self.query(x).view(b, t, self.heads, -1).transpose(1, 2)  # (B, h, T, D/h)
-        k, v = self.keys(memory) if isinstance(memory, Tensor) else memory
+        k, v = self.key_value(memory).view(b, s, 2, self.heads, -1).permute(2, 0, 3, 1, 4)  # (B, h, S, D/h)
         mask = None if seen is None else seen[:, None, None, :]
         y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         out: Tensor = self.out(y.transpose(1, 2).reshape(b, t, d))
@@ -77,16 +68,10 @@ class Block(nn.Module):
         self.cross = Attention(width, heads) if cross else None
         self.forward_part = FeedForward(width)
 
-    def memory_keys(self, memory: Tensor) -> Keys:
-        """What the block makes of a memory (B, S, D), to be handed to `forward` many times in its place."""
-        if self.cross is None:
-            raise ValueError("this block looks at no memory")
-        return self.cross.keys(memory)
-
     def forward(
         self,
         x: Tensor,
-        memory: Tensor | Keys | None = None,
+        memory: Tensor | None = None,
         seen: Tensor | None = None,
         memory_seen: Tensor | None = None,
         last: int | None = None,

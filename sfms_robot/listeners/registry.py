@@ -5,16 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import cast
 
-from sfms_robot.config import find
-from sfms_robot.config.listener_kinds import listener_kind
-from sfms_robot.listeners.checkpoint import CONFIG, load_config
+from sfms_robot.config.listener_kinds import LISTENER_KINDS
+from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.listeners.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
 
 def load_listener(name: str | Path) -> Listener:
-    """A listener by shipped name, or of a folder with config.yaml and weights. Raises ConfigError or ModelError."""
-    folder = find("listeners", str(name), CONFIG)
-    return cast(Listener, listener_kind(load_config(folder).kind, folder / CONFIG).load_folder(folder))
+    """A listener by shipped name, of a folder with config.yaml and weights, or of another package.
+
+    Raises ConfigError or ModelError.
+    """
+    folder = listener_folder(str(name))
+    if folder is None:
+        return load_plugin(str(name))
+    return cast(Listener, LISTENER_KINDS[load_config(folder).kind].load_folder(folder))
 
 
 def one_thread() -> None:

@@ -6,7 +6,6 @@ import pytest
 from sfms_robot.app.bench.adversary import torment
 from sfms_robot.app.bench.lead import delay_ticks, delays
 from sfms_robot.app.bench.retarget import retarget
-from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
@@ -30,7 +29,7 @@ def test_a_joint_that_stands_still_has_no_delay():
 
 @pytest.mark.parametrize("name", QUICK)
 def test_led_by_its_lag_every_joint_is_less_than_a_tick_late(name):
-    found = delays(load_head(name), duration_s=4.0)
+    found = delays(name, duration_s=4.0)
     moved = np.isfinite(found.led_s)
     assert moved.any()
     assert np.abs(found.led_s[moved]).max() < 0.010
@@ -40,7 +39,7 @@ def test_led_by_its_lag_every_joint_is_less_than_a_tick_late(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in HEADS if name not in QUICK])
 def test_led_by_its_lag_every_joint_of_the_larger_heads_is_less_than_a_tick_late(name):
-    found = delays(load_head(name))
+    found = delays(name)
     moved = np.isfinite(found.led_s)
     assert moved.mean() > 0.8 and np.abs(found.led_s[moved]).max() < 0.010
 

@@ -5,7 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.campaign import FAMILIES, SPECS, Judge, Outcome, Rig, head_of, one, run_campaign, table
+from sfms_robot.app.bench.campaign import (
+    CASES,
+    HALF_DEAD,
+    MANY_TURNS,
+    MUTE_AT_STOP,
+    OUTSIDE,
+    SPECS,
+    STORED,
+    Outcome,
+    one,
+    run_campaign,
+    table,
+)
+from sfms_robot.app.bench.campaign_rig import FAMILIES, Judge, Rig, head_of
 from sfms_robot.app.bench.fuzz import BYTES, fuzz_one
 from sfms_robot.app.session import build_bus
 from sfms_robot.app.wiring import emulated
@@ -14,6 +27,9 @@ from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import VirtualClock
 
+IMPOSSIBLE = {(case, board) for case in (STORED, MANY_TURNS) for board in ("maestro", "ssc32")} | {
+    (MANY_TURNS, family) for family in ("dynamixel1", "scs")
+}
 SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
 
 
@@ -21,7 +37,7 @@ SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
 def rig():
     head, clock = head_of("dynamixel2"), VirtualClock()
     with launch(emulated(head)["main"], virtual=True) as chain:
-        rig = Rig(head, chain, clock, build_bus(head, {"main": chain}, clock))
+        rig = Rig(head, {"main": chain}, clock, build_bus(head, {"main": chain}, clock))
         rig.hold()
         yield rig
         rig.bus.stop("release")
@@ -29,7 +45,7 @@ def rig():
 
 
 def test_every_kind_of_fault_is_tried():
-    assert set(SPECS) == set(KINDS)
+    assert set(SPECS) == set(KINDS) < set(CASES)
 
 
 def test_unknown_family_is_named():
@@ -43,6 +59,34 @@ def test_nothing_escapes_and_everybody_comes_back(family):
     outcome = one(family, fault, ticks=300)
     assert outcome.passed, outcome
     assert outcome.ticks == 300
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_servos_found_outside_their_range_come_in_and_nothing_escapes(family):
+    outcome = one(family, OUTSIDE, ticks=300)
+    assert outcome.possible and outcome.passed and outcome.refused is None, outcome
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("case", [STORED, MANY_TURNS])
+def test_servos_that_contradict_the_heads_file_are_refused_or_mended(family, case):
+    outcome = one(family, case, ticks=200)
+    assert outcome.passed, outcome
+    assert outcome.possible == ((case, family) not in IMPOSSIBLE)
+    if case == STORED and outcome.refused is not None:
+        assert "limit" in outcome.refused
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_torque_is_off_at_once_though_nobody_answers(family):
+    outcome = one(family, MUTE_AT_STOP)
+    assert outcome.off_s is not None and outcome.off_s <= 0.02 and outcome.stop_s <= 0.5 and outcome.passed, outcome
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_bus_that_dies_takes_no_other_with_it(family):
+    outcome = one(family, HALF_DEAD, ticks=1000 if family in ("maestro", "dynamixel2") else 250)
+    assert outcome.passed, outcome
 
 
 def test_a_family_that_cannot_have_a_fault_says_so():
@@ -88,6 +132,8 @@ def test_joint_that_does_not_follow_is_noticed(rig):
         {"recovered_s": None},
         {"recovered_s": 2.5},
         {"named": ["joint1: torque lost"]},
+        {"refused": "min_position_limit is 1900"},
+        {"left_on": 1},
     ],
 )
 def test_anything_amiss_fails(what):

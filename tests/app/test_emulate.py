@@ -2,7 +2,8 @@ import shutil
 
 import pytest
 
-from sfms_robot.app.servo.emulated_chains import EmulateOptions, emulators, parse_servos
+from sfms_robot.app.servo.emulated_chains import EmulateOptions, described, emulators, parse_servos
+from sfms_robot.config import load_head
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 
@@ -68,3 +69,43 @@ def test_stored_values_that_cannot_be_are_one_clear_line(tmp_path, stored, messa
     (tmp_path / "emulate.yaml").write_text(stored)
     with pytest.raises(ConfigError, match=message), emulators(EmulateOptions(head=str(tmp_path))):
         pass
+
+
+def test_what_is_stored_and_where_servos_are_found_is_told_by_id():
+    options = EmulateOptions(
+        servo="xl330-m288:1-3,sts3215:9", stored=("1,3:min_position_limit=1900", "9:phase=28"), starts=("2-3=4150",)
+    )
+    with emulators(options) as chains:
+        chain = chains["servos"]
+        assert [servo.registers for servo in chain.servos] == [
+            {"min_position_limit": 1900}, {}, {"min_position_limit": 1900}, {"phase": 28},
+        ]  # fmt: skip
+        assert [chain.state(i)["position"] for i in (1, 2, 3, 9)] == [2048, 4150, 4150, 2048]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"stored": ("min_position_limit=3",)}, "stored = 'min_position_limit=3' cannot be read: IDS:REGISTER=VALUE"),
+        ({"stored": ("1:nose=3",)}, "register = 'nose' is none of xl330-m288"),
+        ({"stored": ("1:shutdown=300",)}, "shutdown = 300 is out of range of xl330-m288"),
+        ({"starts": ("1:4150",)}, "start = '1:4150' cannot be read: IDS=TICKS"),
+        ({"starts": ("7=4150",)}, "start = '7=4150' names 7, which nobody has"),
+        ({"starts": ("3-1=4150",)}, "start = '3-1=4150' holds ids that are none"),
+    ],
+)
+def test_start_that_cannot_be_is_one_clear_line(more, message):
+    with pytest.raises(ConfigError, match=message), emulators(EmulateOptions(servo="xl330-m288:1", **more)):
+        pass
+
+
+def test_what_is_plugged_in_is_described_joint_by_joint():
+    with emulators(EmulateOptions(head="open_duck_mini_v2_head")) as chains:
+        told = described(chains, "open_duck_mini_v2_head")
+    head = load_head("open_duck_mini_v2_head")
+    assert set(told["buses"]) == set(head.buses) and len(told["buses"]) > 1
+    for bus, each in told["buses"].items():
+        assert each["device"] and each["control"]
+        for servo in each["servos"]:
+            joint = head.joints[servo["joint"]]
+            assert (joint.bus, joint.id, joint.model) == (bus, servo["id"], servo["model"])

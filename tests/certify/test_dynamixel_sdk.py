@@ -121,3 +121,17 @@ def test_two_protocols_on_one_cable(plugged_in, again):
     again(lambda: old.read2ByteTxRx(port, 20, 36), lambda a: a == (450, COMM_SUCCESS, 0))
     again(lambda: new.read4ByteTxRx(port, 1, 132), lambda a: a == (2048, COMM_SUCCESS, 0))
     port.closePort()
+
+
+def test_ax_wheel_turns_and_a_registered_write_is_pending(plugged_in, again):
+    chain = plugged_in([EmulatedServo(1, model="ax-12a", start_ticks=400, firmware=24)])
+    port, sdk = PortHandler(chain.device), Protocol1PacketHandler()
+    assert port.openPort() and port.setBaudRate(1_000_000)
+    again(lambda: sdk.write4ByteTxRx(port, 1, 6, 0), lambda a: a == NO_ERROR)  # both angle limits
+    again(lambda: sdk.write1ByteTxRx(port, 1, 24, 1), lambda a: a == NO_ERROR)
+    again(lambda: sdk.regWriteTxRx(port, 1, 32, 2, [0, 6]), lambda a: a == NO_ERROR)  # 1024 + 512
+    again(lambda: sdk.read1ByteTxRx(port, 1, 44), lambda a: a == (1, COMM_SUCCESS, 0))
+    assert sdk.action(port, 254) == COMM_SUCCESS
+    again(lambda: sdk.read1ByteTxRx(port, 1, 44), lambda a: a == (0, COMM_SUCCESS, 0))
+    again(lambda: sdk.read2ByteTxRx(port, 1, 38), lambda a: a[1:] == NO_ERROR and a[0] > 1024 + 200)
+    port.closePort()

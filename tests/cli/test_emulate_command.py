@@ -1,3 +1,4 @@
+import json
 import os
 import signal
 import subprocess
@@ -33,3 +34,21 @@ def test_bad_fault_is_one_line_and_code_2(capsys):
     assert ended.value.code == 2
     assert told.startswith("sfms-robot: emulate: fault = 'dorp:1' has no such kind as 'dorp' (drop, delay, corrupt")
     assert len(told.splitlines()) == 1
+
+
+def test_json_is_one_object_with_devices_and_servos_and_it_serves_on():
+    command = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", "emulate", "--json"]
+    servos = ["--servo", "xl330-m288:1-2,ax-12a:20"]
+    with subprocess.Popen([*command, *servos], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        told = json.loads(process.stdout.readline())
+        [wire] = told["buses"].values()
+        assert [(s["id"], s["model"]) for s in wire["servos"]] == [
+            (1, "xl330-m288"), (2, "xl330-m288"), (20, "ax-12a"),
+        ]  # fmt: skip
+        with serial.Serial(wire["device"], 1_000_000, timeout=10) as port:
+            port.write(bytes.fromhex("ff ff 14 02 01 e8"))  # ping, protocol 1
+            assert port.read(6) == bytes.fromhex("ff ff 14 02 00 e9")
+        process.terminate()
+        rest, error = process.communicate(timeout=30)
+    assert process.returncode == 0 and rest == "" and error == ""

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, train_missing
 from sfms_robot.cli.main import main
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_S
 from sfms_robot.signals.tracks import Track, write_track
 
@@ -58,6 +60,12 @@ def test_a_table_trains_what_is_missing_keeps_it_and_scores_any_folder(
 def test_an_unknown_table_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert command(*TABLE, "5") == 2
     assert "--table '5' is not one of 3, 4, all" in capsys.readouterr().err
+
+
+def test_an_installed_package_says_how_to_get_the_tokenizers_it_does_not_carry(tmp_path: Path) -> None:
+    said = r"2 tokenizers of this table are not there \(a, ...\): add --models DIR, which trains what is missing"
+    with pytest.raises(ConfigError, match=said):
+        train_missing(TableOptions("4"), ["a", "b"], tmp_path / "tokenizers", {})
 
 
 def test_training_needs_a_folder_of_ones_own(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,6 @@
 """No row of a table is cut, wherever it goes."""
 
-from sfms_robot.cli.servo_tables import print_table
+from sfms_robot.cli.show_servo import print_table
 
 ROWS = [
     {"id": 11, "joint": "a_joint_with_quite_a_long_name", "model": "xl330-m288", "faults": "input voltage, overload"},

@@ -229,3 +229,27 @@ def test_position_stays_finite_at_the_ends_of_every_range():
     bench.put(torque_enable=1, profile_velocity=32767, profile_acceleration=32767, goal_position=-1048575)
     for _ in range(20):
         assert math.isfinite(bench.after(1.0))
+
+
+def test_xl320_torque_limit_starts_at_max_torque_and_holds_the_motor_back():
+    table = Table.of(load_firmware_map("xl-320"))
+    way = {}
+    for stored in ({}, {"max_torque": 60}):
+        servo = Dynamixel2Servo(1, table, 1_000_000, 512, 30, stored)
+        most = stored.get("max_torque", 1023)
+        assert servo.read(35, 2, 0.0) == (0, most.to_bytes(2, "little"))  # Torque Limit
+        servo.write(30, (900).to_bytes(2, "little"), 0.0)
+        servo.write(24, b"\x01", 0.0)
+        way[most] = servo.state(0.1)["position"] - 512
+        servo.write(35, b"\x05\x00", 0.1)
+        servo.reboot(0.1)
+        assert servo.read(35, 2, 0.5) == (0, most.to_bytes(2, "little"))
+    assert 0 < way[60] < way[1023] / 2
+
+
+def test_turns_are_forgotten_at_power_up_however_few_they_are():
+    bench = Bench()
+    bench.servo.turn(4150, 0.0)
+    assert bench.servo.state(0.0)["position"] == 4150
+    bench.servo.reboot(0.0)
+    assert bench.servo.state(1.0)["position"] == 4150 - 4096

@@ -8,6 +8,7 @@ from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.protocol1_chain import Protocol1Chain
+from sfms_robot.emulator.pulse_boards import Ssc32Board
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs import protocol1 as frame1
@@ -155,3 +156,40 @@ def test_same_faults_and_requests_give_the_same_bytes():
         return out
 
     assert run(7) == run(7) != run(8)
+
+
+@pytest.mark.parametrize("chain_break", [True, False])
+def test_mute_servo_obeys_and_never_answers(chain_break):
+    chain = Dynamixel2Chain([Dynamixel2Servo(i, TABLE, BAUD, 2000 + i, 53) for i in (1, 2, 3)], chain_break)
+    wire = EmulatedWire([chain], "instant", [parse_fault("mute:2@1-3")], 0)
+    torque_on = encode_instruction(2, dxl2.WRITE, bytes([64, 0, 1]))
+    behind = [1] if chain_break else [1, 3]
+    for now_s, answers, order in ((0.5, [2], [1, 2, 3]), (2.0, [], behind), (3.5, [2], [1, 2, 3])):
+        chain.servo(2).write(64, b"\0", now_s)
+        wire.receive(torque_on, BAUD, now_s)
+        assert ids_in(wire.take(now_s)) == answers
+        assert chain.servo(2).state(now_s)["torque"]
+        wire.receive(sync_read(1, 2, 3), BAUD, now_s)
+        assert ids_in(wire.take(now_s)) == order
+        wire.receive(encode_instruction(dxl2.BROADCAST, dxl2.PING), BAUD, now_s)
+        assert ids_in(wire.take(now_s)) == [i for i in (1, 2, 3) if i != 2 or answers]
+
+
+def test_mute_servo_of_protocol_1_obeys_and_never_answers():
+    table = Table.of(load_firmware_map("ax-12a"))
+    row = {"id": 1, "model": "ax-12a", "baud": BAUD, "start_ticks": 512, "firmware": 24}
+    chain = Protocol1Chain.from_rows([row], {"ax-12a": table})
+    wire = EmulatedWire([chain], "instant", [parse_fault("mute")], 0)
+    for request in ("ff ff 01 02 01 fb", "ff ff 01 04 02 24 02 d2", "ff ff 01 04 03 18 01 de"):  # ping, read, torque on
+        wire.receive(bytes.fromhex(request), BAUD, 0.0)
+    assert wire.take(1.0) == [] and chain.servo(1).state(0.0)["torque"]
+
+
+def test_board_is_mute_when_all_its_channels_are():
+    table = Table.of(load_firmware_map("ssc-32"))
+    board = Ssc32Board(table, [{"id": i, "baud": 9600, "start_ticks": 1500} for i in (0, 1)])
+    wire = EmulatedWire([board], "instant", [parse_fault("mute@1-2")], 0)
+    for now_s, answers in ((0.5, 1), (1.5, 0), (2.5, 1)):
+        wire.receive(f"#0P{1500 + round(now_s)}\rQ\r".encode(), 9600, now_s)
+        assert len(wire.take(now_s)) == answers
+        assert board.channels[0].goal == 1500 + round(now_s)

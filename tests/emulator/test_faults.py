@@ -34,7 +34,7 @@ def test_spec_is_read(text, kind, ids, start_s, end_s, value):
     ("text", "problem"),
     [
         ("dorp", "has no such kind as 'dorp' (drop, delay"),
-        ("drop=1.5", "is out of range: share of replies of drop (0..1)"),
+        ("drop=1.5", "is out of range: fraction of replies of drop (0..1)"),
         ("drop:9-3", "holds a number that is none"),
         ("drop:1-999", "holds a number that is none"),
         ("drop@4-2", "ends at 2 s, before it starts"),

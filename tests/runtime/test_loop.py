@@ -129,7 +129,7 @@ def chain_state(chain: Chain, clock: VirtualClock) -> dict[int, dict[str, int]]:
     finally:
         link.port.close()
     return {
-        i: {"torque": torque[i].params[0], "ticks": int.from_bytes(present[i].params, "little", signed=True)}
+        i: {"torque": torque[i].data[0], "ticks": int.from_bytes(present[i].data, "little", signed=True)}
         for i in present
     }
 

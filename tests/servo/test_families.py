@@ -1,6 +1,6 @@
 """The one table of bus families: names, what they drive, and families of other packages."""
 
-import importlib.metadata
+import importlib
 
 import pytest
 
@@ -56,7 +56,7 @@ def installed(tmp_path, monkeypatch):
             "FAMILY = BusFamily('HerkuleX', 'collections:OrderedDict', ('herkulex', None))\n"
         )
         monkeypatch.syspath_prepend(str(tmp_path))
-        importlib.metadata.MetadataPathFinder.invalidate_caches()
+        importlib.invalidate_caches()
         families.cache_clear()
 
     yield install

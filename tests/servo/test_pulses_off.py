@@ -182,12 +182,12 @@ def test_torque_off_anywhere_in_a_tick_is_the_last_word(at, model):
     bench.adapter.calls, bench.adapter.at = 0, at
     bench.adapter.interrupt = lambda: bench.bus.torque_off("release")
     for k in range(200):
-        try:
-            bench.tick(held + 0.1 * math.sin(k / 5))
-        except ValueError:
-            bench.tick()
+        bench.tick(held + 0.1 * math.sin(k / 5))
     assert bench.adapter.interrupt is None
     assert bench.on() == []
+    bench.bus.stop("release")
+    with pytest.raises(ValueError, match="no joint is enabled"):
+        bench.tick(held)
 
 
 def test_joint_that_must_hold_keeps_its_pulses_in_torque_off(model):

@@ -12,21 +12,13 @@ import resource
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Final
 
-import numpy as np
-
 from sfms_robot.app import wiring
-from sfms_robot.app.bench.campaign import FAMILIES, RECOVERY_S, Judge, Rig, head_of
-from sfms_robot.config import Head, load_firmware_map
-from sfms_robot.emulator.launch import Chain, launch
-from sfms_robot.motion.calibration import Calibration
-from sfms_robot.ports import Bus
+from sfms_robot.app.bench.campaign_rig import FAMILIES, RECOVERY_S, Judge, Rig, bus_on, head_of
+from sfms_robot.emulator.launch import launch
 from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.servo.families import family_named
-from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port, VirtualTimePort
+from sfms_robot.servo.port import Port
 
 BYTES: Final = 1_000_000
 MEMORY_MIB: Final = 64.0  # more than this is growth
@@ -119,28 +111,13 @@ def fuzz_one(family: str, count: int = BYTES, seed: int = 0) -> Fuzzed:
     head, clock = head_of(family), VirtualClock()
     with launch(wiring.emulated(head)["main"], virtual=True) as chain:
         noise = Noise(random.Random(seed))
-        rig = Rig(head, chain, clock, _bus(head, chain, clock, noise))
+        rig = Rig(head, {"main": chain}, clock, bus_on(head, chain, clock, lambda port: NoisyPort(port, noise)))
         try:
             rig.hold()
             return _storm(rig, family, noise, count)
         finally:
             rig.bus.stop("release")
             rig.bus.close()
-
-
-def _bus(head: Head, chain: Chain, clock: VirtualClock, noise: Noise) -> Bus:
-    config = head.buses["main"]
-    maps = {joint.model: load_firmware_map(joint.model) for joint in head.joints.values()}
-    servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in head.joints.items()]
-    turns = np.array([maps[joint.model].ticks_per_revolution for joint in head.joints.values()])
-    wire = partial(VirtualTimePort, chain.device, chain.control, config.baud, clock)
-    family = family_named(config.family)
-    more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
-    bus: Bus = family.bus_class()(
-        "main", servos, Calibration(head.joints, turns), lambda: NoisyPort(wire(), noise), config.baud, 0.003,
-        config=config, **more,
-    )  # fmt: skip
-    return bus
 
 
 def _storm(rig: Rig, family: str, noise: Noise, count: int) -> Fuzzed:

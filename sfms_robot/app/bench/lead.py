@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,17 +17,14 @@ from numpy.typing import NDArray
 
 from sfms_robot.app.bench.measure import HEAD, Row, row
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.session import build_bus, build_motion
-from sfms_robot.app.wiring import emulated
-from sfms_robot.config import Head, load_firmware_map, load_head
-from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.config import Head, load_firmware_map
+from sfms_robot.emulator.launch import Chain
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock, Tick
-from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import IDLE_FEED
-from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.runtime.safety import Interrupt
 
 HORIZON, HOP = 8, 4  # frames of a plan, and between two plans
 LATENCY_S = 0.010  # from the last frame heard to the plan
@@ -111,17 +107,16 @@ class Onlooker:
     def close(self) -> None: ...
 
 
-def delays(head: Head, duration_s: float = DURATION_S) -> Delays:
+def delays(head: str, duration_s: float = DURATION_S) -> Delays:
     """Of a head as its file leads it, and with no lead at all."""
-    rate_hz = max(bus.rate_hz for bus in head.buses.values())
-    leads_s = build_motion(head, rate_hz).leads_s
-    led, unled = (_delays(head, rate_hz, leads, duration_s) for leads in (leads_s, 0 * leads_s))
-    return Delays(tuple(head.joints), leads_s, led, unled)
+    found = [_delays(head, led, duration_s) for led in (1.0, 0.0)]
+    (joints, leads_s, led_s), (_, _, unled_s) = found
+    return Delays(joints, leads_s, led_s, unled_s)
 
 
 def lead(head: str = HEAD) -> dict[str, Row]:
     """Rows of `sfms-robot bench lead`: the delay of each joint with lead [ms], its peer the one without."""
-    found = delays(load_head(head))
+    found = delays(head)
     moved = np.isfinite(found.led_s)
     led, unled = np.abs(found.led_s[moved]) * 1e3, np.abs(found.unled_s[moved]) * 1e3
     names = [name for name, there in zip(found.joints, moved, strict=True) if there]
@@ -129,27 +124,17 @@ def lead(head: str = HEAD) -> dict[str, Row]:
     return {"lead": row(led.tolist(), unled.tolist(), "ms", f"no lead ({head})"), **rows}
 
 
-def _delays(head: Head, rate_hz: float, leads_s: Doubles, duration_s: float) -> Doubles:
-    motion, waves, clock = replace(build_motion(head, rate_hz), leads_s=leads_s), Waves(), VirtualClock()
-    with ExitStack() as stack:
-        chains = {name: stack.enter_context(launch(rows, True)) for name, rows in emulated(head).items()}
-        bus = build_bus(head, dict(chains), clock)
-        stack.callback(bus.close)
-        bus.connect()
-        seen = Onlooker(head, chains, clock)
-        parts = Parts(
-            NobodyThere(),
-            waves,
-            motion.timeline,
-            motion.retargeter,
-            motion.limiter,
-            bus,
-            [seen],
-            leads_s,
-            motion.rest_rad,
-        )
-        log = RunLog(motion.retargeter.joints, 1.0 / rate_hz, motion.audit)
-        drive(parts, clock, log, rate_hz=rate_hz, duration_s=duration_s, interrupted=lambda: False)
+def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], Doubles, Doubles]:
+    """Joints, their leads, and how late they are when they are led by `share` of those."""
+    waves = Waves()
+    with open_head(HeadOptions(name, fast=True, yes=True)) as opened:
+        motion, rate_hz = opened.motion, opened.rate_hz
+        led = replace(opened, motion=replace(motion, leads_s=share * motion.leads_s))
+        chains = {bus: chain for bus, chain in opened.opened.items() if isinstance(chain, Chain)}
+        seen = Onlooker(opened.config, chains, opened.clock)
+        drove = drive_head(led, Programme(NobodyThere(), waves, duration_s, observers=[seen]), Interrupt())
+    if drove.error is not None:
+        raise drove.error
     times_s = np.array(seen.times_s)
     memory, meant = motion.retargeter.start(), []
     for face in waves.face(times_s):
@@ -157,7 +142,7 @@ def _delays(head: Head, rate_hz: float, leads_s: Doubles, duration_s: float) -> 
         meant.append(angles)
     settled = times_s > SETTLED_S
     moved = delay_ticks(np.array(meant)[settled], np.array(seen.angles_rad)[settled], round(FARTHEST_S * rate_hz))
-    return moved / rate_hz
+    return motion.retargeter.joints, motion.leads_s, moved / rate_hz
 
 
 def delay_ticks(meant: Doubles, seen: Doubles, farthest: int) -> Doubles:

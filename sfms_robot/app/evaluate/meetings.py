@@ -33,7 +33,7 @@ from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.ports import Listener
 
 TABLE: Final = "nod_table.yaml"  # in sim/listeners
-_TABLE_COMMENT: Final = """Nods and minutes of listening by phase of speech (`evaluation.nod_table`), by series of meetings.
+_COMMENT: Final = """Nods and minutes of listening by speech phase, per series of meetings (`evaluation.nod_table`).
 Counted in: The AMI Meeting Corpus, AMI project consortium (Carletta et al. 2005), manual annotations 1.7, CC BY 4.0,
 http://groups.inf.ed.ac.uk/ami/corpus/; annotations taken from github Hasetomo2142/ami-corpus-preprocessing, commit
 6d845bc07b21c8862afbf38f1b1f9ab3bf40c437. Made by
@@ -84,7 +84,7 @@ def fit_table(data: Path, out: Path) -> dict[str, Any]:
     """Write the nod table of all people of `data`. Returns what went into it."""
     people = read_people(tables(data))
     table = evaluation.fit_table(people)
-    nod_table.save(out, table, _TABLE_COMMENT)
+    nod_table.save(out, table, _COMMENT)
     total = nod_table.Counts.total(table.series.values())
     return {
         "table": str(out),

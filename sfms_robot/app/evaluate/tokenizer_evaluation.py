@@ -60,7 +60,7 @@ def evaluate_table(options: TableOptions) -> dict[str, Any]:
     recorded = takes.load(data_dir("sim") / "listeners" / RECORDED)
     held_out = recorded[takes.HELD_OUT] if options.data is None else takes.folder_takes(options.data)
     wanted = list(dict.fromkeys(name for table in chosen for name in needed(table)))
-    _train_missing(options, wanted, folder, recorded)
+    train_missing(options, wanted, folder, recorded)
     loaded = {name: models.read(folder / name) for name in wanted}
     _same_scales(loaded, folder)
     window = next(iter(loaded.values())).window
@@ -86,7 +86,8 @@ def _chosen(options: TableOptions) -> Sequence[str]:
     return TABLES if options.table == ALL else (options.table,)
 
 
-def _train_missing(options: TableOptions, wanted: Sequence[str], folder: Path, recorded: dict[str, list[Take]]) -> None:
+def train_missing(options: TableOptions, wanted: Sequence[str], folder: Path, recorded: dict[str, list[Take]]) -> None:
+    """Train what `folder` lacks of `wanted`. Raises ConfigError where that is the package's own folder."""
     missing = [name for name in wanted if options.train or not models.is_there(folder / name)]
     if not missing:
         return

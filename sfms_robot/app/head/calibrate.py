@@ -9,7 +9,6 @@ is done: who stops in the middle goes on there the next time. Only the overlay o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -17,8 +16,8 @@ from typing import Any, Final, Literal, Protocol
 
 from sfms_robot.app.calibrated_head import identify
 from sfms_robot.app.head.joint_probe import Probe, jumps, probe
-from sfms_robot.app.session import build_motion
-from sfms_robot.app.wiring import SIM, devices, emulated
+from sfms_robot.app.session import HeadOptions, build_motion, open_wires
+from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head, Joint, load_head
 from sfms_robot.config.overlay import (
     CalibrateLayer,
@@ -32,7 +31,7 @@ from sfms_robot.config.overlay import (
     overlay_file,
     save_overlay,
 )
-from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
@@ -88,12 +87,7 @@ def calibrate(name: str, port: str, talk: Talk, joints: Sequence[str] = (), agai
     that are measured already. Raises RobotError.
     """
     head = load_head(name)
-    with ExitStack() as stack:
-        where: dict[str, Chain | str] = {}
-        if port == SIM:
-            where |= {bus: stack.enter_context(launch(servos)) for bus, servos in emulated(head).items()}
-        else:
-            where |= devices(head, port)
+    with open_wires(head, HeadOptions(name, port)) as where:
         file = overlay_file(head.name, practice=port == SIM)
         return calibrate_on(name, where, RealClock(), talk, file, date.today(), joints, again)
 

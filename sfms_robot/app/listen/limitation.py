@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from sfms_robot.config import find, load_listener
+from sfms_robot.config import load_listener
+from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.listeners.space import MotionSpace
 
 
 def limitation(listener: str) -> str | None:
-    """One line about a listener by name or folder, or None: it can show all channels. Raises ConfigError."""
-    folder = find("listeners", listener, "config.yaml")
-    return MotionSpace.of(load_listener(folder / "config.yaml"), folder).limitation
+    """One line about a listener by name or folder; None: it can show all channels, or another package brings it.
+
+    Raises ConfigError.
+    """
+    folder = listener_folder(listener)
+    return None if folder is None else MotionSpace.of(load_listener(folder / "config.yaml"), folder).limitation

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from sfms_robot.data import find
 from sfms_robot.errors import PortError
+from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.sources.registry import check_source
 
@@ -22,7 +23,7 @@ def check_names(
 ) -> None:
     """Are there such a head, listener, port and files? Raises ConfigError, PortError."""
     find("heads", head, "head.yaml")
-    find("listeners", listener, "config.yaml")
+    listener_folder(listener)
     check_source(audio, face, agent_audio)
     for part in port.split(","):
         device = part.rpartition("=")[2]

@@ -1,16 +1,20 @@
-"""`sfms-robot emulate`: servos to plug software into, without servos."""
+"""`sfms-robot emulate`: servos to plug software into, without servos.
+
+What somebody did to the servos before the host comes is told for ids of a wire: `stored` 3,5-7:min_position_limit=1900
+(raw values of registers), `starts` 3=4150 (what its position reads, ticks; beyond a limit or one turn, too).
+"""
 
 from __future__ import annotations
 
 import re
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, load_head
 from sfms_robot.emulator.faults import parse_ids
@@ -20,6 +24,8 @@ from sfms_robot.errors import BusError, ConfigError
 USUAL_BAUD: Final = 1_000_000
 _BOARD_BAUDS: Final = {"maestro": 115_200, "ssc32": 9_600}
 _MORE_IDS: Final = re.compile(r"\d+(-\d+)?")
+_STORED: Final = re.compile(r"(?P<ids>[0-9,-]+):(?P<register>\w+)=(?P<value>-?\d+)")
+_START: Final = re.compile(r"(?P<ids>[0-9,-]+)=(?P<value>-?\d+)")
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,8 @@ class EmulateOptions:
     virtual: bool = False
     behind_silent: Literal["chain_break", "skip"] = "chain_break"
     seed: int = 0
+    stored: tuple[str, ...] = ()
+    starts: tuple[str, ...] = ()
 
 
 @contextmanager
@@ -61,6 +69,25 @@ def emulators(options: EmulateOptions) -> Iterator[dict[str, Chain]]:
         yield chains
 
 
+def described(chains: Mapping[str, Chain], head: str | None) -> dict[str, Any]:
+    """What is plugged in where, as plain data for `--json`."""
+    joints = {} if head is None else {(j.bus, j.id): name for name, j in load_head(head).joints.items()}
+    return {
+        "head": head,
+        "buses": {
+            bus: {
+                "device": chain.device,
+                "control": chain.control,
+                "servos": [
+                    {"id": s.id, "model": s.model, "baud": s.baud, "joint": joints.get((bus, s.id))}
+                    for s in chain.servos
+                ],
+            }
+            for bus, chain in chains.items()
+        },
+    }
+
+
 def until_stopped(chains: Mapping[str, Chain]) -> None:
     """Block until SIGTERM or SIGINT, which end the program with code 0. Raises BusError when a chain ends by itself."""
 
@@ -81,14 +108,41 @@ def _servos(options: EmulateOptions) -> dict[str, list[EmulatedServo]]:
         wires = plugged_in(options.head, load_head(options.head))
     else:
         wires = {"servos": parse_servos(options.servo or "")}
-    out = {}
-    for bus, servos in wires.items():
-        if options.baud is not None:
-            servos = [replace(servo, baud=options.baud) for servo in servos]
-        if options.voltage is not None:
-            servos = [replace(servo, supply_v=options.voltage) for servo in servos]
-        out[bus] = servos
+    settings: dict[str, Any] = {}
+    if options.baud is not None:
+        settings["baud"] = options.baud
+    if options.voltage is not None:
+        settings["supply_v"] = options.voltage
+    out = {bus: [replace(servo, **settings) for servo in servos] for bus, servos in wires.items()}
+    for text in options.stored:
+        ids, found = _of_ids("stored", text, _STORED, "IDS:REGISTER=VALUE, as in 3:min_position_limit=1900", out)
+        for servos in out.values():
+            for i, servo in enumerate(servos):
+                if servo.id in ids:
+                    registers = {**servo.registers, found["register"]: int(found["value"])}
+                    servos[i] = replace(servo, registers=registers)
+    for text in options.starts:
+        ids, found = _of_ids("start", text, _START, "IDS=TICKS, as in 3=4150", out)
+        for servos in out.values():
+            servos[:] = [replace(s, start_ticks=int(found["value"])) if s.id in ids else s for s in servos]
     return out
+
+
+def _of_ids(
+    option: str, text: str, form: re.Pattern[str], wanted: str, wires: Mapping[str, Sequence[EmulatedServo]]
+) -> tuple[frozenset[int], re.Match[str]]:
+    """Ids named by an option, and the rest of it. Raises ConfigError for what cannot be read, and for ids of nobody."""
+    found = form.fullmatch(text.strip())
+    if found is None:
+        raise ConfigError.at("emulate", option, text, f"cannot be read: {wanted}")
+    there = {servo.id for servos in wires.values() for servo in servos}
+    try:
+        ids = parse_ids(found["ids"])
+    except ValueError:
+        raise ConfigError.at("emulate", option, text, "holds ids that are none", ["0..252"]) from None
+    if missing := sorted(ids - there):
+        raise ConfigError.at("emulate", option, text, f"names {missing[0]}, which nobody has", sorted(there))
+    return ids, found
 
 
 def parse_servos(text: str) -> list[EmulatedServo]:

@@ -264,7 +264,7 @@ def factory_reset(wire: Wire, seen: Seen, keep: str, confirm: Confirm) -> Seen:
 
 def twins(wire: Wire, servo: int) -> bool:
     """Whether two servos seem to answer to one id: a ping brings more than one clean answer, again and again."""
-    return all(hear_ping(wire.port, wire.kind.maps[1] or 2, servo, PATIENCE_S).twins for _ in range(TRIES))
+    return all(hear_ping(wire.port, wire.kind.protocol, servo, PATIENCE_S).twins for _ in range(TRIES))
 
 
 def _neighbours(wire: Wire) -> list[Seen]:

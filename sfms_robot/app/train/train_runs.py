@@ -68,13 +68,13 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
     if isinstance(settings, config.ArigTraining) and options.order is not None:
         raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
     _spare(options, checkpoint.WEIGHTS, "arig" if isinstance(settings, config.ArigTraining) else "listener")
+    began_s = time.monotonic()
     with run_of(options) as run:
-        began_s = time.monotonic()
         if isinstance(settings, config.ArigTraining):
             return _timed(train_arig(settings, options.data, options.out, run), began_s)
         figures = listener.train_listener(settings, options.data, options.out, run, options.order)
-        _calibrate(settings, options)
-        return _timed(figures, began_s)
+    _calibrate(settings, options)
+    return _timed(figures, began_s)
 
 
 def _calibrate(settings: config.Training, options: TrainOptions) -> None:

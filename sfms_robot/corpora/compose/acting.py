@@ -20,7 +20,6 @@ EYE_TILT_RAD: Final = np.deg2rad(20)
 NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay below 1800 deg/s^2
 _FADE: Final = FRAME_HZ
 _GLANCE_S: Final = 1.5
-_LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
 _MIRROR: Final = [
     BLENDSHAPES.index(
         name.replace("Left", "\0").replace("Right", "Left").replace("\0", "Right")

@@ -215,16 +215,16 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._ticks = self._conversion.to_ticks(np.clip(angle, self._lowest, self._highest))
 
     def torque_off(self, policy: StopPolicy) -> None:
-        """End the pulses now, but of joints whose safety says hold; refuse goals until the next `enable`.
+        """End the pulses now, but of joints whose safety says hold; goals are withheld until the next `enable`.
 
         For any thread or signal handler, any time. Never raises, waits for no answer; blocks while bytes are handed
         to the port and, where that was lost, while it is opened. A board that is away is switched off by `poll` when
-        it is back.
+        it is back. With the policy "hold" nothing happens.
         """
-        limp = [servo.id for servo in self._servos if policy == "release" and servo.safety.stop == "release"]
-        self._off = tuple(dict.fromkeys((*(self._off or ()), *limp)))  # first of all: whoever sends now, looks here
-        self._enabled, self._switched_off, self._pending = [], [], False
-        self._sent = {}
+        if policy == "hold":
+            return
+        self._off = tuple(servo.id for servo in self._servos if servo.safety.stop == "release")  # first of all
+        self._sent, self._switched_off = {}, []
         self._pulses = {channel: ticks for channel, ticks in self._pulses.items() if channel not in self._off}
         self._send_off()
 
@@ -247,12 +247,13 @@ class PulseBus(WireBus[RateLimitedPort]):
             wire.port.close()
 
     def stop(self, policy: StopPolicy) -> None:
-        """As `torque_off`, then ask the board whether its pulses are off, and repeat it. Never raises.
+        """As `torque_off`, then ask the board whether its pulses are off, and repeat it; refuse goals. Never raises.
 
         Blocks for 0.5 s at most; what was sent before may take part of that to leave. Only one thread at a time.
         """
         self.torque_off(policy)
-        if not self._off or (self._link is None and self._lost_s is None):
+        self._enabled, self._switched_off, self._pending = [], [], False
+        if policy == "hold" or not self._off or (self._link is None and self._lost_s is None):
             return
         wire = self._link or self._open_again()
         until_s = wire.port.now_s() + _STOP_S if wire is not None else 0.0
@@ -286,10 +287,12 @@ class PulseBus(WireBus[RateLimitedPort]):
     def write(self, goals_rad: Doubles, now_s: float) -> None:
         """Goals of all joints; those of joints that are not enabled are left out.
 
-        Raises ValueError, with nothing sent, before `enable` and after torque off, for a goal that is not finite, or
-        one out of range. While the port is gone nothing is sent and nothing is raised.
+        Raises ValueError, with nothing sent, before `enable` and after `stop`, for a goal that is not finite, or one
+        out of range. While the port is gone, and after `torque_off`, nothing is sent and nothing is raised.
         """
-        self._check(bool(self._enabled) and self._off is None)
+        self._check(bool(self._enabled))
+        if self._off is not None:
+            return
         self._ticks = self._goals.ticks(goals_rad, np.array(self._enabled, np.intp))
         self._pending = True
         try:
@@ -404,7 +407,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         """After a silence: channels that the board has switched off meanwhile come on one at a time, if it tells."""
         self._sent = {}
         pulses = self._protocol.read_pulses(wire.exchange, self._channels)
-        if pulses is None:
+        if pulses is None or self._off is not None:
             return
         self._pulses = pulses
         self._switched_off = [index for index in self._enabled if not pulses.get(self._channels[index])]

@@ -113,6 +113,11 @@ class ChainBus(WireBus[L], Generic[L]):
         return {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
 
     @property
+    def members(self) -> Sequence[Member]:
+        """In bus order: for looking at."""
+        return self._members
+
+    @property
     def poll_budget_s(self) -> float:
         """Time that a poll may take, whatever is lost: see `status_poll`."""
         return self._poll.budget_s

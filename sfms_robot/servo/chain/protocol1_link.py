@@ -152,6 +152,8 @@ class Frame1Link(RegisterLink):
         closed: list[int] = []
         for servo in late[:_FENCES]:
             if self._fence(servo):
+                for each in servos:  # nothing older than that answer can come, from nobody
+                    self._owed.pop(each, None)
                 break
             closed.append(servo)
         else:
@@ -159,8 +161,6 @@ class Frame1Link(RegisterLink):
         asked = [servo for servo in servos if servo not in closed]
         if not asked:
             return {}
-        for servo in asked:
-            self._owed.pop(servo, None)
         self._send(BROADCAST, *request(asked))
         return self._answers(asked, length)
 

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Faults, LoadRule, Safety, Threshold, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.policy import BusServo, LoadWatch, Measured, counts, load_rules
+from sfms_robot.servo.chain.member import FaultReporter, Member, State
+from sfms_robot.servo.policy import BusServo, Measured, counts, load_rules
+from sfms_robot.servo.registers import Table
 
 RAD_PER_TICK = 2 * np.pi / 4096
 OVERLOAD, VOLTAGE = 1 << 5, 1 << 0
@@ -106,28 +108,32 @@ def test_alert_of_a_head_at_seven_volts_is_no_fault_by_its_own_threshold(make_ri
         assert rig.bus.statistics()["faults"] == []
 
 
-def watch(**safety):
+def jaw(**safety):
     servo = BusServo("jaw", 1, load_firmware_map("xl330-m288"), -1.0, 1.0, Safety(**safety))
-    return servo, LoadWatch([servo])
+    return servo, Member(0, servo, Table.of(servo.map), Faults(), FaultReporter())
 
 
 @given(st.lists(st.floats(0, 99), min_size=1, max_size=30))
 def test_current_below_the_rule_never_breaks_it(currents_mA):
-    _, loads = watch(pinch=LoadRule(current_mA=100, for_s=0.1))
-    assert all(loads.step(0, current, 0.05 * k) is None for k, current in enumerate(currents_mA))
+    _, member = jaw(pinch=LoadRule(current_mA=100, for_s=0.1))
+    member.enabled()
+    for k, current in enumerate(currents_mA):
+        member.take_current(current, 0.05 * k)
+    assert member.state is State.ONLINE
 
 
 def test_pinch_needs_current_without_a_break():
-    _, loads = watch(pinch=LoadRule(current_mA=100, for_s=0.1))
-    assert loads.step(0, 150, 0.00) is None
-    assert loads.step(0, 50, 0.06) is None
-    assert loads.step(0, -150, 0.08) is None
-    broken = loads.step(0, -150, 0.19)
-    assert broken is not None and broken[0] == "pinched"
+    _, member = jaw(pinch=LoadRule(current_mA=100, for_s=0.1))
+    member.enabled()
+    for current_mA, now_s in ((150, 0.00), (50, 0.06), (-150, 0.08)):
+        member.take_current(current_mA, now_s)
+        assert member.state is State.ONLINE
+    member.take_current(-150, 0.19)
+    assert member.state is State.LIMP and member.fault == "pinched"
 
 
 def test_every_servo_with_a_current_sensor_has_a_pinch_rule():
-    servo, _ = watch()
+    servo, _ = jaw()
     [(name, rule)] = load_rules(servo)
     assert name == "pinched" and rule.current_mA == pytest.approx(0.6 * 1750) and rule.then == "limp"
 
@@ -165,14 +171,12 @@ def test_gains_are_set_before_torque_and_again_after_a_restart(make_rig):
         assert register(rig, 2, "position_p_gain") == 600
 
 
-@pytest.mark.parametrize(
-    ("model", "register_name", "raw"), [("xl430-w250", "goal_pwm", 442), ("xl-320", "torque_limit", 500)]
-)
-def test_torque_is_limited_where_current_cannot_be(make_rig, model, register_name, raw):
-    servos = [EmulatedServo(1, model, start_ticks=load_firmware_map(model).center_ticks)]
+def test_torque_is_limited_where_current_cannot_be_and_halved_by_a_fault(make_rig):
+    servos = [EmulatedServo(1, "xl430-w250")]
     safety = Safety(torque_limit_percent=50, on_fault="reduce")
-    with make_rig(servos, firmware_map=load_firmware_map(model), safety=safety) as rig:
+    with make_rig(servos, firmware_map=load_firmware_map("xl430-w250"), safety=safety) as rig:
         rig.ticks(rig.hold(), 3)
-        assert register(rig, 1, register_name) == raw
-        rig.bus._care._act(0, "reduce", rig.clock.t)
-        assert register(rig, 1, register_name) == raw // 2
+        assert register(rig, 1, "goal_pwm") == 442
+        rig.chain.fault(1, VOLTAGE)  # which its shutdown mask leaves out
+        rig.ticks(np.zeros(1), 20)
+        assert register(rig, 1, "goal_pwm") == 221

@@ -16,19 +16,20 @@ CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16
 SINGLE_TURN_OFFSET: Final = 1024  # no more of the homing offset counts in position mode
 _REVERSE, _PROFILE_BY_TIME, TORQUE_ON_BY_GOAL = 0x01, 0x04, 0x08
 _FULL_PWM: Final = 885.0
+_FULL_TORQUE: Final = 1000.0  # of the XL-320's torque limit, which goes to 1023
 _XL320_MODES: Final = {1: VELOCITY, 2: POSITION}
 
 
 class TickFrames:
     """The two frames of one servo, as its registers stand."""
 
-    def __init__(self, memory: RegisterFile) -> None:
-        self.mode = mode_of(memory)
-        self.sign = -1.0 if memory.get("drive_mode") & _REVERSE else 1.0
-        offset = memory.get("homing_offset")
+    def __init__(self, file: RegisterFile) -> None:
+        self.mode = mode_of(file)
+        self.sign = -1.0 if file.get("drive_mode") & _REVERSE else 1.0
+        offset = file.get("homing_offset")
         if self.mode == POSITION:
             offset = min(max(offset, -SINGLE_TURN_OFFSET), SINGLE_TURN_OFFSET)
-        turned = memory.table.ticks_per_revolution if self.sign < 0 and self.mode == POSITION else 0.0
+        turned = file.table.ticks_per_revolution if self.sign < 0 and self.mode == POSITION else 0.0
         self.offset = offset + turned
 
     def told(self, shaft: float) -> float:
@@ -38,38 +39,42 @@ class TickFrames:
         return self.sign * (told - self.offset)
 
 
-def mode_of(memory: RegisterFile) -> int:
-    if "operating_mode" in memory.table.fields:
-        return memory.get("operating_mode")
-    return _XL320_MODES.get(memory.get("control_mode"), POSITION)
+def mode_of(file: RegisterFile) -> int:
+    if "operating_mode" in file.table.fields:
+        return file.get("operating_mode")
+    return _XL320_MODES.get(file.get("control_mode"), POSITION)
 
 
-def motor_command(memory: RegisterFile, gearing: TickFrames, shaft: float, top_speed: float) -> MotorCommand | None:
+def motor_command(file: RegisterFile, frames: TickFrames, shaft: float, top_speed: float) -> MotorCommand | None:
     """What a motor under torque is told, standing at `shaft`; None in a mode that is none."""
-    table, get = memory.table, memory.get
-    if gearing.mode in (POSITION, EXTENDED, CURRENT_POSITION):
-        goal = gearing.shaft(float(get("goal_position")))
-        speed, acceleration = _profile(memory, abs(goal - shaft))
-        torque = 1.0
-        if gearing.mode == CURRENT_POSITION:
+    table, get = file.table, file.get
+    torque = min(1.0, get("torque_limit", round(_FULL_TORQUE)) / _FULL_TORQUE)
+    if frames.mode in (POSITION, EXTENDED, CURRENT_POSITION):
+        goal = frames.shaft(float(get("goal_position")))
+        speed, acceleration = _profile(file, abs(goal - shaft))
+        if frames.mode == CURRENT_POSITION:
             torque = min(1.0, abs(get("goal_current")) / max(1, get("current_limit", 1)))
         return MotorCommand(goal, top_speed, speed, acceleration, torque)
-    if gearing.mode == VELOCITY:
+    if frames.mode == VELOCITY:
         name = "goal_velocity" if "goal_velocity" in table.fields else "moving_speed"
-        wanted = gearing.sign * _ticks_s(table, name, get(name))
-        acceleration = _profile(memory, 0.0)[1]
-        return MotorCommand(min(max(wanted, -top_speed), top_speed), top_speed, 0.0, acceleration, by_speed=True)
-    if gearing.mode == PWM:
-        return MotorCommand(gearing.sign * top_speed * get("goal_pwm") / _FULL_PWM, top_speed, by_speed=True)
-    if gearing.mode == CURRENT:
-        share = get("goal_current") / max(1, get("current_limit", 1))
-        return MotorCommand(gearing.sign * top_speed * share, top_speed, torque=min(1.0, abs(share)), by_speed=True)
+        wanted = frames.sign * _ticks_s(table, name, get(name))
+        acceleration = _profile(file, 0.0)[1]
+        return MotorCommand(
+            min(max(wanted, -top_speed), top_speed), top_speed, 0.0, acceleration, torque, by_speed=True
+        )
+    if frames.mode == PWM:
+        return MotorCommand(frames.sign * top_speed * get("goal_pwm") / _FULL_PWM, top_speed, by_speed=True)
+    if frames.mode == CURRENT:
+        fraction = get("goal_current") / max(1, get("current_limit", 1))
+        return MotorCommand(
+            frames.sign * top_speed * fraction, top_speed, torque=min(1.0, abs(fraction)), by_speed=True
+        )
     return None
 
 
-def _profile(memory: RegisterFile, distance: float) -> tuple[float, float]:
+def _profile(file: RegisterFile, distance: float) -> tuple[float, float]:
     """Profile velocity and acceleration in ticks and seconds; 0 = no limit."""
-    table, get = memory.table, memory.get
+    table, get = file.table, file.get
     if "profile_velocity" not in table.fields:
         name = "moving_speed"
         return (_ticks_s(table, name, abs(get(name))) if name in table.fields else 0.0), 0.0

@@ -1,0 +1,36 @@
+"""A voice agent: sound in from your microphone or call, sound out to your loudspeaker, and a head that listens."""
+
+import sys
+import wave
+
+import numpy as np
+
+import sfms_robot as sr
+from sfms_robot.data import data_dir
+
+RATE_HZ, PIECE_S = 48_000, 0.02  # as a browser or a telephone call hands it over
+
+
+def microphone(seconds: float) -> np.ndarray:
+    """Stands for yours: a recorded person, int16."""
+    with wave.open(str(data_dir("sim") / "speakers" / "katie" / "speech.wav")) as file:
+        voice = np.frombuffer(file.readframes(file.getnframes()), np.int16)
+        step = file.getframerate() / RATE_HZ
+    return voice[(np.arange(round(seconds * RATE_HZ)) * step).astype(int) % len(voice)]
+
+
+def text_to_speech(text: str) -> np.ndarray:
+    """Stands for yours: half a second of something, float -1..1 at 24 kHz."""
+    return 0.1 * np.sin(2 * np.pi * 180 * np.arange(12_000) / 24_000)
+
+
+heard = microphone(float(sys.argv[1]) if len(sys.argv) > 1 else 15.0)
+piece = round(RATE_HZ * PIECE_S)
+with sr.Robot("face28", port="sim", listener="sfms-small") as robot:
+    robot.on("nod", lambda nod: robot.say(text_to_speech("mm-hm"), rate_hz=24_000))  # play it 40 ms later
+    for start in range(0, len(heard), piece):
+        robot.hear(heard[start : start + piece], rate_hz=RATE_HZ)
+        if robot.wait(PIECE_S):  # your audio callback brings its own time
+            break
+report = robot.report()
+print(report["frames"], "frames heard,", report["motion"])

@@ -1,0 +1,113 @@
+"""A listener without a robot: one 40 ms frame of a person in, now and then a plan out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sfms_robot.errors import InputError
+from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
+from sfms_robot.ports import Listener
+
+
+def load_listener(name: str | Path) -> LoadedListener:
+    """A listener by shipped name, folder, or the name under which another package registers its own.
+
+    Blocks while its library (torch, for those that ship) and its weights load, a second or two. Raises ConfigError,
+    ModelError.
+    """
+    from sfms_robot.listeners import registry  # torch comes with what it loads
+
+    return LoadedListener(registry.load_listener(name))
+
+
+class LoadedListener:
+    """Weights and the pure functions of `ports.Listener`; `stream` holds what they hand on."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+
+    @property
+    def hop(self) -> int:
+        """A new plan is made every `hop` frames."""
+        return self._listener.hop
+
+    @property
+    def horizon(self) -> int:
+        """Frames in a plan."""
+        return self._listener.horizon
+
+    def start(self, seed: int) -> Any:
+        """Memory of a stream that has heard nothing."""
+        return self._listener.start(seed)
+
+    def step(self, speaker: SpeakerFrame, memory: Any) -> tuple[Plan | None, Any]:
+        """See `ports.Listener`."""
+        return self._listener.step(speaker, memory)
+
+    def stream(self, seed: int = 0) -> ListenerStream:
+        """A conversation that begins now. Streams of one listener know nothing of one another."""
+        return ListenerStream(self, seed)
+
+
+class ListenerStream:
+    """One person being listened to. Its time is that of the frames pushed: frame i ends at (i + 1) x 40 ms.
+
+    One thread at a time.
+    """
+
+    def __init__(self, listener: Listener, seed: int) -> None:
+        self._listener = listener
+        self._memory = listener.start(seed)
+        self._frames = 0
+
+    @property
+    def time_s(self) -> float:
+        """End of the last frame pushed."""
+        return self._frames / FRAME_HZ
+
+    def push(
+        self, audio: ArrayLike | None, face: FaceFrame | ArrayLike | None = None, agent_audio: ArrayLike | None = None
+    ) -> Plan | None:
+        """Take the next 40 ms; a plan on every `hop`-th frame, None between.
+
+        Blocks for as long as the listener computes. What is refused changes nothing: the stream goes on.
+
+        Args:
+            audio: (640,) mono 16 kHz, -1..1; None or empty without a microphone.
+            face: the person's face at the end of the frame, as (58,) motion or a FaceFrame; None where it is not seen.
+            agent_audio: (640,) what the robot itself says during the next frame; None when it does not speak.
+
+        Raises InputError for another number of samples or channels, and for what is not finite.
+        """
+        time_s = (self._frames + 1) / FRAME_HZ
+        said = None if agent_audio is None else _samples("agent_audio", agent_audio)
+        heard = np.zeros(0, np.float32) if audio is None else _samples("audio", audio)
+        frame = SpeakerFrame(time_s, heard, _face(face, time_s), said)
+        plan, self._memory = self._listener.step(frame, self._memory)
+        self._frames += 1
+        return plan
+
+
+def _samples(name: str, audio: ArrayLike) -> Floats:
+    samples = np.asarray(audio, np.float32)
+    if samples.shape not in ((0,), (FRAME_SAMPLES,)):
+        raise InputError(f"{name} has shape {samples.shape}: 40 ms of mono sound at 16 kHz are ({FRAME_SAMPLES},)")
+    if not np.isfinite(samples).all():
+        raise InputError(f"{name}[{int(np.argmin(np.isfinite(samples)))}] is not finite")
+    return samples
+
+
+def _face(face: FaceFrame | ArrayLike | None, time_s: float) -> FaceFrame | None:
+    if face is None:
+        return None
+    motion = face.motion if isinstance(face, FaceFrame) else np.asarray(face, np.float32)
+    if motion.shape != (MOTION_DIM,):
+        raise InputError(f"face has shape {motion.shape}: pose 6 and blendshapes 52 are ({MOTION_DIM},)")
+    if not np.isfinite(motion).all():
+        raise InputError(f"face[{int(np.argmin(np.isfinite(motion)))}] is not finite")
+    jaw_rad = face.jaw_rad if isinstance(face, FaceFrame) else None
+    return FaceFrame(time_s, motion[:6], motion[6:], jaw_rad)

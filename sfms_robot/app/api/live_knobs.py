@@ -1,0 +1,88 @@
+"""How much each region of a head shows, turned while it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from threading import Lock
+
+from sfms_robot.config import Head
+from sfms_robot.errors import InputError
+from sfms_robot.retarget.mapping import Knobs
+from sfms_robot.retarget.mapping import Mapping as Face
+
+
+class Knob:
+    """`intensity` and `style` of one region, 0..2, 1 for as it is. What is set holds from the next tick on.
+
+    Setting raises InputError for a value outside 0..2.
+    """
+
+    def __init__(self, knobs: LiveKnobs, region: str) -> None:
+        self._knobs, self._region = knobs, region
+
+    @property
+    def intensity(self) -> float:
+        """How large: 0 nothing, 1 as mapped, 2 twice, within the range of every joint."""
+        return self._knobs.values["intensity"][self._region]
+
+    @intensity.setter
+    def intensity(self, value: float) -> None:
+        self._knobs.set("intensity", self._region, value)
+
+    @property
+    def style(self) -> float:
+        """How small motion comes out: 0 it vanishes, 1 as mapped, 2 doubled; large motion stays as it is."""
+        return self._knobs.values["style"][self._region]
+
+    @style.setter
+    def style(self, value: float) -> None:
+        self._knobs.set("style", self._region, value)
+
+    def __repr__(self) -> str:
+        return f"Knob({self._region!r}, intensity={self.intensity:g}, style={self.style:g})"
+
+
+class LiveKnobs:
+    """Regions of a head by name. May be turned from any thread.
+
+    Attributes:
+        values: region -> value, of "intensity" and of "style".
+        now: what the loop asks for at every tick.
+    """
+
+    def __init__(self, head: Head, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
+        self._face = Face(head)
+        self._lock = Lock()
+        self._regions = tuple(head.regions)
+        self.values = {
+            kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()}
+            for kind in ("intensity", "style")
+        }
+        self.now: Knobs = self._face.knobs()
+        for kind, given in (("intensity", intensity), ("style", style)):
+            for region, value in given.items():
+                self._region(region)
+                self.set(kind, region, value)
+
+    def set(self, kind: str, region: str, value: float) -> None:
+        """Raises InputError for a value outside 0..2."""
+        if not 0 <= value <= 2:
+            raise InputError(f"{kind} of {region} = {value:g} is not in 0..2")
+        with self._lock:
+            self.values = {**self.values, kind: {**self.values[kind], region: float(value)}}
+            self.now = self._face.knobs(self.values["intensity"], self.values["style"])
+
+    def _region(self, name: str) -> str:
+        if name not in self._regions:
+            raise InputError(f"{name!r} is not a region of this head ({', '.join(self._regions) or 'none'})")
+        return name
+
+    def __getitem__(self, region: str) -> Knob:
+        """Raises InputError for a name that is no region."""
+        return Knob(self, self._region(region))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._regions)
+
+    def __len__(self) -> int:
+        return len(self._regions)

@@ -1,0 +1,249 @@
+"""A head that listens, as an object: the loop in a thread of its own, worked from any other.
+
+person  ->  hear, see, say      what a program hears and sees; or a source that a run has
+face    ->  show, look_at       laid over what the listener planned, under the same limits
+plans   ->  on                  nods, blinks and smiles before the servos do them
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from sfms_robot.app.api.background import Background, Report
+from sfms_robot.app.api.live_knobs import LiveKnobs
+from sfms_robot.app.api.named_head import head_name
+from sfms_robot.app.session import RunOptions, prepare_head, run
+from sfms_robot.app.wiring import SIM
+from sfms_robot.config import Head, load_head
+from sfms_robot.errors import ConfigError, InputError, RobotError
+from sfms_robot.frames import FaceFrame, Floats
+from sfms_robot.listeners.thread import ListenerThread
+from sfms_robot.ports import Listener, Observer, Source
+from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.puppet import Puppet
+from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
+from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.sources.push import Pcm, PushSource
+from sfms_robot.sources.validated import ValidatedSource
+
+log = logging.getLogger(__name__)
+
+PUSH: Final = "push"
+EVENTS_LIMIT_S: Final = 1.0  # how long `stop` waits for callbacks
+
+
+class Robot:
+    """A run of `sfms-robot run`, with its options by name, in a thread of its own.
+
+    `with Robot(...) as robot:` or `Robot(...).start()` and `stop()`: from then on the head moves, until `stop`. In a
+    script, a notebook or any thread; no signal is touched. Methods may be called from any thread, none of them
+    waits for the loop but `start`, `wait` and `stop`.
+
+    Args:
+        head: shipped name, folder, or what `load_head` gave.
+        port: "sim" for emulated servos, "auto", a device, or NAME=DEVICE[,NAME=DEVICE].
+        listener: shipped name, folder, a name that another package registers; or an object that implements
+            `Listener`, which is then stepped in a thread of this process.
+        audio: "push" for what `hear`, `see` and `say` hand over; else a source that `run --audio` knows.
+        face, agent_audio: as `run --face`, `--agent-audio`, beside another source than "push".
+        source: an object that implements `Source`, instead of `audio`, `face` and `agent_audio`. Its `read` is called
+            in the loop: it must not block.
+        duration_s: seconds after which it ends by itself; None for that of the source.
+        fast: virtual time on emulated servos, as fast as they compute; not with "push".
+        seed: of everything that is drawn at random.
+        record: folder for the recording; `overwrite` for one that has a recording already.
+        yes: hobby servos may jump when they come on.
+        without: joints that are left alone.
+        intensity, style: of regions, as in `knobs`.
+
+    Raises ConfigError, PortError, InputError for what cannot be right, before anything is opened.
+    """
+
+    def __init__(
+        self,
+        head: Head | str = "face28",
+        *,
+        port: str = SIM,
+        listener: Listener | str | Path = "sfms-small",
+        audio: str = PUSH,
+        face: str = "auto",
+        agent_audio: str = "none",
+        source: Source | None = None,
+        duration_s: float | None = None,
+        fast: bool = False,
+        seed: int = 0,
+        record: Path | str | None = None,
+        overwrite: bool = False,
+        yes: bool = False,
+        without: Sequence[str] = (),
+        intensity: Mapping[str, float] | None = None,
+        style: Mapping[str, float] | None = None,
+    ) -> None:
+        pushed = source is None and audio == PUSH
+        if pushed and (face, agent_audio) != ("auto", "none"):
+            raise InputError('with audio="push" the face comes by see() and the robot\'s own voice by say()')
+        if pushed and fast:
+            raise InputError('fast=True needs another source than audio="push": what a program hears takes real time')
+        own = listener if not isinstance(listener, (str, Path)) else None
+        self._options = RunOptions(
+            head=head_name(head), port=port, listener=type(own).__name__ if own is not None else str(listener),
+            audio="none" if pushed else audio, face=face, agent_audio=agent_audio, duration_s=duration_s, fast=fast,
+            seed=seed, record=None if record is None else Path(record), overwrite=overwrite, yes=yes,
+            without=tuple(without),
+        )  # fmt: skip
+        prepare_head(self._options.servos)
+        config = load_head(self._options.head)
+        self._listener = own
+        self._push = PushSource() if pushed else None
+        inner = self._push if pushed else source
+        self._source = None if inner is None else ValidatedSource(inner)
+        self._hears = audio if source is None else type(source).__name__
+        self._events = EventWatch()
+        self._puppet = Puppet(config.life.gaze, frozenset(HeadRetargeter(config).blind_channels))
+        self._knobs = LiveKnobs(config, intensity or {}, style or {})
+        self._run: Background | None = None
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """`stop`. Does not hide an exception that is on its way."""
+        try:
+            self.stop()
+        except RobotError as failure:
+            if error is None:
+                raise
+            log.error("%s", failure)
+
+    def start(self) -> Self:
+        """Open the head, torque on, listen. Blocks until the first tick, a second or three. Raises RobotError."""
+        if self._run is not None:
+            raise ConfigError("this robot was started before: make another Robot")
+        self._run = Background(self._drive)
+        self._run.start()
+        return self
+
+    def wait(self, limit_s: float | None = None) -> bool:
+        """Block until it has ended by itself, or for `limit_s`: whether it has."""
+        return self._run is None or self._run.wait(limit_s)
+
+    def stop(self) -> None:
+        """Come to rest, torque off. Blocks until then, 4 s at most once it has started; idempotent.
+
+        Raises once, as RobotError, what ended the run before.
+        """
+        if self._run is not None:
+            try:
+                self._run.stop()
+            finally:
+                self._events.close()
+                self._events.join(EVENTS_LIMIT_S)
+
+    def release(self) -> None:
+        """Torque off now, without coming to rest: for emergencies. Does not wait, raises nothing."""
+        if self._run is not None:
+            self._run.release()
+
+    # --- what the robot hears and sees ---
+
+    def hear(self, pcm: Pcm, rate_hz: float) -> None:
+        """The person's voice: the next piece of sound, of any length. Never blocks.
+
+        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. Sound that has
+        waited for more than a second is left out. Raises ConfigError for another type, shape or rate.
+        """
+        self._pushed("hear").hear(pcm, rate_hz)
+
+    def see(self, face: FaceFrame | Floats | None) -> None:
+        """The person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms. Never blocks.
+
+        Raises ConfigError for another shape.
+        """
+        self._pushed("see").see(face)
+
+    def say(self, pcm: Pcm, rate_hz: float) -> None:
+        """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
+
+        Play it one frame (40 ms) after it is handed over. Up to two minutes may wait. Never blocks.
+        """
+        self._pushed("say").say(pcm, rate_hz)
+
+    def _pushed(self, what: str) -> PushSource:
+        if self._push is None:
+            raise InputError(f'{what}() needs audio="push"; this robot listens to {self._hears!r}')
+        return self._push
+
+    # --- what the face shows ---
+
+    def show(self, face58: Floats | Mapping[str, float], seconds: float = 0.5) -> None:
+        """A face (58,), or some channels by name, over what the listener asks for; for `seconds`, then it goes back.
+
+        Rises in 0.25 s, falls in 0.35 s, under the same limits as all motion; a newer one takes over where it is. Never
+        blocks. Raises InputError for what is no face.
+        """
+        self._puppet.show(face58, seconds)
+
+    def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float = 2.0) -> None:
+        """Look at a point for `seconds`, in metres from the middle of the head: x forward, y to its left, z up.
+
+        Eyes first, then the head with its share. Never blocks. Raises InputError for what is no point.
+        """
+        self._puppet.look_at(x_m, y_m, z_m, seconds)
+
+    @property
+    def knobs(self) -> LiveKnobs:
+        """Regions of the head: `robot.knobs["neck"].intensity = 0.5`, `.style`, 0..2."""
+        return self._knobs
+
+    # --- what it does ---
+
+    def on(self, kind: str, callback: Callable[[MotionEvent], object]) -> None:
+        """Call `callback` when a plan holds a "nod", a "blink" or a "smile", before the servos do it.
+
+        It is called in a thread of its own, one event after the other; one that raises is detached and named in the
+        log. Raises InputError for another kind.
+        """
+        self._events.on(kind, callback)
+
+    @property
+    def state(self) -> str:
+        """ "starting", "listening", "stopping", "stopped" or "fault" (ended by an error, which `stop` raises)."""
+        return "stopped" if self._run is None else self._run.state
+
+    def report(self) -> dict[str, Any]:
+        """The report of `run --json`; while it runs, those of its keys that are known, with "exit": "running"."""
+        if self._run is not None and self._run.report is not None:
+            return {**self._run.report, "callbacks_detached": dict(self._events.detached)}
+        seen = None if self._run is None else self._run.progress
+        options = self._options
+        return {
+            "version": 1, "head": Path(options.head).name, "listener": Path(options.listener).name,
+            "port": options.port, "seed": options.seed, "exit": "running",
+            "duration_s": seen.seen.time_s if seen is not None and seen.seen is not None else 0.0,
+            "frames": 0 if seen is None else seen.frames, "ticks": 0 if seen is None else seen.ticks,
+            "callbacks_detached": dict(self._events.detached),
+        }  # fmt: skip
+
+    def _drive(self, interrupt: Interrupt, progress: Observer) -> Report:
+        with ExitStack() as stack:
+            feed = None
+            if self._listener is not None:
+                feed = ListenerThread(self._listener, self._options.seed)
+                stack.callback(feed.close)
+            return run(
+                self._options,
+                source=self._source,
+                feed=feed,
+                observers=[progress, self._events],
+                knobs=lambda _: lambda: self._knobs.now,
+                overlay=self._puppet.overlay,
+                interrupt=interrupt,
+                signals=False,
+            )

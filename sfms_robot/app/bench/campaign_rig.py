@@ -1,0 +1,208 @@
+"""Emulated servos of every family, driven as the loop does it, in virtual time, and an onlooker outside the bus."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.config import Head, load_firmware_map
+from sfms_robot.emulator.launch import Chain
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import Doubles, Reading
+from sfms_robot.motion.calibration import Calibration
+from sfms_robot.motion.limits import JerkLimiter, JointLimits
+from sfms_robot.ports import Bus
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.servo.families import family_named
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port, VirtualTimePort
+
+RATE_HZ: Final = 100.0
+LIMIT_DEG: Final = 40.0
+RECOVERY_S: Final = 2.0  # after the fault is over
+_DEADLINE_S: Final = 0.003
+_WAVE_RAD, _WAVE_S = 0.4, 4.0
+_STALE_TICKS: Final = 3  # rounding, and what the servo moves while it answers
+_FRESH_S: Final = 0.3
+_FOLLOWS_RAD: Final = 0.15
+
+# Family -> (bus family, model, ids, baud).
+FAMILIES: Final[Mapping[str, tuple[str, str, Sequence[int], int]]] = {
+    "dynamixel2": ("dynamixel", "xl330-m288", (1, 2, 3, 4), 1_000_000),
+    "dynamixel1": ("dynamixel1", "ax-12a", (1, 2, 3, 4), 1_000_000),
+    "dynamixel1-mx": ("dynamixel1", "mx-28-1.0", (1, 2, 3, 4), 1_000_000),
+    "sts": ("feetech", "sts3215", (1, 2, 3, 4), 1_000_000),
+    "scs": ("feetech", "scs0009", (1, 2, 3, 4), 1_000_000),
+    "maestro": ("maestro", "maestro-24", (0, 1, 2, 5), 115_200),
+    "ssc32": ("ssc32", "ssc-32", (0, 1, 2, 5), 115_200),
+}
+
+
+def head_of(family: str, reconnect_s: float | None = None) -> Head:
+    """Four joints of a family on the bus `main`; with `reconnect_s` on two buses, `main` and `other`, which fail then.
+
+    Raises ConfigError for an unknown family.
+    """
+    if family not in FAMILIES:
+        raise ConfigError.at("campaign", "family", family, "is not a family", FAMILIES)
+    kind, model, ids, baud = FAMILIES[family]
+    center = load_firmware_map(model).center_ticks
+    bus: dict[str, Any] = {"family": kind, "baud": baud, "rate_hz": RATE_HZ}
+    if reconnect_s is None:
+        buses, names = {"main": bus}, ["main"] * len(ids)
+    else:
+        bus["reconnect_s"] = reconnect_s
+        buses, names = {"main": bus, "other": bus}, ["main", "main", "other", "other"]
+    joint = {"model": model, "zero_ticks": center, "limits": "all"}
+    reach = {"min_deg": -LIMIT_DEG, "max_deg": LIMIT_DEG}
+    plain: dict[str, Any] = {
+        "name": "campaign",
+        "description": f"four {model}",
+        "buses": buses,
+        "limits": {"all": {"speed_deg_s": 120, "acceleration_deg_s2": 1500, "jerk_deg_s3": 90000}},
+        "joints": {f"joint{i}": {**joint, **reach, "id": i, "bus": on} for i, on in zip(ids, names, strict=True)},
+    }
+    return Head.model_validate(plain)
+
+
+class Rig:
+    """Emulated servos of one family, their bus, and the way of the loop to it."""
+
+    def __init__(self, head: Head, chains: Mapping[str, Chain], clock: VirtualClock, bus: Bus) -> None:
+        self.chains, self.clock, self.bus = chains, clock, bus
+        self.ids = [joint.id for joint in head.joints.values()]
+        self._wires = [chains[joint.bus] for joint in head.joints.values()]
+        turns = np.array([load_firmware_map(j.model).ticks_per_revolution for j in head.joints.values()])
+        self.conversion = Calibration(head.joints, turns)
+        self._limiter = JerkLimiter(JointLimits.of(head), 1.0 / RATE_HZ)
+        self.tells_position = all("position" in told for told in self.bus.capabilities.values())
+
+    def hold(self) -> None:
+        self.bus.connect()
+        held = self.bus.enable(self.bus.joints)
+        self._state = self._limiter.start(held)
+        self._centre = np.clip(held, -0.1, 0.1)
+        self._began_s = self.clock.now_s()
+        self.goals: Doubles = held
+
+    def tick(self) -> Mapping[str, Reading]:
+        """One turn of the loop: limiter, write, poll; who came back is led from where it stands."""
+        self.clock.wait_until(self.clock.now_s() + 1.0 / RATE_HZ)
+        now_s = self.clock.now_s()
+        self.goals, self._state = self._limiter.step(self._wave(now_s - self._began_s), self._state)
+        self.bus.write(self.goals, now_s)
+        readings = self.bus.poll(now_s)
+        back = np.array([reading.rejoined for reading in readings.values()])
+        if back.any():
+            stands = [
+                g if r.position_rad is None else r.position_rad
+                for g, r in zip(self.goals, readings.values(), strict=True)
+            ]
+            self._state = self._limiter.restart(back, np.array(stands), self._state)
+        return readings
+
+    def _wave(self, time_s: float) -> Doubles:
+        """Reference (3, J): angle, speed, acceleration of a wave that begins at rest where the joints are held."""
+        turn = 2 * math.pi / _WAVE_S
+        phase = turn * time_s
+        way = np.where(np.arange(len(self.ids)) % 2, -1.0, 1.0) * _WAVE_RAD
+        angle = self._centre + way * math.sin(phase)
+        return np.array([angle, way * turn * math.cos(phase), -way * turn * turn * math.sin(phase)])
+
+    def refuses(self, reading: Reading) -> int:
+        """Bad goals of the last joint that are not refused; its goals are withheld while its `reading` has a fault."""
+        out_of_range = (
+            () if reading.fault is not None else (math.radians(LIMIT_DEG) + 0.5, -math.radians(LIMIT_DEG) - 0.5)
+        )
+        accepted = 0
+        for bad in (math.nan, math.inf, *out_of_range):
+            goals = self.goals.copy()
+            goals[-1] = bad
+            try:
+                self.bus.write(goals, self.clock.now_s())
+            except ValueError:
+                continue
+            accepted += 1
+        return accepted
+
+    def states(self) -> list[dict[str, Any]]:
+        """What an onlooker sees of every servo now."""
+        for chain in self.chains.values():
+            chain.time_is(self.clock.now_s())
+        return [chain.state(servo) for chain, servo in zip(self._wires, self.ids, strict=True)]
+
+
+class Judge:
+    """Looks at the servos after every tick, but those of joints `away`, of whom nothing is expected any more.
+
+    A joint that was found outside its range may be sent anywhere between there and its range, and never out again.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self.away: frozenset[int] = frozenset()
+        found = np.rint([state["position"] for state in rig.states()])
+        self._low = np.minimum(rig.conversion.low_ticks, found)
+        self._high = np.maximum(rig.conversion.high_ticks, found)
+        self._shafts: list[Doubles] = []
+        self._slack_rad = _STALE_TICKS / np.abs(rig.conversion.ticks_per_rad)
+        self.outside = self.stale = 0
+        self.well_since_s: float | None = None
+        self.named: list[str] = []
+
+    def see(self, readings: Mapping[str, Reading]) -> None:
+        rig, states = self._rig, self._rig.states()
+        shafts = rig.conversion.to_rad(np.array([state["position"] for state in states]))
+        self._shafts.append(shafts)
+        for index, state in enumerate(states):
+            if state["torque"] and state["goal"] is not None:
+                self._see_goal(index, state["goal"])
+        for index, reading in enumerate(readings.values()):
+            self.stale += self._misdated(index, reading)
+        seen = [(i, joint, r) for i, (joint, r) in enumerate(readings.items()) if i not in self.away]
+        self.named = [f"{joint}: {r.fault}" for _, joint, r in seen if r.fault is not None]
+        fine = [self._well(i, r, states[i], shafts[i]) for i, _, r in seen]
+        if not all(fine):
+            self.well_since_s = None
+        elif self.well_since_s is None:
+            self.well_since_s = rig.clock.now_s()
+
+    def _see_goal(self, index: int, goal: float) -> None:
+        self.outside += not self._low[index] <= goal <= self._high[index]
+        self._low[index] = max(self._low[index], min(goal, self._rig.conversion.low_ticks[index]))
+        self._high[index] = min(self._high[index], max(goal, self._rig.conversion.high_ticks[index]))
+
+    def _misdated(self, index: int, reading: Reading) -> bool:
+        """Whether the servo stood elsewhere at the time that the reading names."""
+        if reading.position_rad is None or not math.isfinite(reading.age_s):
+            return False
+        back = round(reading.age_s * RATE_HZ)
+        if back >= len(self._shafts):
+            return False  # from before the first tick
+        return bool(abs(reading.position_rad - self._shafts[-1 - back][index]) > self._slack_rad[index])
+
+    def _well(self, index: int, reading: Reading, state: Mapping[str, Any], shaft_rad: float) -> bool:
+        if reading.fault is not None:
+            return True  # out of the game, and says why
+        told = not self._rig.tells_position or reading.age_s < _FRESH_S
+        return told and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
+
+
+def bus_on(head: Head, chain: Chain, clock: VirtualClock, wrap: Callable[[Port], Port]) -> Bus:
+    """The bus `main` of a head, alone, on a port that is wrapped in another one."""
+    config = head.buses["main"]
+    maps = {joint.model: load_firmware_map(joint.model) for joint in head.joints.values()}
+    servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in head.joints.items()]
+    turns = np.array([maps[joint.model].ticks_per_revolution for joint in head.joints.values()])
+    open_port = partial(VirtualTimePort, chain.device, chain.control, config.baud, clock)
+    family = family_named(config.family)
+    more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
+    bus: Bus = family.bus_class()(
+        "main", servos, Calibration(head.joints, turns), lambda: wrap(open_port()), config.baud, _DEADLINE_S,
+        config=config, **more,
+    )  # fmt: skip
+    return bus

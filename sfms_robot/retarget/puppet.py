@@ -1,0 +1,284 @@
+"""What a program asks the face to show, laid over what the listener planned: a face, or a point to look at.
+
+    show       each channel goes from the listener's value to the one asked for, stays, and goes back
+    look_at    the eyes jump to the point, the head follows with its share, and the eyes give back what it brings
+
+Each channel has a weight: 0 leaves the listener's value, 1 is the value asked for. A weight rises and falls by smooth
+steps and is 0 again in the end, so that a face that nobody works is the listener's, bit for bit. What is asked for anew
+begins where the channel is.
+
+Commands come from any thread and count from the latest instant of the tick that finds them: joints look ahead by
+different leads, and no instant that was already played is changed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from threading import Lock
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.config import Gaze
+from sfms_robot.errors import InputError
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, POSE, SHAPES, Doubles, Floats
+from sfms_robot.retarget.eyes import directions, smooth, turn
+
+RISE_S: Final = 0.25  # listener -> face
+CHANGE_S: Final = 0.12  # one face asked for -> the next; straight, so that a stream of them flows
+FALL_S: Final = 0.35
+EYES_S: Final = 0.1  # a saccade of 30 degrees
+HEAD_S: Final = 0.6  # a head turn that follows it
+HEAD_SHARE: Final = 0.6  # of the direction; the eyes keep the rest
+LARGEST_POSE: Final = np.array([math.pi, math.pi, math.pi, 1.0, 1.0, 1.0])  # rad, m
+_AXES: Final = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
+_NEVER_S: Final = -math.inf
+
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Weights (C,) over time: from `start` up to 1 in `rise_s`, and down to 0 in `fall_s` from `until_s` (C,) on."""
+
+    start: Doubles
+    began_s: Doubles
+    until_s: Doubles
+    rise_s: float
+    fall_s: float
+
+    @classmethod
+    def zero(cls, size: int, rise_s: float, fall_s: float) -> Ramp:
+        return cls(np.zeros(size), np.full(size, _NEVER_S), np.full(size, _NEVER_S), rise_s, fall_s)
+
+    def at(self, times_s: Doubles) -> Doubles:
+        """(N, C)."""
+        times = times_s[:, None]
+        risen = self.start + (1.0 - self.start) * smooth((times - self.began_s) / self.rise_s)
+        weight: Doubles = risen * (1.0 - smooth((times - self.until_s) / self.fall_s))
+        return weight
+
+    def hold(self, which: Bools, now_s: float, seconds: Doubles | float) -> Ramp:
+        """`which` (C,) bool go up from where they are and stay for `seconds`; those still up only stay."""
+        falling = which & (self.until_s <= now_s)
+        start = np.where(falling, self.at(np.array([now_s]))[0], self.start)
+        began = np.where(falling, now_s, self.began_s)
+        until = np.where(which, now_s + self.rise_s + seconds, self.until_s)
+        return Ramp(start, began, until, self.rise_s, self.fall_s)
+
+    def over(self, time_s: float) -> bool:
+        """Whether all weights are 0 from `time_s` on."""
+        return bool((self.until_s + self.fall_s <= time_s).all())
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A face (58,) per channel: `before` until `since_s`, then straight to `after`."""
+
+    ramp: Ramp
+    before: Doubles
+    after: Doubles
+    since_s: float
+
+    def values(self, times_s: Doubles) -> Doubles:
+        """(N, 58)."""
+        share = np.clip((times_s - self.since_s) / CHANGE_S, 0.0, 1.0)[:, None]
+        value: Doubles = self.before + share * (self.after - self.before)
+        return value
+
+    def then(self, face: Doubles, which: Bools, seconds: Doubles, now_s: float) -> Shown:
+        """The same, with `which` (58,) bool of `face` (58,) asked for from now on."""
+        here = np.array([now_s])
+        value, up = self.values(here)[0], self.ramp.at(here)[0] > 0
+        after = np.where(which, face, self.after)
+        return Shown(self.ramp.hold(which, now_s, seconds), np.where(which & ~up, face, value), after, now_s)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A direction (yaw, pitch) [rad] that eyes or head are turned to: from `before` on in `ramp.rise_s` to `after`."""
+
+    ramp: Ramp
+    before_rad: Doubles
+    after_rad: Doubles
+    since_s: float
+
+    @classmethod
+    def none(cls, rise_s: float, fall_s: float) -> Turn:
+        return cls(Ramp.zero(2, rise_s, fall_s), np.zeros(2), np.zeros(2), 0.0)
+
+    def directions_rad(self, times_s: Doubles) -> Doubles:
+        """(N, 2)."""
+        share = smooth((times_s - self.since_s) / self.ramp.rise_s)[:, None]
+        direction: Doubles = self.before_rad + share * (self.after_rad - self.before_rad)
+        return direction
+
+    def then(self, direction_rad: Doubles, seconds: float, now_s: float) -> Turn:
+        """The same, turned to another direction from now on, for `seconds`."""
+        here = np.array([now_s])
+        before = np.where(self.ramp.at(here)[0] > 0, self.directions_rad(here)[0], direction_rad)
+        return Turn(self.ramp.hold(np.ones(2, bool), now_s, seconds), before, direction_rad, now_s)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """What holds from `since_s` on."""
+
+    since_s: float
+    shown: Shown
+    eyes: Turn
+    head: Turn
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What was asked for since the last tick; each channel's last word.
+
+    Attributes:
+        face, which, seconds: (58,) of `show`; `which` is bool.
+        direction_rad, look_s: of `look_at`; None when nobody did.
+    """
+
+    face: Doubles
+    which: Bools
+    seconds: Doubles
+    direction_rad: Doubles | None = None
+    look_s: float = 0.0
+
+
+_NOTHING: Final = _Asked(np.zeros(MOTION_DIM), np.zeros(MOTION_DIM, bool), np.zeros(MOTION_DIM))
+
+
+class Puppet:
+    """`show` and `look_at` from any thread; `overlay` from the loop.
+
+    Args:
+        gaze: how far eyes turn, and what share of the head's turn they take back.
+        blind: channels that the head does not show; without eyes the head turns all the way, without a neck the eyes.
+    """
+
+    def __init__(self, gaze: Gaze | None = None, blind: frozenset[str] = frozenset()) -> None:
+        gaze = gaze or Gaze()
+        self._full_rad = np.radians([gaze.full_yaw_deg, gaze.full_pitch_deg])
+        eyeless = [{"eyeLookOutLeft", "eyeLookInLeft"} <= blind, {"eyeLookUpLeft", "eyeLookDownLeft"} <= blind]
+        stiff = ["yaw" in blind, "pitch" in blind]
+        self._head_share = np.where(stiff, 0.0, np.where(eyeless, 1.0, HEAD_SHARE))
+        self._gain = np.where(stiff, 0.0, gaze.neck_gain)
+        self._asked = _NOTHING
+        self._lock = Lock()
+        still = np.zeros(MOTION_DIM)
+        shown = Shown(Ramp.zero(MOTION_DIM, RISE_S, FALL_S), still, still, 0.0)
+        self._pieces = [_Piece(_NEVER_S, shown, Turn.none(EYES_S, FALL_S), Turn.none(HEAD_S, HEAD_S))]
+
+    def show(self, face: Floats | Mapping[str, float], seconds: float) -> None:
+        """A whole face (58,), or some channels by name, for `seconds` once it has risen. Never blocks.
+
+        Raises InputError for an unknown channel, a value that is not finite, a blendshape outside 0..1, a pose beyond
+        pi or 1 m, and `seconds` that is not a positive number.
+        """
+        values, which = _channels(face)
+        checked_s = _checked_seconds(seconds)
+        with self._lock:
+            before = self._asked
+            self._asked = replace(
+                before,
+                face=np.where(which, values, before.face),
+                which=which | before.which,
+                seconds=np.where(which, checked_s, before.seconds),
+            )
+
+    def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float) -> None:
+        """A point in metres from the middle of the head: x forward, y to its left, z up. Never blocks.
+
+        Raises InputError for a point that is not finite, or nearer than a centimetre, and for `seconds` as `show`.
+        """
+        point = np.array([x_m, y_m, z_m], np.float64)
+        if not np.isfinite(point).all() or math.hypot(*point) < 0.01:
+            raise InputError(f"look_at({x_m:g}, {y_m:g}, {z_m:g}) is no point in front of a head, in metres")
+        direction_rad = np.array([math.atan2(y_m, x_m), -math.atan2(z_m, math.hypot(x_m, y_m))])
+        checked_s = _checked_seconds(seconds)
+        with self._lock:
+            self._asked = replace(self._asked, direction_rad=direction_rad, look_s=checked_s)
+
+    def overlay(self, motion: Floats, times_s: Doubles) -> Floats:
+        """Motion (N, 58) at (N,) instants -> the same with what was asked for. Never changes its input."""
+        self._take(float(times_s.min()), float(times_s.max()))
+        if len(self._pieces) == 1 and self._idle(self._pieces[0], float(times_s.min())):
+            return motion
+        out = motion.copy()
+        starts = [piece.since_s for piece in self._pieces]
+        which = np.searchsorted(starts, times_s, side="right") - 1
+        for index, piece in enumerate(self._pieces):
+            rows = np.flatnonzero(which == index)
+            if len(rows):
+                out[rows] = self._laid_over(piece, motion[rows], times_s[rows])
+        return out
+
+    def _take(self, earliest_s: float, latest_s: float) -> None:
+        """Commands begin at the latest instant of this tick; pieces that no later instant asks for are dropped."""
+        with self._lock:
+            asked, self._asked = self._asked, _NOTHING
+        if asked is not _NOTHING:
+            now = self._pieces[-1]
+            since_s = max(latest_s, now.since_s)
+            shown = now.shown.then(asked.face, asked.which, asked.seconds, since_s)
+            eyes, head = now.eyes, now.head
+            if asked.direction_rad is not None:
+                eyes = eyes.then(asked.direction_rad, asked.look_s, since_s)
+                head = head.then(asked.direction_rad, asked.look_s, since_s)
+            self._pieces.append(_Piece(since_s, shown, eyes, head))
+        while len(self._pieces) > 1 and self._pieces[1].since_s <= earliest_s:
+            self._pieces.pop(0)
+
+    def _idle(self, piece: _Piece, time_s: float) -> bool:
+        return all(part.ramp.over(time_s) for part in (piece.shown, piece.eyes, piece.head))
+
+    def _laid_over(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
+        shown = piece.shown
+        weight = shown.ramp.at(times_s)
+        out = np.where(weight > 0, motion + weight * (shown.values(times_s) - motion), motion)
+        out = out.astype(np.float32)
+        looking = np.flatnonzero((piece.eyes.ramp.at(times_s) + piece.head.ramp.at(times_s)).any(axis=1))
+        if len(looking):
+            out[looking] = self._looking(piece, out[looking], times_s[looking])
+        return out
+
+    def _looking(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
+        """`motion` (N, 58) with head and eyes turned, in place."""
+        turned = piece.head.directions_rad(times_s) * self._head_share
+        motion[:, _AXES] += (piece.head.ramp.at(times_s) * (turned - motion[:, _AXES])).astype(np.float32)
+        wanted = piece.eyes.directions_rad(times_s) - self._gain * motion[:, _AXES]
+        both = directions(motion, self._full_rad)  # (N, eye, axis)
+        middle = both.mean(axis=1)
+        turn(motion, both + (piece.eyes.ramp.at(times_s) * (wanted - middle))[:, None], self._full_rad)
+        return motion
+
+
+def _channels(face: Floats | Mapping[str, float]) -> tuple[Doubles, Bools]:
+    """Values (58,) and which of them are asked for (58,) bool."""
+    which = np.ones(MOTION_DIM, bool)
+    if isinstance(face, Mapping):
+        if unknown := sorted(set(face) - set(CHANNELS)):
+            raise InputError(f"show: {unknown[0]!r} is not a channel ({', '.join(CHANNELS)})")
+        which = np.array([name in face for name in CHANNELS])
+        values = np.array([face.get(name, 0.0) for name in CHANNELS], np.float64)
+    else:
+        values = np.asarray(face, np.float64)
+    if values.shape != (MOTION_DIM,):
+        raise InputError(f"show: a face has shape {values.shape}; pose 6 and blendshapes 52 are ({MOTION_DIM},)")
+    fits = np.isfinite(values)
+    fits[POSE] &= np.abs(values[POSE]) <= LARGEST_POSE
+    fits[SHAPES] &= (values[SHAPES] >= 0) & (values[SHAPES] <= 1)
+    if not fits.all():
+        worst = int(np.argmin(fits))
+        raise InputError(f"show: {CHANNELS[worst]} = {values[worst]:g} is not a number in its range")
+    return values, which
+
+
+def _checked_seconds(seconds: float) -> float:
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise InputError(f"seconds = {seconds:g} is not a positive number")
+    return seconds

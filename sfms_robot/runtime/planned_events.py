@@ -1,0 +1,179 @@
+"""Nods, blinks and smiles in the plans of a listener, found before the servos do them.
+
+The planned frames, newest over oldest, are one motion at 25 Hz; the detectors of `signals.events` look at its last
+seconds after every plan. A nod or a blink is told when a plan holds it whole, a smile when it has lasted 0.4 s;
+each once.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.errors import InputError
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.signals.events import Event, find_blinks, find_nods, find_smiles
+
+log = logging.getLogger(__name__)
+
+WINDOW: Final = 8 * FRAME_HZ  # frames that are looked at; no nod is longer
+NEWS: Final = 2 * FRAME_HZ  # what ended longer ago than this many frames is no news: the window's edge made it
+MOST_WAITING: Final = 10 * FRAME_HZ  # plans
+_PITCH: Final = CHANNEL_INDEX["pitch"]
+_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
+_SMILES: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
+
+
+@dataclass(frozen=True)
+class MotionEvent:
+    """Something that the listener's plans hold.
+
+    Attributes:
+        kind: "nod", "blink" or "smile".
+        start_s, end_s: when the face does it, in the run's time; a smile goes on for longer.
+        size: peak to peak [rad] of a nod, else 0..1.
+    """
+
+    kind: str
+    start_s: float
+    end_s: float
+    size: float
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """How an event shows: the signal of motion (N, 58), its detector, and whether it has to be over to be told."""
+
+    signal: Callable[[Floats], Floats]
+    find: Callable[[Doubles, float], list[Event]]
+    whole: bool
+
+
+EVENTS: Final = {
+    "nod": _Kind(lambda motion: motion[:, _PITCH], find_nods, whole=True),
+    "blink": _Kind(lambda motion: motion[:, _BLINKS].max(axis=1), find_blinks, whole=True),
+    "smile": _Kind(lambda motion: motion[:, _SMILES].mean(axis=1), find_smiles, whole=False),
+}
+
+
+class PlannedEvents:
+    """Plans in, events out. Remembers `WINDOW` frames."""
+
+    def __init__(self) -> None:
+        self._signals = np.zeros((len(EVENTS), 0))
+        self._first = 0  # index, in frames of 40 ms, of the first column
+        self._told_until_s: dict[str, float] = {}
+
+    def add(self, plan: Plan) -> list[MotionEvent]:
+        """Events that this plan completes, in the order in which they begin."""
+        self._join(plan)
+        found = [event for row, kind in enumerate(EVENTS) for event in self._new(kind, self._signals[row])]
+        return sorted(found, key=lambda event: event.start_s)
+
+    def _join(self, plan: Plan) -> None:
+        columns = np.array([kind.signal(plan.frames) for kind in EVENTS.values()], np.float64)
+        begins = round(float(plan.times_s[0]) * FRAME_HZ)
+        known = self._signals.shape[1]
+        if not known or not 0 <= begins - self._first <= known + WINDOW:  # the first plan, or another time altogether
+            self._signals, self._first, known = columns[:, :0], begins, 0
+            self._told_until_s = dict.fromkeys(EVENTS, float("-inf"))
+        at = begins - self._first
+        if at > known:  # nothing was planned meanwhile: the face stays
+            self._signals = np.pad(self._signals, ((0, 0), (0, at - known)), mode="edge")
+        joined = np.concatenate([self._signals[:, :at], columns], axis=1)
+        self._first += max(0, joined.shape[1] - WINDOW)
+        self._signals = joined[:, -WINDOW:]
+
+    def _new(self, name: str, signal: Doubles) -> list[MotionEvent]:
+        kind, begins_s, last_s = EVENTS[name], self._first / FRAME_HZ, (len(signal) - 1) / FRAME_HZ
+        news = []
+        for start, end, size in kind.find(signal, FRAME_HZ):
+            if end < last_s - NEWS / FRAME_HZ or (kind.whole and end > last_s - 0.5 / FRAME_HZ):
+                continue
+            if begins_s + start > self._told_until_s[name]:
+                news.append(MotionEvent(name, float(begins_s + start), float(begins_s + end), float(size)))
+            self._told_until_s[name] = max(self._told_until_s[name], begins_s + end)
+        return news
+
+
+class EventWatch:
+    """A `ports.Observer` that tells events to callbacks, in a thread of its own: the loop only hands it the plans.
+
+    Callbacks run one after the other. One that raises is detached and named; plans that a slow one makes wait for
+    longer than ten seconds are left out.
+
+    Attributes:
+        detached: callbacks that raised, and what.
+    """
+
+    def __init__(self) -> None:
+        self._callbacks: list[tuple[str, Callable[[MotionEvent], object]]] = []
+        self._plans: deque[Plan] = deque(maxlen=MOST_WAITING)
+        self._changed = threading.Condition()
+        self._closing = False
+        self._thread: threading.Thread | None = None
+        self.detached: dict[str, str] = {}
+
+    def on(self, kind: str, callback: Callable[[MotionEvent], object]) -> None:
+        """Call `callback` with every `MotionEvent` of a kind. Raises InputError for an unknown kind."""
+        if kind not in EVENTS:
+            raise InputError(f"on({kind!r}): no such event ({', '.join(EVENTS)})")
+        with self._changed:
+            self._callbacks.append((kind, callback))
+            if self._thread is None and not self._closing:
+                self._thread = threading.Thread(target=self._work, name="events", daemon=True)
+                self._thread.start()
+
+    def planned(self, plan: Plan) -> None:
+        with self._changed:
+            if self._thread is not None:
+                self._plans.append(plan)
+                self._changed.notify()
+
+    def tick(self, seen: Tick) -> None:
+        """Plans say it earlier."""
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        """Only the listener's own motion counts."""
+
+    def close(self) -> None:
+        """What has been planned is still told. Does not wait for it: a callback may be what closes."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+
+    def join(self, limit_s: float) -> None:
+        """After `close`: wait until everything has been told."""
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(limit_s)
+
+    def _work(self) -> None:
+        events = PlannedEvents()
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._plans or self._closing)
+                if not self._plans:
+                    return
+                plan = self._plans.popleft()
+            for event in events.add(plan):
+                self._tell(event)
+
+    def _tell(self, event: MotionEvent) -> None:
+        for entry in tuple(self._callbacks):
+            kind, callback = entry
+            if kind != event.kind:
+                continue
+            try:
+                callback(event)
+            except Exception as error:
+                self._callbacks.remove(entry)
+                name = getattr(callback, "__qualname__", repr(callback))
+                self.detached[name] = f"{type(error).__name__}: {error}"
+                log.warning("on(%r) %s raised and is detached: %s", kind, name, self.detached[name], exc_info=True)

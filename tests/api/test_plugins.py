@@ -1,0 +1,92 @@
+"""A package of somebody else's adds listeners and buses by name: a real one, with its dist-info, beside ours."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+import sfms_robot as sr
+
+PACKAGE = """
+import numpy as np
+import sfms_robot as sr
+
+class Nodder:
+    hop, horizon = 1, 1
+
+    def __init__(self, size):
+        self.size = float(size or 0.1)
+
+    def start(self, seed):
+        return None
+
+    def step(self, speaker, memory):
+        frames = np.zeros((1, 58), np.float32)
+        frames[0, 1] = self.size * np.sin(2 * np.pi * 1.5 * speaker.time_s)
+        return sr.Plan(speaker.time_s, np.array([speaker.time_s + 0.04]), frames), memory
+"""
+
+FAMILY = """
+from sfms_robot.servo.families import BusFamily
+
+FAMILY = BusFamily("Somebody's servos", "somebodys_servos:Bus", ("somebodys", None))
+
+class Bus: ...
+"""
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """A folder as pip leaves it: the module, and METADATA and entry_points.txt of its distribution."""
+    (tmp_path / "somebodys_nods.py").write_text(PACKAGE)
+    info = tmp_path / "somebodys_nods-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: somebodys-nods\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[sfms_robot.listeners]\nnodder = somebodys_nods:Nodder\nbroken = somebodys_nods:Missing\n"
+        "sfms-small = somebodys_nods:Nodder\n"
+        "[sfms_robot.buses]\nsomebodys = somebodys_servos:FAMILY\n"
+    )
+    (tmp_path / "somebodys_servos.py").write_text(FAMILY)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+def test_a_listener_of_another_package_is_loaded_by_its_name(installed):
+    listener = sr.load_listener("nodder:0.2")
+    plan = listener.stream().push(None)
+    assert listener.hop == 1 and plan is not None and plan.frames.shape == (1, 58)
+
+
+def test_shipped_names_go_first(installed):
+    assert sr.load_listener("sfms-small").horizon == 8
+
+
+def test_one_that_cannot_be_imported_says_which(installed):
+    with pytest.raises(sr.ConfigError, match="'broken': somebodys_nods:Missing cannot be imported"):
+        sr.load_listener("broken")
+
+
+def test_an_unknown_name_is_refused_with_the_shipped_ones(installed):
+    with pytest.raises(sr.ConfigError, match="'nope' is neither .*sfms-small"):
+        sr.load_listener("nope")
+
+
+def test_a_run_listens_with_it_in_its_own_process(installed):
+    here = {**os.environ, "XDG_CONFIG_HOME": str(installed), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    arguments = ["run", "--head", "reachy_mini", "--listener", "nodder:0.15", "--duration", "2", "--json"]
+    command = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert '"listener_state": {"state": "listening"' in done.stdout.splitlines()[-1]
+
+
+def test_a_bus_family_of_another_package_is_in_the_table(installed):
+    code = (
+        "from sfms_robot.servo.families import family_named\n"
+        "family = family_named('somebodys'); print(family.title, family.bus_class())"
+    )
+    here = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
+    assert done.stdout.strip() == "Somebody's servos <class 'somebodys_servos.Bus'>", done.stderr

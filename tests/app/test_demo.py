@@ -1,0 +1,36 @@
+"""`sfms-robot demo` in virtual time."""
+
+import json
+
+import pytest
+
+from sfms_robot.app.listen.demo import DemoOptions, compare_seeds, free_folder
+from sfms_robot.cli.main import main
+
+
+@pytest.mark.slow
+def test_the_demo_draws_what_it_saw(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("vtkmodules")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["demo", "--fast", "--head", "op3_head", "--duration", "20", "--json"])
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert ended.value.code == 0 and told["exit"] == "done" and told["nods"] >= 1 and told["neck_travel_deg"] > 10
+    assert told["pictures"] == ["sfms-demo/run.png", "sfms-demo/head.png"]
+    assert all((tmp_path / png).stat().st_size > 10_000 for png in told["pictures"])
+    assert (tmp_path / "sfms-demo" / "run.mcap").is_file()
+
+
+def test_a_second_demo_writes_beside_the_first(tmp_path):
+    first = tmp_path / "sfms-demo"
+    for name in ("sfms-demo", "sfms-demo-2", "sfms-demo-3"):
+        assert free_folder(first) == tmp_path / name
+        (tmp_path / name).mkdir()
+
+
+def test_seeds_are_told_one_by_one():
+    seen = []
+    told = compare_seeds(DemoOptions("op3_head", duration_s=1.0, fast=True), 2, seen.append)
+    assert [row["seed"] for row in seen] == [0, 1] == [row["seed"] for row in told["runs"]]
+    assert told["exit"] == "done" and told["exit_code"] == 0

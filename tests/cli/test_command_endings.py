@@ -1,0 +1,146 @@
+"""How every command ends when it cannot do its work: a line on stderr, an exit code, and with --json an object."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import typer
+
+from sfms_robot.cli import main as command_line
+from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
+
+START = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()"]
+HEAVY = {"torch", "scipy", "numpy", "matplotlib", "vtkmodules", "ruckig"}
+
+
+@pytest.fixture
+def command(capsys, monkeypatch):
+    """A command line whose `listener list` raises what it is given; (code, stdout, stderr)."""
+
+    def run(raised: BaseException | None, *words: str) -> tuple[object, str, str]:
+        def body(json: bool = typer.Option(False, "--json")) -> None:
+            if raised is not None:
+                raise raised
+
+        app = typer.Typer()
+        app.command("breaks")(body)
+        app.command("other")(body)
+        monkeypatch.setattr(command_line, "app", app)
+        with pytest.raises(SystemExit) as ended:
+            command_line.main(list(words))
+        out, err = capsys.readouterr()
+        return ended.value.code, out, err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (ConfigError("a file"), 2, "a file"),
+        (PortError("a port"), 3, "a port"),
+        (BusError("a bus"), 4, "a bus"),
+        (ModelError("weights"), 5, "weights"),
+        (FileNotFoundError(2, "No such file", "x.yaml"), 2, "x.yaml: No such file"),
+        (OSError(28, "No space left on device"), 1, "No space left on device"),
+        (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero"),
+        (EOFError(), 1, "there is nobody to answer (stdin ended)"),
+    ],
+)
+def test_a_failure_is_a_line_and_with_json_an_object(command, error, code, text):
+    ended, out, err = command(error, "breaks", "--json")
+    assert ended == code and err.splitlines()[-1] == f"sfms-robot: {text}"
+    assert json.loads(out.splitlines()[-1]) == {"version": 1, "exit": "failed", "error": text, "exit_code": code}
+    assert command(error, "breaks")[1] == ""
+
+
+def test_an_interruption_is_130_without_a_word(command):
+    ended, out, err = command(KeyboardInterrupt(), "breaks", "--json")
+    assert (ended, err) == (130, "") and json.loads(out)["exit"] == "interrupted"
+
+
+def test_a_command_that_said_how_it_ended_is_not_spoken_for(command):
+    assert command(typer.Exit(4), "breaks", "--json") == (4, "", "")
+    assert command(None, "breaks", "--json") == (0, "", "")
+
+
+def test_a_flag_that_is_none_is_an_object_too(command):
+    ended, out, err = command(None, "breaks", "--json", "--nope")
+    assert ended == 2 and "--nope" in err and json.loads(out)["exit_code"] == 2
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_a_full_disk_behind_stdout_is_one_line():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*START, "listener", "list"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.strip() == "sfms-robot: No space left on device"
+
+
+def test_a_reader_that_has_gone_is_no_error_worth_a_word():
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as pipe:
+        done = subprocess.run([*START, "speaker", "list"], stdout=pipe, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("words", [["-v", "listener", "list"], ["listener", "list", "--verbose"]])
+def test_verbose_stands_before_and_after_the_command(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        command_line.main([*words, "--json"])
+    assert ended.value.code == 0 and json.loads(capsys.readouterr().out)["listeners"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["--port", "/dev/ttyNowhere"], 3),
+        (["--head", "nope"], 2),
+        (["--listener", "nope"], 2),
+        (["--audio", "nope.wav"], 2),
+        (["--face", "nope.csv"], 2),
+    ],
+)
+def test_a_slip_of_the_keyboard_is_found_before_anything_is_loaded(words, code):
+    program = (
+        "import sys; from sfms_robot.cli.main import main\n"
+        f"try: main(['run', *{words!r}])\n"
+        "except SystemExit as ended: code = ended.code\n"
+        f"loaded = {HEAVY!r} & set(sys.modules)\n"
+        "sys.exit(f'loaded {loaded}' if loaded else code)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+    assert words[1] in done.stderr
+
+
+def test_a_head_that_is_not_there_is_named_as_it_was_given(capsys):
+    for words in (["head", "check", "nope"], ["run", "--head", "nope"]):
+        with pytest.raises(SystemExit):
+            command_line.main(words)
+        assert capsys.readouterr().err.startswith("sfms-robot: head 'nope' is neither a shipped name nor a folder")
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "key"),
+    [("head", "face28", "heads"), ("listener", "sfms-small", "listeners"), ("speaker", "katie", "speakers")],
+)
+def test_what_there_is_has_a_line_each(capsys, group, name, key):
+    for words in ([group, "list"], [group, "list", "--json"]):
+        with pytest.raises(SystemExit) as ended:
+            command_line.main(words)
+        assert ended.value.code == 0
+        out = capsys.readouterr().out
+        assert name in out
+    assert all(row["description"] for row in json.loads(out)[key])
+
+
+def test_a_shell_completes_names_of_heads():
+    words = {"_SFMS_ROBOT_COMPLETE": "complete_bash", "COMP_WORDS": "sfms-robot run --head rea", "COMP_CWORD": "3"}
+    program = "import sys; sys.argv[0] = 'sfms-robot'; from sfms_robot.cli.main import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program], env={**os.environ, **words}, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["reachy_mini"], done.stderr

@@ -1,0 +1,40 @@
+"""Every example runs as it stands, in a plain interpreter, and is short."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "examples"
+RUNS = {
+    "retarget.py": ([], "neck_yaw"),
+    "own_listener.py": (["2"], "'nods':"),
+    "own_source.py": (["1"], "25 frames heard"),
+    "servos_alone.py": ([], "arrived: True"),
+    "puppeteer.py": (["0.5"], "'blinks':"),
+    "voice_agent.py": (["1.5"], "frames heard"),
+}
+
+
+def test_every_example_is_tried_and_under_forty_lines():
+    assert {path.name for path in FOLDER.glob("*.py")} == set(RUNS)
+    for path in FOLDER.glob("*.py"):
+        assert len(path.read_text(encoding="utf-8").splitlines()) < 40, path.name
+
+
+SLOW = ("puppeteer.py", "voice_agent.py")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in RUNS])
+def test_an_example_runs(name, tmp_path):
+    arguments, said = RUNS[name]
+    here = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(FOLDER / name), *arguments],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env=here, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert said in done.stdout
+    assert "Traceback" not in done.stderr, done.stderr

@@ -1,0 +1,70 @@
+"""One of two buses fails for good: the other eases its joints to rest, and torque goes off. In virtual time."""
+
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.head.pose import HeldFace, NobodyThere, parse_face
+from sfms_robot.app.session import build_bus, build_motion
+from sfms_robot.app.wiring import emulated
+from sfms_robot.config import load_head
+from sfms_robot.emulator.launch import launch
+from sfms_robot.errors import BusError
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Parts, drive
+
+GIVES_UP_S = 6.0
+WHOLE = load_head("open_duck_mini_v2_head")
+HEAD = WHOLE.model_copy(
+    update={"buses": {name: bus.model_copy(update={"reconnect_s": GIVES_UP_S}) for name, bus in WHOLE.buses.items()}}
+)
+RATE_HZ = max(bus.rate_hz for bus in HEAD.buses.values())
+
+
+class Unplugger:
+    """An observer that pulls one adapter after two seconds, and keeps the goals."""
+
+    def __init__(self, chain):
+        self._chain, self.goals, self._pulled = chain, [], False
+
+    def tick(self, seen):
+        self.goals.append((seen.time_s, seen.goals_rad))
+        if seen.time_s > 2.0 and not self._pulled:
+            self._pulled = True
+            self._chain.hang_up()
+
+    def heard(self, frame): ...
+
+    def planned(self, plan): ...
+
+    def close(self): ...
+
+
+@pytest.mark.parametrize(("dead", "alive"), [("antennas", "neck"), ("neck", "antennas")])
+def test_the_bus_that_works_comes_to_rest(dead, alive):
+    clock, motion = VirtualClock(), build_motion(HEAD, RATE_HZ)
+    with ExitStack() as stack:
+        chains = {name: stack.enter_context(launch(servos, True)) for name, servos in emulated(HEAD).items()}
+        bus = build_bus(HEAD, chains, clock)
+        bus.connect()
+        stack.callback(bus.close)
+        log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
+        watcher = Unplugger(chains[dead])
+        parts = Parts(
+            NobodyThere(), NobodyThere(), HeldFace(parse_face(["pitch=0.2", "browInnerUp=1"]), 60.0),
+            motion.retargeter, motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
+        )  # fmt: skip
+        with pytest.raises(BusError, match=dead):
+            drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=60.0, interrupted=lambda: False)
+        mine = [(j.id, j.zero_ticks) for j in HEAD.joints.values() if j.bus == alive]
+        states = {servo: chains[alive].state(servo) for servo, _ in mine}
+    ended_s, last_rad = watcher.goals[-1]
+    assert 2.0 + GIVES_UP_S <= ended_s < 2.0 + GIVES_UP_S + 1.0
+    rest_rad = np.array([joint.rest_rad for joint in HEAD.joints.values()])
+    assert np.abs(last_rad - rest_rad).max() > 0.05  # the face was somewhere else
+    assert log.eased >= RATE_HZ and log.audited.violations == 0
+    if alive == "neck":
+        assert all(states[servo]["torque"] == 0 for servo, _ in mine)
+        assert all(abs(states[servo]["position"] - zero) <= 6 for servo, zero in mine)

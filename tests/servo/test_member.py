@@ -1,0 +1,295 @@
+"""One servo's states: a test per arrow of the diagram in docs/safety.md. Without a wire, times are given."""
+
+import pytest
+
+from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
+from sfms_robot.errors import ServoError
+from sfms_robot.servo.chain import member as rules
+from sfms_robot.servo.chain.member import FaultReporter, Member, State
+from sfms_robot.servo.chain.startup import Silent
+from sfms_robot.servo.policy import BusServo, Measured
+from sfms_robot.servo.registers import Table
+
+OVERLOAD = 1 << 5
+STANDS = 2100
+
+
+class Way:
+    """How a servo starts up again: ends with where it stands, or as `failure` says."""
+
+    can_reboot = True
+
+    def __init__(self):
+        self.failure = None
+        self.asked = []
+
+    def bring_back(self, index, reboot):
+        self.asked.append(reboot)
+        yield 0.5 if reboot else 0.0
+        if self.failure is not None:
+            raise self.failure
+        return STANDS
+
+
+@pytest.fixture
+def way():
+    return Way()
+
+
+@pytest.fixture
+def member(way):
+    return made(way)
+
+
+def made(way, **safety):
+    """An enabled servo."""
+    servo = BusServo("jaw", 4, load_firmware_map("xl330-m288"), -1.0, 1.0, Safety(**safety))
+    member = Member(0, servo, Table.of(servo.map), Faults(), FaultReporter())
+    member.attach(way)
+    member.connected()
+    member.enabled()
+    return member
+
+
+def run(member, now_s):
+    """All steps of its job that are due; the time is the caller's."""
+    while member.due(now_s):
+        member.step(now_s)
+
+
+def silent(member, now_s=0.0):
+    member.suspect(now_s)
+    member.probe_failed(now_s)
+
+
+def fails(member, now_s=0.0):
+    member.take_bits(OVERLOAD, Measured(), now_s)
+
+
+def test_off_to_online_by_enable(way):
+    member = made(way)
+    assert member.state is State.ONLINE and member.gets_goals
+
+
+def test_online_to_silent_when_a_probe_is_in_vain_and_not_before(member):
+    member.suspect(0.0)
+    assert member.state is State.ONLINE and not member.presence.listed
+    member.probe_failed(0.05)
+    assert member.state is State.SILENT and not member.gets_goals and member.fault == "no answer"
+
+
+def test_one_lost_answer_is_forgiven_and_the_second_is_not(member):
+    assert not member.unanswered(0.0)
+    member.answered()
+    assert not member.unanswered(0.1)
+    assert member.unanswered(0.2)
+
+
+def test_silent_to_returning_to_rejoining_to_online(member):
+    silent(member)
+    assert member.answered()
+    member.back(1.0)
+    assert member.state is State.RETURNING and not member.gets_goals
+    run(member, 1.0)
+    assert member.state is State.REJOINING and member.rejoined and member.fault is None and not member.gets_goals
+    assert not member.accepts(STANDS + 50)
+    assert member.accepts(STANDS + 5)
+    assert member.state is State.ONLINE and member.gets_goals
+
+
+def test_off_to_silent_by_enable_of_one_that_is_absent(way):
+    member = made(way)
+    member.absent()
+    member.awaited()
+    assert member.state is State.SILENT and member.fault == "no answer"
+    member.answered()
+    member.back(3.0)
+    run(member, 3.0)
+    assert member.state is State.REJOINING and member.identified
+
+
+def test_returning_to_silent_and_again(member):
+    silent(member)
+    member.back(1.0)
+    silent(member, 1.1)
+    assert member.state is State.SILENT and member.job is None
+
+
+def test_returning_goes_on_after_a_silence_of_its_own(member, way):
+    silent(member)
+    member.back(1.0)
+    way.failure = Silent("no answer")
+    run(member, 1.0)
+    assert member.state is State.RETURNING
+    way.failure = None
+    run(member, 1.0 + rules.RETRY_S - 0.01)
+    assert member.state is State.RETURNING
+    run(member, 1.0 + rules.RETRY_S)
+    assert member.state is State.REJOINING
+
+
+def test_returning_to_given_up_when_it_refuses_again_and_again(member, way):
+    way.failure = ServoError("is another model")
+    silent(member)
+    member.back(0.0)
+    now_s = 0.0
+    for _ in range(rules.ATTEMPTS + 1):
+        run(member, now_s)
+        now_s += rules.REFUSED_S
+    assert member.state is State.GIVEN_UP and member.fault == "left alone" and member.torque_wanted is False
+
+
+def test_given_up_to_online_by_enable(member, way):
+    test_returning_to_given_up_when_it_refuses_again_and_again(member, way)
+    member.enabled()
+    assert member.state is State.ONLINE and member.fault is None
+
+
+@pytest.mark.parametrize(
+    ("policy", "state"),
+    [("limp", State.LIMP), ("hold", State.FAULTY), ("reduce", State.REDUCED), ("reboot_and_ease_in", State.REBOOTING)],
+)
+def test_online_by_a_fault_to_what_the_head_says(way, policy, state):
+    member = made(way, on_fault=policy)
+    fails(member)
+    assert member.state is state and member.fault == "overload"
+    assert member.gets_goals is (state is State.REDUCED)
+    fails(member)
+    assert member.state is state  # once
+
+
+def test_online_by_a_fault_to_limp_for_a_while_where_there_is_no_reboot(way):
+    way.can_reboot = False
+    member = made(way, on_fault="reboot_and_ease_in")
+    fails(member)
+    assert member.state is State.LIMP
+    member.take_torque(False, 0.1)
+    run(member, rules.LIMP_S)
+    assert member.state is State.REJOINING
+
+
+def test_rebooting_to_rejoining_and_silence_meanwhile_is_no_absence(way):
+    member = made(way, on_fault="reboot_and_ease_in")
+    fails(member)
+    assert way.asked == [] or way.asked == [True]
+    run(member, 0.0)
+    silent(member, 0.1)
+    assert member.state is State.REBOOTING
+    run(member, 0.5)
+    assert member.state is State.REJOINING and way.asked == [True]
+
+
+@pytest.mark.parametrize(("then", "state"), [("limp", State.LIMP), ("hold", State.FAULTY), ("reduce", State.REDUCED)])
+def test_online_by_a_load_rule(way, then, state):
+    member = made(way, pinch=LoadRule(current_mA=100, for_s=0.1, then=then))
+    member.take_current(150, 0.0)
+    member.take_current(150, 0.1)
+    assert member.state is state and member.fault == "pinched"
+
+
+def test_limp_stays_to_be_released_until_the_servo_says_so(way):
+    member = made(way, on_fault="limp")
+    fails(member)
+    assert member.to_release
+    member.take_torque(True, 0.0)  # as it was before anything was written
+    assert member.fault == "overload"
+    member.off_written = True
+    member.take_torque(True, 0.1)
+    assert member.to_release
+    member.take_torque(False, 0.2)
+    assert not member.to_release
+
+
+def test_limp_to_returning_after_its_time_and_not_before_it_is_seen_limp(way):
+    member = made(way, pinch=LoadRule(current_mA=100, for_s=0.1, then="limp"))
+    member.take_current(150, 0.0)
+    member.take_current(150, 0.1)
+    run(member, 0.1 + rules.LIMP_S)
+    assert member.state is State.LIMP
+    member.take_torque(False, 4.0)
+    run(member, 4.0)
+    assert member.state is State.REJOINING
+
+
+def test_limp_that_falls_silent_is_to_be_released_again(way):
+    member = made(way, on_fault="limp")
+    fails(member)
+    member.take_torque(False, 0.1)
+    silent(member, 1.0)
+    assert member.state is State.LIMP and member.to_release
+
+
+def test_online_to_returning_when_its_torque_is_gone(member):
+    member.take_torque(False, 0.0)
+    assert member.state is State.RETURNING and member.fault == "torque lost"
+
+
+def test_faulty_to_limp_when_its_own_protection_took_the_torque(way):
+    member = made(way, on_fault="hold")
+    fails(member)
+    member.take_torque(False, 0.1)
+    assert member.state is State.LIMP and member.fault == "overload"
+
+
+def test_rejoining_to_silent(member):
+    silent(member)
+    member.back(0.0)
+    run(member, 0.0)
+    silent(member, 1.0)
+    assert member.state is State.SILENT
+
+
+def test_online_to_returning_when_it_is_distrusted(member):
+    member.distrust("watchdog", 0.0)
+    assert member.state is State.RETURNING and member.fault == "watchdog"
+    run(member, 0.0)
+    assert member.state is State.REJOINING and member.fault is None
+
+
+@pytest.mark.parametrize("state", list(State))
+def test_from_any_state_to_off_by_stop(member, state):
+    member.state = state
+    member.stopped()
+    assert member.state is State.OFF and member.job is None and member.torque_wanted is None
+
+
+def test_port_that_is_gone_makes_all_silent_but_those_that_are_out(way):
+    limp, held, online = made(way, on_fault="limp"), made(way, on_fault="hold"), made(way)
+    for each in (limp, held):
+        fails(each)
+    for each in (limp, held, online):
+        each.gone()
+    assert [each.state for each in (limp, held, online)] == [State.LIMP, State.FAULTY, State.SILENT]
+
+
+def test_registers_that_differ_are_a_fault_until_they_do_not(member):
+    member.take_registers({"operating_mode": (1, 3)})
+    assert member.fault == "operating_mode reads 1, set to 3" and member.gets_goals
+    member.take_registers({})
+    assert member.fault is None
+
+
+def test_loose_contact_is_said_once_in_ten_seconds_with_a_count(member, caplog):
+    for tick in range(200):
+        member.suspect(tick * 0.1)
+        member.answered()
+        member.back(tick * 0.1)
+    said = [record.getMessage() for record in caplog.records]
+    assert said == [
+        "jaw (id 4) is silent",
+        "jaw (id 4) answers again",
+        "jaw (id 4) is silent (99 times since the last word)",
+        "jaw (id 4) answers again",
+    ]
+
+
+def test_probes_of_a_dead_servo_become_rare_and_never_stop(member):
+    member.suspect(0.0)
+    probes = []
+    for k in range(2000):
+        if member.presence.probe_s <= 0.01 * k:
+            probes.append(0.01 * k)
+            member.probe_failed(0.01 * k)
+    gaps = [b - a for a, b in zip(probes, probes[1:], strict=False)]
+    assert 15 < len(probes) < 30
+    assert gaps[0] < 0.2 and gaps[-1] == pytest.approx(rules.LONGEST_PAUSE_S, abs=0.02)
