@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     )
     from sfms_robot.frames import BLENDSHAPES, CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
     from sfms_robot.ports import Listener, Source
-    from sfms_robot.retarget.head import HeadRetargeter as Retargeter
+    from sfms_robot.retarget.head_retargeter import HeadRetargeter as Retargeter
     from sfms_robot.runtime.planned_events import MotionEvent
 
 __version__ = "0.1.0"
@@ -79,7 +79,7 @@ _NAMES: Final = {
     ),
     "frames": ("BLENDSHAPES", "CHANNELS", "FaceFrame", "Plan", "Reading", "SpeakerFrame"),
     "ports": ("Listener", "Source"),
-    "retarget.head": ("Retargeter",),
+    "retarget.head_retargeter": ("Retargeter",),
     "runtime.planned_events": ("MotionEvent",),
 }  # fmt: skip
 _MODULE_OF: Final = {name: module for module, names in _NAMES.items() for name in names}

@@ -38,8 +38,8 @@ from sfms_robot.motion.audit import Audit
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Timeline
-from sfms_robot.retarget.head import HeadRetargeter
-from sfms_robot.retarget.life import Life
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.retarget.spontaneous import Life
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog

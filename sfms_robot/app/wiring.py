@@ -13,6 +13,7 @@ from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map
 from sfms_robot.config.emulate import load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo
+from sfms_robot.emulator.sagging import sagged_rad, sagged_ticks, sagging_joints
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
@@ -21,7 +22,6 @@ from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
 from sfms_robot.servo.port_choice import AUTO, choose_ports, parse_ports
 
 SIM: Final = "sim"
-HANGING: Final = 0.3  # where an emulated joint stands at power-up: this share of the way from rest to its lower end
 
 Opened = Mapping[str, Chain | str]  # per named bus: an emulated chain, or a serial device
 
@@ -51,11 +51,16 @@ def calibration_of(joints: dict[str, Joint]) -> Calibration:
 
 
 def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
-    """Per bus, the servos of a head that was switched off: hanging a little from rest, torque off."""
+    """Per bus, the servos of a head that was switched off: sagged onto its stops, torque off."""
     by_bus: dict[str, list[EmulatedServo]] = {}
-    for name, joint in head.joints.items():
-        hanging = np.array([joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)])
-        ticks = int(calibration_of({name: joint}).to_ticks(hanging)[0])
+    calibration, sagging = calibration_of(head.joints), sagging_joints(head)
+    for index, (name, joint) in enumerate(head.joints.items()):
+        ticks = sagged_ticks(
+            sagged_rad(joint, name in sagging),
+            calibration.zero_ticks[index],
+            calibration.ticks_per_rad[index],
+            load_firmware_map(joint.model).center_ticks,
+        )
         baud = head.buses[joint.bus].baud
         servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
         by_bus.setdefault(joint.bus, []).append(servo)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.adversary import torment
+from sfms_robot.app.bench.adversary import CHUNK, adversarial, torment
 from sfms_robot.app.bench.lead import delay_ticks, delays
 from sfms_robot.app.bench.retarget import retarget
 from sfms_robot.data import data_dir, shipped_names
@@ -61,3 +61,12 @@ def test_a_tick_is_measured_part_by_part_beside_a_matrix_product():
     parts = {f"retarget.{part}" for part in ("tick", "timeline", "mapping", "limits", "calibration", "stewart")}
     assert set(rows) == parts
     assert all(row["median"] > 0 and row["ratio"] > 0 and row["unit"] == "ms" for row in rows.values())
+
+
+@pytest.mark.slow
+def test_wild_frames_are_counted_over_all_heads_and_chunks():
+    rows = adversarial(CHUNK + 1, ("poppy_head",), seed=2) | adversarial(50, ("op3_head",), seed=2)
+    assert {name: (row["frames"], row["violations"]) for name, row in rows.items()} == {
+        "retarget.wild.op3_head": (50, 0),
+        "retarget.wild.poppy_head": (CHUNK + 1, 0),
+    }

@@ -7,7 +7,7 @@ from sfms_robot.config import load_head
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.loop import difference
 
 TICK_S, HORIZON, HOP, LATENCY_TICKS = 0.01, 8, 4, 2

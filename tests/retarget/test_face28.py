@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 HEAD = load_head("face28")
 MAPPING = HeadRetargeter(HEAD)

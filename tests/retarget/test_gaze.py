@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
-from sfms_robot.retarget import life
+from sfms_robot.retarget import spontaneous
+from sfms_robot.retarget.channel_mapping import ChannelMapping
 from sfms_robot.retarget.eyes import Jump, directions, turn
-from sfms_robot.retarget.mapping import Mapping
 
 TICK_S, LEADS_S = 0.01, np.array([0.0, 0.04, 0.07])
 FULL_RAD = np.radians([30.0, 20.0])
@@ -29,7 +29,7 @@ def looking(yaw_deg: float, pitch_deg: float = 0.0, **pose_rad: float) -> np.nda
 
 def lived(listener, seconds: float, **gaze) -> np.ndarray:
     """What is shown, (T, N, 58), of a listener given as a function of time; N instants with leads a tick."""
-    alive = life.Life(Life(gaze=Gaze(**gaze)), seed=0)
+    alive = spontaneous.Life(Life(gaze=Gaze(**gaze)), seed=0)
     state, shown = alive.start(), []
     for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
         times_s = now_s + LEADS_S
@@ -125,5 +125,5 @@ def test_lids_follow_the_gaze_that_is_shown():
     head = load_head("face28")
     lid = list(head.joints).index("lid_left")
     shown = lived(lambda t: looking(0.0, pitch=-0.2 if t > 0.5 else 0.0), 1.0)  # nose up: the eyes go down
-    before, after = (np.degrees(Mapping(head).angles(row[0]))[lid] for row in (shown[0], shown[-1]))
+    before, after = (np.degrees(ChannelMapping(head).angles(row[0]))[lid] for row in (shown[0], shown[-1]))
     assert before == pytest.approx(0, abs=1e-6) and after > 5

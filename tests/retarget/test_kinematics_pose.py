@@ -8,36 +8,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import POSE_CHANNELS
-from sfms_robot.retarget.kinematics import pose
+from sfms_robot.retarget.kinematics import rotations
 
 turns = st.floats(-3.0, 3.0)
 seeds = st.integers(0, 2**32 - 1)
 
 
 def any_rotations(seed: int, count: int = 50) -> np.ndarray:
-    return pose.from_vector(np.random.default_rng(seed).normal(size=(count, 3)) * 1.5)
+    return rotations.from_vector(np.random.default_rng(seed).normal(size=(count, 3)) * 1.5)
 
 
 def test_pose_columns_are_those_of_the_frames_and_rotate_as_the_frames_say():
     roll, pitch, yaw = 0.3, -0.2, 0.9
-    by_hand = pose.about(2, yaw) @ pose.about(1, pitch) @ pose.about(0, roll)
+    by_hand = rotations.about(2, yaw) @ rotations.about(1, pitch) @ rotations.about(0, roll)
     assert POSE_CHANNELS == ("roll", "pitch", "yaw", "x", "y", "z")
-    assert pose.rotation(np.array([roll, pitch, yaw])) == pytest.approx(by_hand, abs=1e-15)
+    assert rotations.rotation(np.array([roll, pitch, yaw])) == pytest.approx(by_hand, abs=1e-15)
 
 
 def test_plus_is_right_ear_down_nose_down_and_turn_to_the_left():
     forward, left = np.eye(3)[0], np.eye(3)[1]
-    assert (pose.rotation(np.array([0.3, 0, 0])) @ left)[2] > 0  # the left ear goes up
-    assert (pose.rotation(np.array([0, 0.3, 0])) @ forward)[2] < 0
-    assert (pose.rotation(np.array([0, 0, 0.3])) @ forward)[1] > 0
+    assert (rotations.rotation(np.array([0.3, 0, 0])) @ left)[2] > 0  # the left ear goes up
+    assert (rotations.rotation(np.array([0, 0.3, 0])) @ forward)[2] < 0
+    assert (rotations.rotation(np.array([0, 0, 0.3])) @ forward)[1] > 0
 
 
 @pytest.mark.parametrize("axes", list(permutations(range(3))))
 @given(seed=seeds)
 def test_euler_angles_of_any_order_give_the_rotation_back(axes, seed):
     matrix = any_rotations(seed)
-    angles = pose.euler(matrix, axes)
-    back = pose.about(axes[0], angles[:, 0]) @ pose.about(axes[1], angles[:, 1]) @ pose.about(axes[2], angles[:, 2])
+    angles = rotations.euler(matrix, axes)
+    back = (
+        rotations.about(axes[0], angles[:, 0])
+        @ rotations.about(axes[1], angles[:, 1])
+        @ rotations.about(axes[2], angles[:, 2])
+    )
     assert np.abs(back - matrix).max() < 1e-9
 
 
@@ -45,38 +49,38 @@ def test_euler_angles_of_any_order_give_the_rotation_back(axes, seed):
 @pytest.mark.parametrize("middle", [np.pi / 2, -np.pi / 2])
 def test_with_the_middle_axis_at_ninety_degrees_the_last_angle_is_zero_and_the_rotation_the_same(axes, middle):
     a, b, c = axes
-    matrix = pose.about(a, 0.4) @ pose.about(b, middle) @ pose.about(c, 0.3)
-    angles = pose.euler(matrix, axes)
+    matrix = rotations.about(a, 0.4) @ rotations.about(b, middle) @ rotations.about(c, 0.3)
+    angles = rotations.euler(matrix, axes)
     assert angles[2] == 0.0
-    assert pose.about(a, angles[0]) @ pose.about(b, angles[1]) == pytest.approx(matrix, abs=1e-9)
+    assert rotations.about(a, angles[0]) @ rotations.about(b, angles[1]) == pytest.approx(matrix, abs=1e-9)
 
 
 @given(seeds, st.integers(0, 2), st.floats(-0.5, 0.5))
 def test_no_other_turn_about_the_axis_leaves_less_than_the_twist(seed, axis, off):
     matrix = any_rotations(seed)
-    best = pose.twist(matrix, axis)
-    left = pose.angle_between(matrix, pose.about(axis, best))
-    assert (left <= pose.angle_between(matrix, pose.about(axis, best + off)) + 1e-12).all()
+    best = rotations.twist(matrix, axis)
+    left = rotations.angle_between(matrix, rotations.about(axis, best))
+    assert (left <= rotations.angle_between(matrix, rotations.about(axis, best + off)) + 1e-12).all()
 
 
 @given(turns, turns, turns)
 def test_a_rotation_vector_turns_by_its_length(x, y, z):
     vector = np.array([x, y, z])
     length = np.linalg.norm(vector)
-    turned = pose.angle_between(np.eye(3), pose.from_vector(vector))
+    turned = rotations.angle_between(np.eye(3), rotations.from_vector(vector))
     assert turned == pytest.approx(np.pi - abs(np.pi - length % (2 * np.pi)), abs=1e-6)
-    assert pose.from_vector(vector) @ vector == pytest.approx(vector, abs=1e-9)
+    assert rotations.from_vector(vector) @ vector == pytest.approx(vector, abs=1e-9)
 
 
 def test_small_angles_between_rotations_are_exact():
-    assert pose.angle_between(np.eye(3), pose.about(1, 1e-9)) == pytest.approx(1e-9, rel=1e-6)
+    assert rotations.angle_between(np.eye(3), rotations.about(1, 1e-9)) == pytest.approx(1e-9, rel=1e-6)
 
 
 @given(seeds, turns)
 def test_a_pose_seen_from_a_turned_body_is_the_same_transform_in_its_frame(seed, body):
     world = np.random.default_rng(seed).uniform(-1, 1, (20, 6))
-    seen = pose.seen_from(body, world)
-    back = pose.about(2, body)
-    assert back @ pose.rotation(seen[:, :3]) == pytest.approx(pose.rotation(world[:, :3]), abs=1e-12)
+    seen = rotations.seen_from(body, world)
+    back = rotations.about(2, body)
+    assert back @ rotations.rotation(seen[:, :3]) == pytest.approx(rotations.rotation(world[:, :3]), abs=1e-12)
     assert seen[:, 3:] @ back.T == pytest.approx(world[:, 3:], abs=1e-12)
-    assert pose.seen_from(-body, seen) == pytest.approx(world, abs=1e-9)
+    assert rotations.seen_from(-body, seen) == pytest.approx(world, abs=1e-9)

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
 from sfms_robot.config.kinematics import BodyYaw, StewartPlatform
-from sfms_robot.retarget.kinematics import Stewart, build_neck, pose
-from sfms_robot.retarget.kinematics.reach import nearest
+from sfms_robot.retarget.kinematics import Stewart, build_neck, rotations
+from sfms_robot.retarget.kinematics.reach_limit import nearest
 
 HEAD = load_head("reachy_mini")
 CONFIG = HEAD.kinematics
@@ -70,7 +70,7 @@ def test_the_reach_has_no_second_part_behind_its_border():
 def test_on_a_smooth_path_in_and_out_of_reach_no_step_is_longer_than_the_asked_one_allows(seed):
     path = smooth_path(seed)
     got, _ = nearest(path, NECK.reachable)
-    asked, made = pose.distance_m(path[1:], path[:-1]), pose.distance_m(got[1:], got[:-1])
+    asked, made = rotations.distance_m(path[1:], path[:-1]), rotations.distance_m(got[1:], got[:-1])
     assert (made <= LONGEST_STEP * asked).all()
 
 
@@ -80,7 +80,7 @@ def test_nor_do_the_joints_jump(seed):
     """A crank tip moves as far as the head, or some times as far where crank and rod are nearly in line."""
     path = smooth_path(seed, 1500)
     tips_m = np.abs(np.diff(NECK.solve(path).angles_rad, axis=0)).max(axis=1) * CONFIG.crank_m
-    assert (tips_m <= LONGEST_STEP * pose.distance_m(path[1:], path[:-1])).all()
+    assert (tips_m <= LONGEST_STEP * rotations.distance_m(path[1:], path[:-1])).all()
 
 
 def test_such_a_path_does_cross_the_border():

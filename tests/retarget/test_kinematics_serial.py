@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sfms_robot.config import parse
 from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.errors import ConfigError
-from sfms_robot.retarget.kinematics import Serial, pose
+from sfms_robot.retarget.kinematics import Serial, rotations
 
 AXES = ("roll", "pitch", "yaw")
 seeds = st.integers(0, 2**32 - 1)
@@ -50,7 +50,7 @@ def test_a_pan_tilt_neck_keeps_the_direction_of_the_face_and_reports_the_roll(se
     solved = pan_tilt.solve(wanted)
     given_pose = pan_tilt.forward(solved.angles_rad, wanted)
     ahead = np.array([1.0, 0.0, 0.0])
-    faces = [pose.rotation(some[:, :3]) @ ahead for some in (wanted, given_pose)]
+    faces = [rotations.rotation(some[:, :3]) @ ahead for some in (wanted, given_pose)]
     assert faces[0] == pytest.approx(faces[1], abs=1e-12)
     assert solved.residual_rad == pytest.approx(np.abs(wanted[:, 0]), abs=1e-9)
     assert not solved.reached[np.abs(wanted[:, 0]) > 1e-6].any()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sfms_robot.config import load_head
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.errors import ConfigError
-from sfms_robot.retarget.kinematics import Stewart, build_neck, pose
+from sfms_robot.retarget.kinematics import Stewart, build_neck, rotations
 
 HEAD = load_head("reachy_mini")
 CONFIG = HEAD.kinematics
@@ -40,7 +40,7 @@ def test_the_inverse_is_that_of_the_published_geometry(row):
     wanted = np.array([float(row[key]) for key in ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")])
     angles = [float(row[f"q{leg}_rad"]) for leg in range(1, 7)]
     body = float(row["body_yaw_rad"])
-    assert PLATFORM.inverse(pose.seen_from(body, wanted)) == pytest.approx(angles, abs=1e-9)
+    assert PLATFORM.inverse(rotations.seen_from(body, wanted)) == pytest.approx(angles, abs=1e-9)
     solved = NECK.solve(wanted, np.array(body))
     assert solved.angles_rad == pytest.approx([body, *angles], abs=1e-9) and solved.reached
 
@@ -69,7 +69,9 @@ def test_every_rod_keeps_its_length(seed):
         servo = np.array(leg.servo_from_body)
         arm = CONFIG.crank_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
         tips = (arm - servo[:, 3]) @ servo[:, :3]  # rotation and shift undone: in the body's frame
-        ends = pose.rotation(wanted[:, :3]) @ np.array(leg.rod_end_m) + wanted[:, 3:] + [0, 0, CONFIG.home_height_m]
+        ends = (
+            rotations.rotation(wanted[:, :3]) @ np.array(leg.rod_end_m) + wanted[:, 3:] + [0, 0, CONFIG.home_height_m]
+        )
         assert np.linalg.norm(ends - tips, axis=1) == pytest.approx(np.full(len(wanted), CONFIG.rod_m), abs=1e-12)
 
 
@@ -85,9 +87,9 @@ def test_a_mirrored_pose_gives_the_cranks_of_the_other_side_turned_the_other_way
 @given(seeds)
 def test_a_small_move_of_the_head_is_a_small_move_of_the_cranks(seed):
     wanted = in_reach(seed)
-    step = np.random.default_rng(seed).normal(size=wanted.shape) * 1e-6 / pose.WEIGHTS
+    step = np.random.default_rng(seed).normal(size=wanted.shape) * 1e-6 / rotations.WEIGHTS
     moved = np.linalg.norm(PLATFORM.inverse(wanted + step) - PLATFORM.inverse(wanted), axis=1)
-    assert (moved < 25 * pose.distance_m(wanted + step, wanted) / CONFIG.crank_m).all()
+    assert (moved < 25 * rotations.distance_m(wanted + step, wanted) / CONFIG.crank_m).all()
 
 
 def test_many_poses_at_once_are_the_same_as_one_by_one():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sfms_robot.config import Expression, Head, parse
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
-from sfms_robot.retarget.mapping import Mapping
+from sfms_robot.retarget.channel_mapping import ChannelMapping
 
 EXTREMES = np.array([0.0, 1.0, -1.0, 1e-30, 7.0, -1e4, 3e38, -3e38], np.float32)
 
@@ -32,7 +32,7 @@ def shown(head, knobs=None, **channels):
     motion = np.zeros(MOTION_DIM, np.float32)
     for name, size in channels.items():
         motion[CHANNEL_INDEX[name]] = size
-    mapping = Mapping(head)
+    mapping = ChannelMapping(head)
     return (np.degrees(mapping.angles(motion, knobs)) / 10).tolist()
 
 
@@ -91,7 +91,7 @@ def test_a_fold_shows_a_channel_in_a_joint_that_has_something_else_to_do():
     head = head_of(joints, folds=folds)
     assert shown(head, cheekSquintLeft=1.0, eyeBlinkLeft=0.1, tongueOut=0.5) == pytest.approx([0.3, 0, 0.5])
     assert shown(head, cheekSquintRight=1.0) == pytest.approx([0, 0.2, 0])
-    assert not {"cheekSquintLeft", "cheekSquintRight", "tongueOut"} & set(Mapping(head).blind_channels)
+    assert not {"cheekSquintLeft", "cheekSquintRight", "tongueOut"} & set(ChannelMapping(head).blind_channels)
 
 
 LIPS = {
@@ -120,7 +120,7 @@ def test_couplings_hold_for_any_motion(seed, unit):
     rng = np.random.default_rng(seed)
     joints = {name: joint | {"unit": unit, "min_deg": -50} for name, joint in LIPS.items()}
     coupling = APART[0] | {"keep": {"upper": 1.5, "lower": -0.7, "jaw": 0.5}}
-    mapping = Mapping(head_of(joints, couplings=[coupling]))
+    mapping = ChannelMapping(head_of(joints, couplings=[coupling]))
     angles = mapping.angles(rng.uniform(-1, 1, (50, 3, MOTION_DIM)).astype(np.float32))
     ends = np.radians([50, 10])
     units = angles if unit == "rad" else angles / np.where(angles > 0, ends[1], ends[0])
@@ -132,7 +132,7 @@ def test_regions_turn_their_joints_up_and_down_and_no_others():
         {"brow": {"drive": "browInnerUp"}, "jaw": {"drive": "jawOpen"}},
         regions={"brows": {"joints": ["brow"], "intensity": 0.5}, "mouth": {"joints": ["jaw"]}},
     )
-    mapping = Mapping(head)
+    mapping = ChannelMapping(head)
     assert shown(head, browInnerUp=0.6, jawOpen=0.6) == pytest.approx([0.3, 0.6])
     assert shown(head, mapping.knobs({"brows": 2}), browInnerUp=0.3, jawOpen=0.6) == pytest.approx([0.6, 0.6])
     assert shown(head, mapping.knobs({"brows": 0, "mouth": 0}), browInnerUp=1.0, jawOpen=1.0) == [0, 0]
@@ -147,7 +147,7 @@ def test_style_doubles_or_removes_what_is_small_and_leaves_the_ends(style, wante
 
 
 def test_wrong_knobs_are_told_with_the_choices():
-    mapping = Mapping(head_of({"jaw": {"drive": "jawOpen"}}, regions={"mouth": {"joints": ["jaw"]}}))
+    mapping = ChannelMapping(head_of({"jaw": {"drive": "jawOpen"}}, regions={"mouth": {"joints": ["jaw"]}}))
     with pytest.raises(ConfigError, match=r"intensity: 'nose' is not a region of this head \(mouth\)"):
         mapping.knobs({"nose": 1})
     for value in (2.5, -0.1, float("nan")):
@@ -156,7 +156,9 @@ def test_wrong_knobs_are_told_with_the_choices():
 
 
 def test_channels_and_joints_that_are_left_out_are_listed():
-    mapping = Mapping(head_of({"jaw": {"drive": "open"}, "ear": {}}, expressions={"open": {"max": ["jawOpen", "yaw"]}}))
+    mapping = ChannelMapping(
+        head_of({"jaw": {"drive": "open"}, "ear": {}}, expressions={"open": {"max": ["jawOpen", "yaw"]}})
+    )
     assert set(CHANNELS) - set(mapping.blind_channels) == {"jawOpen", "yaw"}
     assert mapping.dead_joints == ("ear",)
 
@@ -167,5 +169,5 @@ def test_products_of_absurd_channels_stay_finite(seed):
     rng = np.random.default_rng(seed)
     node = Expression(product=tuple(Expression(channel=c, gain=1000) for c in rng.choice(CHANNELS, 4)))
     head = head_of({"a": {"drive": Expression(product=(node, node, node)).model_dump(exclude_none=True)}})
-    angles = Mapping(head).angles(rng.choice(EXTREMES, (20, 1, MOTION_DIM)))
+    angles = ChannelMapping(head).angles(rng.choice(EXTREMES, (20, 1, MOTION_DIM)))
     assert np.isfinite(angles).all() and (np.abs(angles) <= np.radians(10)).all()

@@ -8,7 +8,7 @@ from scipy.interpolate import PchipInterpolator
 
 from sfms_robot.config import Bus, Expression, Head, Joint, LimitClass
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
-from sfms_robot.retarget.mapping import Mapping
+from sfms_robot.retarget.channel_mapping import ChannelMapping
 
 
 def head_of(*drives, **joint) -> Head:
@@ -76,7 +76,7 @@ def grown(children):
 def test_angles_are_what_the_expressions_mean(drives, unit, seed):
     head = head_of(*drives, unit=unit)
     motion = np.random.default_rng(seed).uniform(-1, 1, (len(drives), MOTION_DIM)).astype(np.float32)
-    angles = Mapping(head).angles(motion)
+    angles = ChannelMapping(head).angles(motion)
     for angle, joint, row in zip(angles, head.joints.values(), motion, strict=True):
         u = value(joint.drive, row) if joint.drive else 0.0
         span = joint.max_rad - joint.rest_rad if u > 0 else joint.rest_rad - joint.min_rad
@@ -87,12 +87,12 @@ def test_angles_are_what_the_expressions_mean(drives, unit, seed):
 def test_each_joint_reads_its_own_row():
     motion = np.zeros((2, MOTION_DIM), np.float32)
     motion[0, CHANNEL_INDEX["jawOpen"]] = 1
-    angles = Mapping(head_of(Expression(channel="jawOpen"), Expression(channel="jawOpen"))).angles(motion)
+    angles = ChannelMapping(head_of(Expression(channel="jawOpen"), Expression(channel="jawOpen"))).angles(motion)
     assert np.degrees(angles) == pytest.approx([30.0, 2.0])
 
 
 def test_one_row_serves_all_joints_and_a_stack_is_done_at_once():
-    mapping = Mapping(head_of(Expression(channel="jawOpen"), Expression(channel="yaw")))
+    mapping = ChannelMapping(head_of(Expression(channel="jawOpen"), Expression(channel="yaw")))
     motion = np.random.default_rng(0).uniform(0, 1, MOTION_DIM).astype(np.float32)
     once = mapping.angles(motion)
     stacked = mapping.angles(np.broadcast_to(motion, (3, 2, MOTION_DIM)))
@@ -104,15 +104,15 @@ def test_what_is_not_finite_is_refused_by_name(bad):
     motion = np.zeros(MOTION_DIM, np.float32)
     motion[CHANNEL_INDEX["mouthPucker"]] = bad
     with pytest.raises(ValueError, match="mouthPucker is"):
-        Mapping(head_of(Expression(channel="jawOpen"))).angles(motion)
+        ChannelMapping(head_of(Expression(channel="jawOpen"))).angles(motion)
 
 
 @pytest.mark.parametrize("shape", [(57,), (2, 58), (3, 2, 58), ()])
 def test_a_wrong_shape_is_refused(shape):
     with pytest.raises(ValueError, match="not"):
-        Mapping(head_of(Expression(channel="jawOpen"))).angles(np.zeros(shape, np.float32))
+        ChannelMapping(head_of(Expression(channel="jawOpen"))).angles(np.zeros(shape, np.float32))
 
 
 def test_blind_channels_are_those_that_nothing_follows():
-    mapping = Mapping(head_of(Expression(max=(Expression(channel="jawOpen"), Expression(channel="roll"))), None))
+    mapping = ChannelMapping(head_of(Expression(max=(Expression(channel="jawOpen"), Expression(channel="roll"))), None))
     assert set(CHANNELS) - set(mapping.blind_channels) == {"jawOpen", "roll"}

@@ -5,10 +5,10 @@ import pytest
 
 from sfms_robot.config import load_head
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
-from sfms_robot.retarget.mapping import Mapping
+from sfms_robot.retarget.channel_mapping import ChannelMapping
 
 HEAD = load_head("reachy_mini")
-MAPPING = Mapping(HEAD)
+MAPPING = ChannelMapping(HEAD)
 REST_RAD = np.array([joint.rest_rad for joint in HEAD.joints.values()])
 
 

@@ -7,7 +7,7 @@ from sfms_robot.config import load_head
 from sfms_robot.config.check import check_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.frames import MOTION_DIM
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
 FRAMES = 10_000

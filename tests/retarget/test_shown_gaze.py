@@ -8,46 +8,48 @@ from sfms_robot.config.caution import cautious
 
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
-from sfms_robot.retarget import life
+from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.eyes import directions
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
-TICK_S, FULL_RAD = 0.01, np.radians([30.0, 20.0])
+FULL_RAD = np.radians([30.0, 20.0])
 HEADS = {name: load_head(name) for name in ("face28", "inmoov2_ssc32", "reachy_mini", "op3_head")}
 HEADS |= {f"{name}, cautious": cautious(head) for name, head in list(HEADS.items())}
 RETARGETERS = {name: HeadRetargeter(head) for name, head in HEADS.items() if head.kinematics}
 
 
 @pytest.mark.parametrize("name", RETARGETERS)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     intensity=st.floats(0, 2), style=st.floats(0, 2), yaw=st.floats(-1, 1), pitch=st.floats(-0.6, 0.6),
     roll=st.floats(-0.4, 0.4), hz=st.floats(0.2, 2.0),
 )  # fmt: skip
 def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style, yaw, pitch, roll, hz):
     retargeter = RETARGETERS[name]
-    region = {"neck": intensity} if "neck" in HEADS[name].regions else {}
-    knobs = retargeter.mapping.knobs(region, {"neck": style} if region else {})
-    alive = life.Life(Life(gaze=Gaze(recentre_deg=90.0)), seed=0)
-    state, in_space = alive.start(), []
-    for now_s in TICK_S * np.arange(60):
-        times_s = now_s + np.array([0.0, 0.05, 0.05])
-        motion = np.zeros((3, MOTION_DIM), np.float32)
+    region = "neck" in HEADS[name].regions
+    knobs = retargeter.mapping.knobs({"neck": intensity} if region else {}, {"neck": style} if region else {})
+    alive = spontaneous.Life(Life(gaze=Gaze(recentre_deg=90.0)), seed=0)
+    state, rows = alive.start(), []
+    for now_s in np.arange(0.0, 0.6, 0.03):
+        times_s = now_s + np.array([0.0, 0.05])
+        motion = np.zeros((2, MOTION_DIM), np.float32)
         for channel, size in (("yaw", yaw), ("pitch", pitch), ("roll", roll)):
             motion[:, CHANNEL_INDEX[channel]] = size * np.sin(2 * np.pi * hz * times_s)
         motion, state = alive.step(motion, times_s, now_s, state, lambda face: retargeter.shown_pose(face, knobs))
-        angles = [retargeter.angles(face, knobs)[retargeter.neck_columns] for face in motion]
-        shown = retargeter.neck.forward(np.array(angles), motion[:, :6].astype(float))[:, [2, 1]]
-        eyes = directions(motion, FULL_RAD).mean(axis=1)
-        free = (np.abs(shown) < 0.95 * FULL_RAD).all(axis=1)  # the eyes can turn so far
-        in_space.extend((eyes + shown)[free])
-    assert np.abs(in_space).max() < 1e-3
+        rows.append(motion[0])
+    motion = np.array(rows)
+    poses = motion[:, :6].astype(float)
+    solved = np.array([retargeter.angles(row, knobs)[retargeter.neck_columns] for row in motion])
+    shown = retargeter.neck.forward(solved, poses)[:, [2, 1]]
+    eyes = directions(motion, FULL_RAD).mean(axis=1)
+    free = (np.abs(eyes) < 0.99 * FULL_RAD).all(axis=1)  # the eyes can turn so far
+    assert not free.any() or np.ptp((eyes + shown)[free], axis=0).max() < 1e-3
 
 
 def test_a_neck_that_is_switched_off_moves_no_eye():
     retargeter = RETARGETERS["face28"]
     knobs = retargeter.mapping.knobs({"neck": 0.0})
-    alive = life.Life(Life(gaze=Gaze()), seed=0)
+    alive = spontaneous.Life(Life(gaze=Gaze()), seed=0)
     state, times_s = alive.start(), np.zeros(2)
     for pitch in (0.0, 0.15):
         motion = np.zeros((2, MOTION_DIM), np.float32)

@@ -1,6 +1,7 @@
 """Whatever is raised, wherever, at whichever tick: the head comes to rest and torque goes off, seen on the wire."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError, ModelError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.retarget.life import Life
+from sfms_robot.retarget.spontaneous import Life
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
@@ -71,7 +72,9 @@ class Raising:
 
 @pytest.fixture(scope="module")
 def chain() -> Iterator[Chain]:
-    with launch(emulated(HEAD)["main"], virtual=True) as running:
+    near = {joint.id: joint.zero_ticks + 100 for joint in HEAD.joints.values()}
+    servos = [replace(servo, start_ticks=near[servo.id]) for servo in emulated(HEAD)["main"]]
+    with launch(servos, virtual=True) as running:  # the way from a sagged pose is longer than the run
         yield running
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.session import build_bus, build_motion
-from sfms_robot.app.wiring import HANGING, emulated
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.emulator.sagging import sagged_rad
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
@@ -151,9 +152,9 @@ def test_a_run_ends_at_rest_without_torque_and_without_a_violation(chain: Chain)
 
 def test_torque_comes_on_without_a_jump_and_the_face_eases_in(chain: Chain) -> None:
     ticks = run(chain, Nodder()).watcher.ticks
-    hanging_rad = HANGING * HEAD.joints["neck_pitch"].min_rad  # where the emulated head hangs when switched on
+    sagged = sagged_rad(HEAD.joints["neck_pitch"], sags=True)  # where the emulated head is found when switched on
     row = list(HEAD.joints).index("neck_pitch")
-    assert ticks[0].goals_rad[row] == pytest.approx(hanging_rad, abs=2e-3)
+    assert ticks[0].goals_rad[row] == pytest.approx(sagged, abs=2e-3)
     steps = np.abs(np.diff([tick.goals_rad[row] for tick in ticks[:20]]))
     assert steps.max() < 0.005
 

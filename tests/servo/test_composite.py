@@ -8,6 +8,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import Reading
+from sfms_robot.servo.absent_bus import AbsentBus
 from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.port import SerialPort
@@ -155,3 +156,112 @@ def test_goal_that_is_not_finite_reaches_no_thread(bad):
         bus.write(np.array([bad]), 0.0)
     bus.close()
     assert slow.written == []
+
+
+class Steady:
+    """A bus in this process that works until it is told to fail."""
+
+    def __init__(self, joint, failing_with=None):
+        self.joints, self.capabilities = (joint,), {joint: frozenset({"torque"})}
+        self.failing_with = failing_with
+        self.written, self.calls = [], []
+
+    def connect(self): ...
+
+    def enable(self, joints):
+        return np.zeros(len(joints))
+
+    def write(self, goals_rad, now_s):
+        self.written.append(now_s)
+
+    def poll(self, now_s):
+        if self.failing_with is not None:
+            raise self.failing_with
+        return {self.joints[0]: Reading(0.1, 0.0)}
+
+    def torque_off(self, policy):
+        self.calls.append(("torque_off", policy))
+
+    def stop(self, policy):
+        self.calls.append(("stop", policy))
+
+    def close(self): ...
+
+    def statistics(self):
+        return {"writes": len(self.written)}
+
+
+def test_bus_that_fails_is_said_once_and_the_others_go_on():
+    bad, good = Steady("antenna"), Steady("neck")
+    bus = CompositeBus({"bad": bad, "good": good}, ["antenna", "neck"])
+    bus.connect()
+    bus.enable(["antenna", "neck"])
+    bus.write(np.zeros(2), 0.0)
+    bad.failing_with = BusError("bus 'bad': nobody has answered for 30 s")
+    with pytest.raises(BusError, match="nobody has answered"):
+        bus.poll(0.0)
+    for k in range(1, 20):
+        bus.write(np.zeros(2), 0.01 * k)
+        readings = bus.poll(0.01 * k)
+        assert readings["neck"].position_rad == 0.1 and readings["antenna"].fault == "bus failed"
+    assert len(good.written) == 20 and len(bad.written) == 1
+    bus.torque_off("release")
+    bus.stop("release")
+    assert [call for call, _ in bad.calls] == ["torque_off", "torque_off", "stop"]
+
+
+def test_torque_off_reaches_every_bus_before_any_is_asked_to_confirm():
+    order = []
+    buses = {name: Steady(name) for name in ("one", "two", "three")}
+    for each in buses.values():
+        each.calls = order
+    bus = CompositeBus(buses, list(buses))
+    bus.stop("release")
+    assert [call for call, _ in order] == ["torque_off"] * 3 + ["stop"] * 3
+
+
+def test_stop_does_not_wait_for_a_bus_that_hangs_in_the_middle_of_a_write():
+    slow, quick = Gate(), Steady("quick")
+    offs = []
+    slow.torque_off = lambda policy: offs.append(slow.open.is_set())
+    bus = CompositeBus({"slow": slow, "quick": quick}, ["slow", "quick"], {"slow": 1000.0, "quick": 1000.0})
+    bus.write(np.zeros(2), 0.0)
+    assert slow.begun.wait(30.0)
+    bus.stop("release")
+    assert offs == [False]  # sent from this thread, while the writer still hangs
+    assert ("stop", "release") in quick.calls
+    slow.open.set()
+    bus.close()
+
+
+def test_bus_that_fails_in_its_thread_is_said_once_and_the_others_go_on():
+    bad, good = Steady("antenna", BusError("gone")), Steady("neck")
+    bus = CompositeBus({"bad": bad, "good": good}, ["antenna", "neck"], {"bad": 1000.0, "good": 1000.0})
+    said = 0
+    for k in range(10_000):
+        bus.write(np.zeros(2), 0.001 * k)
+        try:
+            readings = bus.poll(0.001 * k)
+        except BusError:
+            said += 1
+        if said and k and readings["neck"].position_rad is not None:
+            break
+    for k in range(100):
+        bus.write(np.zeros(2), 20.0 + 0.001 * k)
+        readings = bus.poll(20.0 + 0.001 * k)
+    assert said == 1 and readings["antenna"].fault == "bus failed"
+    bus.close()
+
+
+def test_joints_that_were_left_out_take_goals_and_say_so():
+    servo = BusServo("jaw", 4, load_firmware_map("xl330-m288"), 0.2, 1.0)
+    bus = CompositeBus({"out": AbsentBus([servo]), "rest": Steady("neck")}, ["jaw", "neck"])
+    bus.connect()
+    assert bus.enable(["jaw", "neck"]).tolist() == [0.2, 0.0]
+    bus.write(np.array([0.5, 0.0]), 0.0)
+    readings = bus.poll(0.0)
+    assert readings["jaw"].fault == "left out" and readings["jaw"].position_rad is None
+    assert readings["neck"].fault is None
+    assert bus.statistics()["faults"] == ["jaw: left out"]
+    bus.stop("release")
+    bus.close()

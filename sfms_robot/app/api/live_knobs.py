@@ -7,8 +7,8 @@ from threading import Lock
 
 from sfms_robot.config import Head
 from sfms_robot.errors import InputError
-from sfms_robot.retarget.mapping import Knobs
-from sfms_robot.retarget.mapping import Mapping as Face
+from sfms_robot.retarget.channel_mapping import ChannelMapping as Face
+from sfms_robot.retarget.channel_mapping import Knobs
 
 
 class Knob:

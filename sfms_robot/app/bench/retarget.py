@@ -12,7 +12,7 @@ from sfms_robot.app.session import build_motion
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan
 from sfms_robot.motion.calibration import Calibration
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.kinematics import Stewart
 from sfms_robot.runtime.loop import difference
 

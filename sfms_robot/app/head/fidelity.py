@@ -23,8 +23,8 @@ from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.face.tracker import Skin, skin_motion
 from sfms_robot.frames import FRAME_S, POSE, POSE_CHANNELS, SHAPES, Doubles, Floats
-from sfms_robot.retarget.fit import asked
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.retarget.response_fit import asked
 
 _ANGLES = slice(0, 3)
 _EVERY = 5  # frames: faces of two neighbours hardly differ

@@ -21,7 +21,7 @@ from sfms_robot.config.check import check_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, POSE_CHANNELS, Doubles, Floats
 from sfms_robot.motion.limits import JointLimits
-from sfms_robot.retarget.head import HeadRetargeter
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.kinematics import Neck
 
 _TICK_HZ: Final = 100.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.retarget.head import HeadRetargeter
-from sfms_robot.retarget.mapping import Knobs
+from sfms_robot.retarget.channel_mapping import Knobs
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 
 def turned(retargeter: HeadRetargeter, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> Knobs:

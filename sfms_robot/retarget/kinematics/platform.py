@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Doubles
-from sfms_robot.retarget.kinematics import pose, reach, split
+from sfms_robot.retarget.kinematics import reach_limit, rotations, split
 from sfms_robot.retarget.kinematics.neck import Ranges, Solved, checked
 from sfms_robot.retarget.kinematics.stewart import Platform
 
@@ -87,7 +87,7 @@ class Stewart:
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
         body = angles_rad[..., 0] if self.turns_body else np.zeros(angles_rad.shape[:-1])
         legs = angles_rad[..., -6:]
-        return pose.seen_from(-body, self.geometry.forward(legs, pose.seen_from(body, start)))
+        return rotations.seen_from(-body, self.geometry.forward(legs, rotations.seen_from(body, start)))
 
     def _body_yaw(self, yaw_rad: Doubles, slow_rad: Doubles) -> Doubles:
         """The body's part (...) of the yaw (...): the slow one, and in any case what is beyond the platform's part."""
@@ -99,12 +99,12 @@ class Stewart:
 
     def _solved(self, poses: Doubles, body: Doubles) -> Solved:
         shape = poses.shape[:-1]
-        wanted = pose.seen_from(body, poses).reshape(-1, 6)
-        given, reached = reach.nearest(wanted, self.reachable)
+        wanted = rotations.seen_from(body, poses).reshape(-1, 6)
+        given, reached = reach_limit.nearest(wanted, self.reachable)
         cranks = np.clip(self.geometry.inverse(given), self._low, self._high)  # a border pose may round past its end
         angles = cranks.reshape(*shape, 6)
         if self.turns_body:
             angles = np.concatenate([np.broadcast_to(body, shape)[..., None], angles], axis=-1)
-        missing_rad = pose.angle_between(pose.rotation(wanted[:, :3]), pose.rotation(given[:, :3]))
+        missing_rad = rotations.angle_between(rotations.rotation(wanted[:, :3]), rotations.rotation(given[:, :3]))
         missing_m = np.asarray(np.linalg.norm(wanted[:, 3:] - given[:, 3:], axis=-1))
         return Solved(angles, reached.reshape(shape), missing_rad.reshape(shape), missing_m.reshape(shape))

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfms_robot.config.kinematics import SerialNeck, Split
 from sfms_robot.frames import Doubles
-from sfms_robot.retarget.kinematics import differential, pose, split
+from sfms_robot.retarget.kinematics import differential, rotations, split
 from sfms_robot.retarget.kinematics.neck import Ranges, Solved, checked
 
 EXACT_RAD: Final = 1e-9
@@ -35,7 +35,7 @@ class Serial:
         self._config = config
         self._ranges = {name: ranges[name] for name in self.joints}
         self._column = {name: column for column, name in enumerate(self.joints)}
-        self._axes = tuple(pose.AXIS[name] for name in config.order)
+        self._axes = tuple(rotations.AXIS[name] for name in config.order)
         places = [config.axes.get(name) for name in config.order]
         self._places: Sequence[str | Split | None] = places  # per axis its joint, or two; None: the differential's
         single = [(column, place) for column, place in enumerate(places) if isinstance(place, str)]
@@ -64,23 +64,23 @@ class Serial:
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
         out = np.zeros((*angles_rad.shape[:-1], 6))
-        out[..., :3] = pose.euler(self._rotation(angles_rad), (2, 1, 0))[..., ::-1]
+        out[..., :3] = rotations.euler(self._rotation(angles_rad), (2, 1, 0))[..., ::-1]
         return out
 
     def _axis_angles(self, poses: Doubles) -> Doubles:
         """Poses (..., 6) -> the angle of each axis (..., k), whatever the joints can do."""
         if self._axes in (_POSE_ORDER, _POSE_ORDER[:2]):
             return poses[..., self._axes]  # the pose is written in these very angles
-        rotation = pose.rotation(poses[..., :3])
+        rotation = rotations.rotation(poses[..., :3])
         if len(self._axes) == 1:
-            return pose.twist(rotation, self._axes[0])[..., None]
+            return rotations.twist(rotation, self._axes[0])[..., None]
         missing = tuple(axis for axis in range(3) if axis not in self._axes)
         a, b, c = (*self._axes, *missing)
-        return pose.euler(rotation, (a, b, c))[..., : len(self._axes)]
+        return rotations.euler(rotation, (a, b, c))[..., : len(self._axes)]
 
     def _solved(self, poses: Doubles, angles: Doubles, slow: Doubles) -> Solved:
         joints = self._joint_angles(angles, slow)
-        missing_rad = pose.angle_between(pose.rotation(poses[..., :3]), self._rotation(joints))
+        missing_rad = rotations.angle_between(rotations.rotation(poses[..., :3]), self._rotation(joints))
         missing_m = np.asarray(np.linalg.norm(poses[..., 3:], axis=-1))
         reached = (missing_rad <= EXACT_RAD) & (missing_m <= EXACT_M)
         return Solved(joints, np.asarray(reached), missing_rad, missing_m)
@@ -119,5 +119,5 @@ class Serial:
                 servos = joints[..., [self._column[pair.left], self._column[pair.right]]]
                 both = differential.axis_angles(servos, pair.pitch_gain, pair.roll_gain)
                 angle = both[("pitch", "roll").index(name)]
-            turns.append(pose.about(axis, angle))
+            turns.append(rotations.about(axis, angle))
         return reduce(np.matmul, turns)

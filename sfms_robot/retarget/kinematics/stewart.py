@@ -18,7 +18,7 @@ import numpy as np
 
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.frames import Doubles
-from sfms_robot.retarget.kinematics import pose
+from sfms_robot.retarget.kinematics import rotations
 
 MAX_STEPS = 60
 SHORTEST_STEP = 1e-3
@@ -72,11 +72,11 @@ class Platform:
         At |k| = 1 crank and rod lie in line and the crank turns ever faster with the head: a `dead_centre` below 1
         keeps away from there.
         """
-        q = self.rod_ends_m(pose.rotation(poses[..., :3]), poses[..., 3:])
+        q = self.rod_ends_m(rotations.rotation(poses[..., :3]), poses[..., 3:])
         flat = np.hypot(q[..., 0], q[..., 1])
         k = ((q * q).sum(-1) + (self.crank_m**2 - self.rod_m**2)) / (2 * self.crank_m * flat)
         turn = np.arccos(np.where(np.abs(k) <= dead_centre, k, np.nan))
-        return pose.wrapped(np.arctan2(q[..., 1], q[..., 0]) + self.side * turn)
+        return rotations.wrapped(np.arctan2(q[..., 1], q[..., 0]) + self.side * turn)
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
         """Crank angles (..., 6) -> poses (..., 6), from a pose (..., 6) nearby: the last one, or home.
@@ -112,7 +112,7 @@ class Platform:
         Beyond 0, with the other sign, lie poses that these cranks also fit but can only reach by falling through.
         """
         flat, cranks = poses.reshape(-1, 6), angles_rad.reshape(-1, 6)
-        rotation = pose.rotation(flat[:, :3])
+        rotation = rotations.rotation(flat[:, :3])
         _, toward = self._errors(rotation, flat[:, 3:], self._tips(cranks))
         determinant: Doubles = np.linalg.det(self._jacobian(rotation, toward))
         return determinant.reshape(poses.shape[:-1])
@@ -138,7 +138,7 @@ class Platform:
 
     def _newton(self, angles: Doubles, start: Doubles) -> tuple[Doubles, Doubles]:
         """Poses (n, 6) with these crank angles (n, 6), and how far off each is at the end (n,) [m]."""
-        rotation, place = pose.rotation(start[:, :3]), start[:, 3:].copy()
+        rotation, place = rotations.rotation(start[:, :3]), start[:, 3:].copy()
         tips = self._tips(angles)
         error, toward = self._errors(rotation, place, tips)
         for _ in range(MAX_STEPS):
@@ -149,7 +149,7 @@ class Platform:
             length, better = np.ones(len(busy)), np.zeros(len(busy), dtype=bool)
             while not better.all() and length.min() > SHORTEST_STEP:  # damping: half as far where it got no better
                 part = step * length[:, None]
-                turned, moved = pose.from_vector(part[:, :3]) @ rotation[busy], place[busy] + part[:, 3:]
+                turned, moved = rotations.from_vector(part[:, :3]) @ rotation[busy], place[busy] + part[:, 3:]
                 new_error, new_toward = self._errors(turned, moved, tips[busy])
                 better = _size(new_error) < _size(error[busy])
                 length = np.where(better, length, length / 2)
@@ -158,7 +158,7 @@ class Platform:
                 break
             rotation[kept], place[kept] = turned[better], moved[better]
             error[kept], toward[kept] = new_error[better], new_toward[better]
-        return np.concatenate([pose.euler(rotation, (2, 1, 0))[:, ::-1], place], axis=-1), _size(error)
+        return np.concatenate([rotations.euler(rotation, (2, 1, 0))[:, ::-1], place], axis=-1), _size(error)
 
 
 def _size(error: Doubles) -> Doubles:

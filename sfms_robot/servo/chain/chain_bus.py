@@ -472,15 +472,15 @@ class ChainBus(WireBus[L], Generic[L]):
                 left -= 1
                 member.step(now_s)
                 if member.rejoined:
-                    self._back(member.index, now_s)
+                    self._back(member)
                 elif member.job is None or not link.judged:
                     break
 
-    def _back(self, index: int, now_s: float) -> None:
+    def _back(self, member: Member) -> None:
         self._counts["reconnects"] += 1
-        self._forget_member(index)
-        self._telemetry.ticks[index] = self._members[index].stands_ticks
-        self._telemetry.seen_s[index] = now_s
+        self._forget_member(member.index)
+        self._telemetry.ticks[member.index] = member.stands_ticks
+        self._telemetry.seen_s[member.index] = member.stands_s
 
     def _compare(self, link: L, now_s: float) -> None:
         """Once a second, one servo after the other: do its registers hold what was asked of them?"""

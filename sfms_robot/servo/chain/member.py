@@ -155,7 +155,7 @@ class Member:
         torque_seen: what it last said; None where nobody knows.
         job: its way back, in steps of one exchange, and when the next is due.
         rejoined: it came to hold a position in this poll.
-        stands_ticks: where, while it is rejoining.
+        stands_ticks: where, while it is rejoining; told at some time since `stands_s`.
         off_written: torque off has been sent since it was wanted.
         mismatch: registers that do not hold what was asked of them, in words.
     """
@@ -172,6 +172,7 @@ class Member:
         self.job_due_s = 0.0
         self.rejoined = False
         self.stands_ticks = 0
+        self.stands_s: float | None = None
         self.off_written = False
         self.mismatch: str | None = None
         self._faults = faults
@@ -393,6 +394,8 @@ class Member:
         """One exchange of its job. Raises BusError when the port fails."""
         if self.job is None:
             return
+        if self.stands_s is None:
+            self.stands_s = now_s
         try:
             self.job_due_s = now_s + next(self.job)
         except StopIteration as end:
@@ -462,6 +465,7 @@ class Member:
         self.state = State.REBOOTING if reboot else State.RETURNING
         self.torque_seen = None
         self.job, self.job_due_s = self._restart.bring_back(self.index, reboot), due_s
+        self.stands_s = None
 
     def _drop_job(self) -> None:
         job, self.job = self.job, None

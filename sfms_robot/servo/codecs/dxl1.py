@@ -1,6 +1,10 @@
 """What Dynamixel Protocol 1.0 puts into the FF FF frame: bulk read, sync write, and the bits of the error byte.
 
-Words travel low byte first. There is no sync read, and a bulk read only on the MX series.
+Words travel low byte first. There is no sync read, and a bulk read only on the MX series. Parameters begin at byte 5:
+
+    SYNC WRITE (83)  start address, length L, then id and L bytes of data of each; to id FE, nobody answers
+    BULK READ (92)   00, then length, id, start address of each: in this order, unlike everywhere else; to id FE, one
+                     status of each in the order asked, each waiting for the one before it
 
 Source: ROBOTIS e-manual, docs/en/dxl/protocol1.md.
 """
@@ -19,7 +23,7 @@ OVERHEATING: Final = 0x04
 RANGE: Final = 0x08
 CHECKSUM: Final = 0x10
 OVERLOAD: Final = 0x20
-INSTRUCTION: Final = 0x40
+INSTRUCTION: Final = 0x40  # bit 7 is always 0
 
 REFUSALS: Final[Mapping[int, str]] = {
     ANGLE_LIMIT: "angle limit error",

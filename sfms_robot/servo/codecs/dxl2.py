@@ -1,6 +1,20 @@
 """Dynamixel Protocol 2.0 packets: values in, bytes out, and back. Opens no port.
 
-    FF FF FD 00 | id | length (2) | instruction | parameters ... | crc (2)
+    byte   0  1  2  3       4    5      6      7            8 ...       n-2    n-1
+           FF FF FD 00      ID   LEN_L  LEN_H  INSTRUCTION  PARAM ...   CRC_L  CRC_H
+           header, reserved                    55 = status  ERROR, PARAM ...
+
+Parameters, by the manual's names (words low byte first):
+
+    PING              none                          status: model number (2), firmware version (1)
+    READ              address (2), length (2)       status: the data
+    WRITE, REG WRITE  address (2), data             status: no data
+    ACTION, REBOOT    none                          status: no data
+    FACTORY RESET     FF all, 01 all but the id, 02 all but id and baud rate
+    CLEAR             01 44 58 4C 22                present position back into one turn
+    SYNC WRITE        address (2), length (2), then id, data of each; sent to id FE, nobody answers
+    SYNC READ         address (2), length (2), then ids; sent to id FE, one status of each, in that order
+    FAST SYNC READ    the same; one status from id FE: ERROR, ID, data, CRC of each
 
 1. `length` counts instruction, parameters and crc, after stuffing. Words travel low byte first.
 2. A status packet is instruction 0x55 whose first parameter is the error byte; bit 7 of it is the alert.
@@ -34,8 +48,8 @@ FAST_SYNC_READ: Final = 0x8A
 BULK_READ: Final = 0x92
 BULK_WRITE: Final = 0x93
 
-# Error byte of a status packet.
-ALERT: Final = 0x80
+# Error byte of a status packet (byte 8).
+ALERT: Final = 0x80  # bit 7: the hardware error status is not 0; says nothing about the request
 ERRORS: Final = {
     1: "result fail",
     2: "instruction error",
@@ -45,7 +59,7 @@ ERRORS: Final = {
     6: "data limit error",
     7: "access error",
 }
-INSTRUCTION_ERROR: Final = 2
+INSTRUCTION_ERROR: Final = 2  # bits 0 to 6 are one number, not flags
 DATA_RANGE_ERROR: Final = 4
 DATA_LENGTH_ERROR: Final = 5
 DATA_LIMIT_ERROR: Final = 6
@@ -108,6 +122,7 @@ def encode_fast_status(replies: Iterable[tuple[int, int, bytes]]) -> bytes:
     stuffed: a device cannot know what the ones before it sent.
     """
     parts = [bytes([error, servo]) + data for servo, error, data in replies]
+    # LEN counts from the instruction on: 1, then error, id, data and crc of each device.
     out = _HEADER + bytes([BROADCAST]) + (1 + sum(len(part) + 2 for part in parts)).to_bytes(2, "little")
     out += bytes([STATUS])
     for part in parts:
@@ -139,6 +154,7 @@ def split_fast_status(data: bytes | bytearray, length: int) -> list[tuple[int, i
 def _encode(servo: int, body: bytes) -> bytes:
     if len(body) + 9 > MAX_PACKET:
         raise PacketError(f"a packet of {len(body) + 9} bytes is longer than {MAX_PACKET}")
+    # LEN = instruction + parameters + crc, after stuffing. The crc is over everything from byte 0 on.
     packet = _HEADER + bytes([servo]) + (len(body) + 2).to_bytes(2, "little") + body
     return packet + crc16(packet).to_bytes(2, "little")
 
@@ -158,8 +174,8 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
         if len(buffer) < 7:
             return None
         servo, length = buffer[4], buffer[5] | buffer[6] << 8
-        total = length + 7
-        if length < 3 or total > MAX_PACKET or servo in (0xFD, 0xFF):
+        total = length + 7  # LEN counts what is behind byte 6
+        if length < 3 or total > MAX_PACKET or servo in (0xFD, 0xFF):  # FD and FF are no ids: they look like a header
             del buffer[0]
             continue
         if len(buffer) < total:

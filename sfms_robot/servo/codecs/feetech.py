@@ -1,7 +1,15 @@
 """What Feetech servos put into the FF FF frame: their own instructions, and the bits of the status byte.
 
 STS and SMS send words low byte first, SCS high byte first; which of the two is a fact of the model (`byte_order` of
-its firmware map), as is the sign rule of each register. Sync write has the form of Dynamixel 1.0.
+its firmware map), as is the sign rule of each register. Sync write has the form of Dynamixel 1.0. Parameters begin at
+byte 5:
+
+    SYNC READ (82)         start address, length, then ids; to id FE, one status of each in that order. SCS do not
+                           reliably answer it
+    RESET TURNS (0A)       none; STS only
+    CALIBRATE OFFSET (0B)  none; the present position becomes the middle
+
+Byte 4 of an answer is the status of the servo. Bit 4 is not used, and nothing there says whether a request was taken.
 
 Sources: Feetech communication protocol manual (matthieuvigne/STS_servos @bdff048, extras/); ftservo/FTServo_Arduino
 @64922cd, src/INST.h.

@@ -1,6 +1,8 @@
 """The FF FF frame of Dynamixel Protocol 1.0 and of Feetech: values in, bytes out, and back. Opens no port.
 
-    FF FF | id | length | code | parameters ... | sum
+    byte  0  1    2    3       4                       5 ...           n-1
+          FF FF   ID   LENGTH  INSTRUCTION or ERROR    PARAMETER ...   CHECKSUM
+          header
 
 1. `length` counts code, parameters and sum. `sum` is the inverse of the low byte of id + length + code + parameters.
 2. `code` is the instruction in what a host sends and the error byte in what a servo answers. Nothing in the frame says
@@ -49,7 +51,7 @@ def encode(servo: int, code: int, params: bytes = b"") -> bytes:
     if len(params) > MAX_PARAMS:
         raise PacketError(f"a frame of {len(params)} parameters is longer than {MAX_PARAMS}")
     body = bytes([servo, len(params) + 2, code]) + params
-    return _HEADER + body + bytes([~sum(body) & 0xFF])
+    return _HEADER + body + bytes([~sum(body) & 0xFF])  # over ID to the last parameter, bytes 2 to n-2
 
 
 def maybe_frame(buffer: bytearray) -> Frame | None:
@@ -68,10 +70,10 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
                 del buffer[0]
             return None
         servo, length = buffer[2], buffer[3]
-        if servo == 0xFF or length < 2:
+        if servo == 0xFF or length < 2:  # a third FF is still header; LENGTH counts code and sum at least
             del buffer[0]
             continue
-        total = length + 4
+        total = length + 4  # LENGTH counts what is behind byte 3
         if len(buffer) < total:
             return None
         if ~sum(buffer[2 : total - 1]) & 0xFF != buffer[total - 1]:

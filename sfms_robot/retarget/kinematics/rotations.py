@@ -1,4 +1,4 @@
-"""Poses and rotations, many at once.
+"""Rotations and poses, many at once.
 
 A pose is (..., 6) roll, pitch, yaw [rad], x, y, z [m], the order of `frames.POSE_CHANNELS`, measured from the head's
 home. Axes are x forward, y left, z up and R = Rz(yaw) Ry(pitch) Rx(roll).

@@ -16,9 +16,9 @@ import numpy as np
 from sfms_robot.config import Head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Doubles, Floats
+from sfms_robot.retarget.channel_mapping import ChannelMapping, Knobs
 from sfms_robot.retarget.kinematics import build_neck
 from sfms_robot.retarget.kinematics.serial import EXACT_RAD
-from sfms_robot.retarget.mapping import Knobs, Mapping
 
 _POSE = len(POSE_CHANNELS)
 _LARGE = np.array([0.5, 0.6, 1.0, 0.05, 0.05, 0.05])  # roll, pitch, yaw [rad], place [m]: where style changes nothing
@@ -38,7 +38,7 @@ class HeadRetargeter:
     """
 
     def __init__(self, head: Head, dt_s: float = 0.01) -> None:
-        self.mapping = Mapping(head)
+        self.mapping = ChannelMapping(head)
         self.joints: Sequence[str] = self.mapping.joints
         self.neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
         self.blind_channels: Sequence[str] = self.mapping.blind_channels

@@ -21,7 +21,7 @@ from scipy.optimize import lsq_linear
 
 from sfms_robot.config import Expression, Head, drives
 from sfms_robot.frames import MOTION_DIM, SHAPES, Doubles, Floats
-from sfms_robot.retarget.mapping import Mapping
+from sfms_robot.retarget.channel_mapping import ChannelMapping
 
 FLATTEST, STEEPEST = 0.2, 8.0  # slope of a response: no curve multiplies a motion by more than 5
 _KNOTS: Final = 9  # from rest to each end, closer together near rest
@@ -79,7 +79,7 @@ def asked(head: Head, shapes: Floats | Doubles) -> Doubles:
     """Blendshapes (N, 52) -> what the head makes of them, (N, J) in joint units; the neck's joints stay 0."""
     motion = np.zeros((len(shapes), MOTION_DIM), dtype=np.float32)
     motion[:, SHAPES] = shapes
-    mapping = Mapping(head)
+    mapping = ChannelMapping(head)
     rows = np.broadcast_to(motion[:, None], (len(motion), len(mapping.joints), MOTION_DIM))
     return Units.of(head).values(mapping.angles(rows))
 

@@ -11,8 +11,7 @@ style bends the response without moving its ends, so that small motions come out
 
 from __future__ import annotations
 
-from collections.abc import Mapping as Table
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,7 +25,7 @@ from sfms_robot.retarget.compile import Indices, Program
 
 @dataclass(frozen=True)
 class Knobs:
-    """How much every joint shows, (J,) each, 0..2 and 1 for as it is; made by `Mapping.knobs`."""
+    """How much every joint shows, (J,) each, 0..2 and 1 for as it is; made by `ChannelMapping.knobs`."""
 
     intensity: Doubles
     style: Doubles
@@ -69,7 +68,7 @@ class _Couplings:
             missing[..., rows] -= (there - now) * weights
 
 
-class Mapping:
+class ChannelMapping:
     """Implements `ports.Retargeter` for one head. A joint without a drive stays at rest.
 
     Attributes:
@@ -98,7 +97,7 @@ class Mapping:
         self.dead_joints: Sequence[str] = tuple(name for name, tree in trees.items() if tree is None)
         self._knobs = self.knobs()
 
-    def knobs(self, intensity: Table[str, float] | None = None, style: Table[str, float] | None = None) -> Knobs:
+    def knobs(self, intensity: Mapping[str, float] | None = None, style: Mapping[str, float] | None = None) -> Knobs:
         """Knobs per region over those of the head's file. Raises ConfigError for an unknown region or a bad value."""
         values = {"intensity": np.ones(len(self.joints)), "style": np.ones(len(self.joints))}
         for kind, given in (("intensity", intensity or {}), ("style", style or {})):

@@ -1,0 +1,40 @@
+"""A head that was switched off: necks lie on their stops, a little outside the range of the head's file."""
+
+import pytest
+
+from sfms_robot.app.wiring import calibration_of, emulated
+from sfms_robot.config import load_firmware_map, load_head
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.emulator.sagging import BEYOND_RAD, sagged_rad, sagging_joints
+
+HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+PITCHES = {
+    "face28": {"neck_pitch"},
+    "op3_head": {"head_tilt"},
+    "open_duck_mini_v2_head": {"neck_pitch", "head_pitch"},
+    "reachy_mini": set(),  # a platform on six legs
+}
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_joints_are_found_where_a_head_without_torque_comes_to_rest(name):
+    head = load_head(name)
+    sagging, conversion = sagging_joints(head), calibration_of(head.joints)
+    assert sagging == PITCHES.get(name, sagging)
+    servos = {(bus, servo.id): servo for bus, each in emulated(head).items() for servo in each}
+    for index, (joint_name, joint) in enumerate(head.joints.items()):
+        servo = servos[joint.bus, joint.id]
+        highest = 2 * load_firmware_map(joint.model).center_ticks - 1
+        assert 0 <= servo.start_ticks <= highest
+        angle = (servo.start_ticks - conversion.zero_ticks[index]) / conversion.ticks_per_rad[index]
+        tick = 1.0 / abs(conversion.ticks_per_rad[index])
+        if joint_name not in sagging:
+            assert joint.min_rad - tick <= angle <= joint.max_rad + tick
+        elif 0 < servo.start_ticks < highest:
+            assert angle == pytest.approx(joint.max_rad + BEYOND_RAD, abs=tick)
+        assert angle == pytest.approx(sagged_rad(joint, joint_name in sagging), abs=BEYOND_RAD + tick)
+
+
+def test_some_heads_are_found_outside_their_range():
+    found = {name for name in HEADS if sagging_joints(load_head(name))}
+    assert found >= {"face28", "op3_head", "poppy_head", "interbotix_wxxms", "open_duck_mini_v2_head"}
