@@ -1,4 +1,4 @@
-"""A package of somebody else's adds listeners, sources and buses by name: a real one, with its dist-info, beside ours."""
+"""A package of somebody else's, with its dist-info, adds listeners, sources and buses by name."""
 
 import os
 import subprocess
