@@ -78,3 +78,13 @@ def test_python_keeps_out_of_the_data_folders() -> None:
     root = PACKAGE.parent
     for folder in ("configs", "firmware_maps", "sim"):
         assert not list((root / folder).rglob("*.py"))
+
+
+def test_no_two_modules_import_one_another() -> None:
+    paths = {path.relative_to(PACKAGE).with_suffix("").parts: path for path in MODULES}
+    modules = {parts[:-1] if parts[-1] == "__init__" else parts: path for parts, path in paths.items()}
+    imported = {
+        name: {target if target in modules else target[:-1] for target in imports_of(path)}
+        for name, path in modules.items()
+    }
+    assert not [(a, b) for a in modules for b in imported[a] - {a} if a in imported.get(b, ())]

@@ -175,6 +175,11 @@ class PushSource:
         return FaceFrame(time_s, self._face.pose, self._face.blendshapes, self._face.jaw_rad)
 
 
+def open_push(argument: str, duration_s: float | None) -> PushSource:
+    """`--audio push`; it takes no argument."""
+    return PushSource(duration_s)
+
+
 def _as_floats(pcm: Pcm) -> NDArray[np.float32]:
     if isinstance(pcm, bytes | bytearray | memoryview):
         if len(pcm) % 2:

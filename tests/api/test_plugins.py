@@ -1,4 +1,4 @@
-"""A package of somebody else's adds listeners and buses by name: a real one, with its dist-info, beside ours."""
+"""A package of somebody else's, with its dist-info, adds listeners, sources and buses by name."""
 
 import os
 import subprocess
@@ -25,6 +25,20 @@ class Nodder:
         frames = np.zeros((1, 58), np.float32)
         frames[0, 1] = self.size * np.sin(2 * np.pi * 1.5 * speaker.time_s)
         return sr.Plan(speaker.time_s, np.array([speaker.time_s + 0.04]), frames), memory
+
+class Hum:
+    def __init__(self, argument, duration_s):
+        self.level, self.duration_s, self.given = float(argument), duration_s, 0
+
+    def read(self, now_s):
+        frames = []
+        while (self.given + 1) / 25 <= min(now_s, self.duration_s):
+            self.given += 1
+            frames.append(sr.SpeakerFrame(self.given / 25, np.full(640, self.level, np.float32)))
+        return frames
+
+    def close(self):
+        pass
 """
 
 FAMILY = """
@@ -46,6 +60,7 @@ def installed(tmp_path, monkeypatch):
     (info / "entry_points.txt").write_text(
         "[sfms_robot.listeners]\nnodder = somebodys_nods:Nodder\nbroken = somebodys_nods:Missing\n"
         "sfms-small = somebodys_nods:Nodder\n"
+        "[sfms_robot.sources]\nhum = somebodys_nods:Hum\n"
         "[sfms_robot.buses]\nsomebodys = somebodys_servos:FAMILY\n"
     )
     (tmp_path / "somebodys_servos.py").write_text(FAMILY)
@@ -90,3 +105,28 @@ def test_a_bus_family_of_another_package_is_in_the_table(installed):
     here = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
     assert done.stdout.strip() == "Somebody's servos <class 'somebodys_servos.Bus'>", done.stderr
+
+
+class Hearer:
+    """A `Listener` that keeps what it hears and does nothing."""
+
+    hop, horizon = 1, 1
+
+    def __init__(self):
+        self.heard = []
+
+    def start(self, seed):
+        return None
+
+    def step(self, speaker, memory):
+        self.heard.append(speaker)
+        return None, memory
+
+
+def test_a_robot_listens_to_a_source_of_another_package(installed, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(installed))
+    listener = Hearer()
+    with sr.Robot("reachy_mini", audio="hum:0.25", duration_s=0.4, listener=listener) as robot:
+        robot.wait()
+    assert robot.report()["frames"] == 10
+    assert listener.heard and all((frame.audio == 0.25).all() for frame in listener.heard)

@@ -1,10 +1,11 @@
 """`sfms-robot demo` in virtual time."""
 
 import json
+import sys
 
 import pytest
 
-from sfms_robot.app.listen.demo import DemoOptions, compare_seeds, free_folder
+from sfms_robot.app.listen.demo import DemoOptions, compare_seeds, demo, free_folder
 from sfms_robot.cli.main import main
 
 
@@ -34,3 +35,10 @@ def test_seeds_are_told_one_by_one():
     told = compare_seeds(DemoOptions("op3_head", duration_s=1.0, fast=True), 2, seen.append)
     assert [row["seed"] for row in seen] == [0, 1] == [row["seed"] for row in told["runs"]]
     assert told["exit"] == "done" and told["exit_code"] == 0
+
+
+def test_without_the_packages_of_pictures_the_run_is_kept_and_the_pip_install_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
+    told = demo(DemoOptions("op3_head", duration_s=1.0, fast=True, folder=tmp_path / "demo"))
+    assert told["exit"] == "done" and told["pictures"] == [] and (tmp_path / "demo" / "run.mcap").is_file()
+    assert told["missing"].count("\n") == 0 and "pip install 'sfms-robot[pictures]'" in told["missing"]

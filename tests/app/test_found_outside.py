@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sfms_robot.config.caution import cautious
 
 from sfms_robot.app.session import HeadOptions, OpenHead, Programme, build_bus, build_motion, drive_head
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
+from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame
@@ -57,7 +57,7 @@ def found_outside(head, whole, rng):
 @pytest.mark.parametrize("name", HEADS)
 def test_a_head_found_outside_its_limits_runs_and_comes_to_rest(name, careful, seed):
     whole = load_head(name)
-    head = cautious(whole) if careful else whole
+    head = held_back(whole) if careful else whole
     rate_hz, clock = max(bus.rate_hz for bus in head.buses.values()), VirtualClock()
     with ExitStack() as stack:
         servos = found_outside(head, whole, np.random.default_rng(seed))

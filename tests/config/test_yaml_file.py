@@ -49,7 +49,10 @@ def test_shipped_files_mean_what_they_meant_to_yaml_1_1(file):
     assert read(file) == yaml.safe_load(file.read_text(encoding="utf-8"))
 
 
-@given(st.dictionaries(st.text(), st.one_of(st.integers(), st.booleans(), st.none(), st.text(), st.floats(width=32))))
+NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]*", fullmatch=True)  # what keys and texts of our files are
+
+
+@given(st.dictionaries(NAMES, st.one_of(st.integers(), st.booleans(), st.none(), NAMES, st.floats(width=32))))
 def test_what_we_write_is_what_we_read(tmp_path_factory, value):
     text = yaml.safe_dump(value, allow_unicode=False)
     assert repr(of(tmp_path_factory.mktemp("yaml"), text)) == repr(yaml.safe_load(text))

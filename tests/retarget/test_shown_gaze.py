@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sfms_robot.config.caution import cautious
+from sfms_robot.config.calibrate_first import held_back
 
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
@@ -14,7 +14,7 @@ from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 FULL_RAD = np.radians([30.0, 20.0])
 HEADS = {name: load_head(name) for name in ("face28", "inmoov2_ssc32", "reachy_mini", "op3_head")}
-HEADS |= {f"{name}, cautious": cautious(head) for name, head in list(HEADS.items())}
+HEADS |= {f"{name}, cautious": held_back(head) for name, head in list(HEADS.items())}
 RETARGETERS = {name: HeadRetargeter(head) for name, head in HEADS.items() if head.kinematics}
 
 

@@ -244,9 +244,10 @@ def test_turns_are_not_cleared_under_torque():
 
 
 def test_a_servo_that_cannot_forget_its_turns_is_refused_with_the_way_out():
-    rig = Rig("sts3215", {"start_ticks": 5000})
-    with pytest.raises(ServoError, match="present_position is 5000.*turn it back by hand, or switch its supply off"):
-        rig.startup.run()
+    rig = Rig("sts3215")
+    (found,) = contradictions({"present_position": 5000}, rig.table, rig.needs[0])
+    assert (found.then, found.wanted, found.fixable) == ("refused", 904, False)
+    assert "turn it back by hand, or switch its supply off and on" in str(found)
 
 
 def test_an_offset_shifts_the_one_turn_that_there_is():

@@ -1,5 +1,8 @@
 """Whatever a source does, a listener gets whole finite frames; kinds of other packages are found."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,8 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, FaceFrame, SpeakerFrame
-from sfms_robot.sources.push import PushSource
-from sfms_robot.sources.registry import SOURCES, open_source, source_kinds
+from sfms_robot.sources.registry import SOURCES, check_source, open_source, source_kinds
 from sfms_robot.sources.validated import ValidatedSource
 
 
@@ -66,17 +68,6 @@ def test_good_frames_go_through_as_they_are():
     np.testing.assert_array_equal(frame.agent_audio, audio)
 
 
-def test_a_kind_is_chosen_by_its_name_and_gets_what_stands_behind_the_colon():
-    inner = Own()
-    told = []
-    source = open_source("robot-ear:left:2", duration_s=3.0, kinds={"robot-ear": lambda *a: told.append(a) or inner})
-    source.close()
-    assert told == [("left:2", 3.0)] and inner.closed
-    assert open_source("push", duration_s=1.5).duration_s == 1.5
-    with pytest.raises(ConfigError, match="--face webcam: --audio push brings its own"):
-        open_source("push", "webcam")
-
-
 class Entry:
     """The part of importlib's EntryPoint that is used."""
 
@@ -89,10 +80,31 @@ class Entry:
         return self.loaded
 
 
-def test_kinds_of_other_packages_are_imported_when_used_and_never_replace_ours():
-    ear = Entry("ear", "ears:Ear", lambda argument, duration_s: PushSource(9.0))
-    kinds = source_kinds(lambda: {"ear": ear, "push": Entry("push", "x"), "broken": Entry("broken", "nowhere:Ear")})
+def test_a_kind_is_chosen_by_its_name_and_gets_what_stands_behind_the_colon():
+    inner, told = Own(), []
+    ear = Entry("ear", "ears:Ear", lambda *arguments: told.append(arguments) or inner)
+    source = open_source("ear:left:2", duration_s=3.0, kinds=source_kinds([ear]))
+    source.close()
+    assert told == [("left:2", 3.0)] and inner.closed
+    assert open_source("push", duration_s=1.5).duration_s == 1.5
+    with pytest.raises(ConfigError, match="--face webcam: --audio push brings its own"):
+        open_source("push", "webcam")
+
+
+def test_kinds_of_other_packages_are_imported_when_opened_and_never_replace_ours():
+    kinds = source_kinds([Entry("push", "theirs:Push"), Entry("broken", "nowhere:Ear")])
     assert kinds["push"] is SOURCES["push"]
-    assert open_source("ear", kinds=kinds).duration_s == 9.0
+    check_source("broken", kinds=kinds)
     with pytest.raises(ConfigError, match="--audio broken: nowhere:Ear cannot be imported: no module named so"):
         open_source("broken", kinds=kinds)
+
+
+def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
+    code = (
+        "import sys; from sfms_robot.sources.registry import check_source\n"
+        "check_source('push')\n"
+        "sys.exit(bool({'numpy', 'soundfile', 'soxr'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    with pytest.raises(ConfigError, match="--audio nothing-so: no such file"):
+        check_source("nothing-so")

@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app import session
-from sfms_robot.app.replay import replay_run
 from sfms_robot.config import load_head
 from sfms_robot.errors import MissingExtra
 from sfms_robot.ports import Observer
@@ -49,8 +48,10 @@ def demo(options: DemoOptions, progress: Callable[[float | None], Observer] | No
     folder = options.folder if options.folder is not None else free_folder(Path(FOLDER))
     report = session.run(options.run(options.seed, folder), progress)
     told = {**_seen(options, report), "folder": str(folder), "pictures": [], "missing": None, "report": report}
-    if report["exit"] == "failed":
+    if report["exit"] == "failed" or not report["ticks"]:  # interrupted before it began: nothing to draw
         return told
+    from sfms_robot.app.replay import replay_run  # scipy: not while servos move
+
     try:
         replay_run(folder, folder / PLOT, folder / SHEET)
         told["pictures"] = [str(folder / name) for name in (PLOT, SHEET)]

@@ -10,7 +10,7 @@ from sfms_robot.data import find
 from sfms_robot.errors import PortError
 from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.servo.discovery import access_problem
-from sfms_robot.sources.speakers import recorded_files
+from sfms_robot.sources.registry import check_source
 
 
 def check_names(
@@ -24,7 +24,7 @@ def check_names(
     """Are there such a head, listener, port and files? Raises ConfigError, PortError."""
     find("heads", head, "head.yaml")
     listener_folder(listener)
-    recorded_files(audio, face, agent_audio)
+    check_source(audio, face, agent_audio)
     for part in port.split(","):
         device = part.rpartition("=")[2]
         if device.startswith("/") and (problem := access_problem(device)):

@@ -20,7 +20,6 @@ _FIRST_IDS: Final = 20
 _ID_S: Final = 0.02  # an adapter may hold an answer back for 16 ms
 _RATES: Final = 3  # of each family, those met most often
 _DXL2_HEADER: Final = b"\xff\xff\xfd\x00"
-NAMES: Final = {"dynamixel2": "Dynamixel 2.0", "dynamixel1": "Dynamixel 1.0", "feetech": "Feetech"}
 
 
 def protocol_hint(wire: Wire) -> str:
@@ -36,7 +35,7 @@ def protocol_hint(wire: Wire) -> str:
             if family == wire.family:
                 return ""
             if family is not None:
-                return f"these servos answer {NAMES[family]} at {baud} baud: --family {family}"
+                return f"these servos answer {servo_families()[family].title} at {baud} baud: --family {family}"
     finally:
         wire.at(before)
     return ""
