@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sfms_robot.config.calibrate_first import held_back
 
 from sfms_robot.config import Gaze, Life, load_head
+from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.eyes import directions
