@@ -5,9 +5,9 @@ import importlib
 import pytest
 
 from sfms_robot.config import load_head
+from sfms_robot.config.named_bus import BUS_GROUP
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo import families as table
 from sfms_robot.servo.families import BusFamily, families, family_named, servo_families
 
 
@@ -50,7 +50,7 @@ def installed(tmp_path, monkeypatch):
         info = tmp_path / "sfms_herkulex-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sfms-herkulex\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[{table.GROUP}]\n{line}\n")
+        (info / "entry_points.txt").write_text(f"[{BUS_GROUP}]\n{line}\n")
         (tmp_path / "sfms_herkulex.py").write_text(
             "from sfms_robot.servo.families import BusFamily\n"
             "FAMILY = BusFamily('HerkuleX', 'collections:OrderedDict', ('herkulex', None))\n"
