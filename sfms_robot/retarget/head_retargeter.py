@@ -92,7 +92,8 @@ class HeadRetargeter:
         solved = self.neck.solve(poses)
         short = solved.residual_rad > EXACT_RAD
         if short.any():
-            poses[short, :3] = self.neck.forward(solved.angles_rad[short], poses[short])[..., :3]
+            shown = self.neck.forward(solved.angles_rad[short], np.zeros_like(poses[short]))[..., :3]
+            poses[short, :3] = np.where(np.isfinite(shown), shown, poses[short, :3])  # the search may end nowhere
         return poses
 
     def _pose(self, motion: Floats, knobs: Knobs | None) -> Doubles:
