@@ -6,8 +6,8 @@ RobotError                      base; `exit_code` is what the command line retur
 |   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
 +-- PortError            (3)    a port cannot be opened, or is held by somebody else
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
-|   +-- ServoError       (4)    a servo is not what the configuration says, or refuses a command
-|   +-- PacketError      (4)    bytes that are no packet (codecs raise it, buses count it)
++-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
++-- PacketError          (4)    bytes that are no packet (codecs raise it, buses count it)
 +-- ModelError           (5)    weights or model files are missing, corrupt or of another shape
 """
 
@@ -70,12 +70,16 @@ class BusError(RobotError):
     exit_code = 4
 
 
-class ServoError(BusError):
-    """One servo is not what the head configuration says, or refused a command at start-up."""
+class ServoError(RobotError):
+    """One servo is not what the head configuration says, or refused a command. The bus goes on."""
+
+    exit_code = 4
 
 
-class PacketError(BusError):
-    """Bytes that are not a packet: bad header, length or checksum."""
+class PacketError(RobotError):
+    """Bytes that are not a packet: bad header, length or checksum. The bus goes on."""
+
+    exit_code = 4
 
 
 class ModelError(RobotError):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
-from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
     from sfms_robot.app.servo.servo_wire import Seen, Wire
@@ -64,7 +64,7 @@ def ping(
         for servo in _parsed(ids):
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
-            except BusError:
+            except (BusError, ServoError):
                 rows.append({"id": servo, "model": None, "model_number": None, "firmware": None, "baud": None,
                              "note": "", "answers": False})  # fmt: skip
     _show(rows, {"servos": rows}, on.json)

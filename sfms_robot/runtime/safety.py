@@ -6,21 +6,23 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import Bus, Limiter
 from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.log import RunLog
 
 EASE_S: Final = 1.0  # torque-on pose -> live face, and live face -> rest
 SETTLE_S: Final = 2.0  # a slow joint may need longer than EASE_S; after this the torque goes off all the same
-ARRIVED_RAD: Final = 1e-4
+ARRIVED_RAD: Final = 1e-4  # of a goal
+STANDS_RAD: Final = 0.01  # of a servo: its gear and its load leave it a little short
+FOLLOW_S: Final = 0.3  # that servos are given after their goals have arrived
 FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
 SWITCH_S: Final = 0.0005  # Python's own 5 ms is half a tick
 
@@ -39,11 +41,13 @@ def come_to_rest(
 ) -> None:
     """Ease every joint to its rest angle under the limits; blocks for up to EASE_S + SETTLE_S.
 
-    Takes as long in seconds however many ticks that is. A tick that raises (a bus that fails, a goal that is refused)
+    Ends when goals and servos have arrived; servos that do not quite get there have `FOLLOW_S` for it. Takes as long in
+    seconds however many ticks that is. A tick that raises (a bus that fails, a goal that is refused)
     is said once and left out; after `FAILURES` in a row it gives up. Never raises an Exception.
     """
     span = rest_rad - from_rad
     began_s: float | None = None
+    arrived_s: float | None = None
     failed = 0
     for tick in ticks:
         began_s = tick.time_s if began_s is None else began_s
@@ -56,13 +60,22 @@ def come_to_rest(
             goals_rad, state = limiter.step(reference, state)
             log.ease(tick, goals_rad, reference[0])
             bus.write(goals_rad, tick.time_s)
-            bus.poll(tick.time_s)
-            arrived, failed = bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD)), 0
+            readings, failed = bus.poll(tick.time_s), 0
+            if bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD)):
+                arrived_s = tick.time_s if arrived_s is None else arrived_s
+                stand = _stand(bus.joints, readings, rest_rad)
+                arrived = stand or tick.time_s - arrived_s >= FOLLOW_S
         except Exception as error:  # whatever it is, the other buses are still to be eased
             failed += 1
             logger.error("on the way to rest: %s", error)
         if failed >= FAILURES or (arrived and since_s >= EASE_S) or since_s >= EASE_S + SETTLE_S:
             return
+
+
+def _stand(joints: Sequence[str], readings: Mapping[str, Reading], rest_rad: Doubles) -> bool:
+    """Whether every servo that tells its position is at rest."""
+    stands = [readings[joint].position_rad if joint in readings else None for joint in joints]
+    return all(at is None or abs(at - rest) < STANDS_RAD for at, rest in zip(stands, rest_rad, strict=True))
 
 
 class Released(KeyboardInterrupt):

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Generic, Protocol, TypeVar
 
 from sfms_robot.config import Bus as BusConfig
-from sfms_robot.errors import BusError, PortError, RobotError
+from sfms_robot.errors import BusError, PacketError, PortError, RobotError, ServoError
 from sfms_robot.frames import Reading
 from sfms_robot.ports import StopPolicy, TickConversion
 from sfms_robot.servo.goals import Goals
@@ -117,6 +117,9 @@ class WireBus(ABC, Generic[L]):
                     self._heard_s = now_s
             except BusError as error:
                 self._lose(error, now_s)
+            except (ServoError, PacketError) as error:  # about one servo or one packet: the port is there
+                self._counts["errors"] += 1
+                log.warning("bus %r: %s", self.name, error)
         if self._heard_s is None:
             self._heard_s = now_s
         if now_s - self._heard_s > self._reconnect_s:

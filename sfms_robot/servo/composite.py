@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.errors import BusError, PortError, RobotError
+from sfms_robot.errors import BusError, RobotError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import Bus, StopPolicy
 from sfms_robot.servo.writer import Writer
@@ -82,7 +82,7 @@ class CompositeBus:
         return np.array([held[joint] for joint in joints])
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
-        """As a single bus, to all that work. A ValueError of a bus in a thread is raised by the next call."""
+        """As a single bus, to all that work. What goes wrong in a thread is raised by `poll`."""
         if not np.isfinite(goals_rad).all():
             raise ValueError(f"goal of {self.joints[int(np.argmin(np.isfinite(goals_rad)))]} is not finite")
         refused: ValueError | None = None
@@ -93,11 +93,10 @@ class CompositeBus:
                     bus.write(goals, now_s)
                 else:
                     self._writer(name, bus).put(goals, now_s)
-                    self._writers[name].raise_failure()
-            except (BusError, PortError) as error:
-                self._fail(name, error)
             except ValueError as error:  # the others have theirs all the same
                 refused = refused or error
+            except Exception as error:  # whatever it is, it is this bus's alone
+                self._fail(name, error)
         if refused is not None:
             raise refused
 
@@ -108,7 +107,7 @@ class CompositeBus:
             if name not in self._failures:
                 try:
                     self._last[name] = self._read(name, bus, now_s)
-                except (BusError, PortError) as error:
+                except Exception as error:
                     self._fail(name, error)
             if name in self._failures:
                 readings |= {joint: Reading(None, float("inf"), FAILED) for joint in bus.joints}

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.lead import Nobody, Waves
+from sfms_robot.app.bench.lead import Waves
+from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.session import RunOptions, build_bus, build_motion, run
 from sfms_robot.app.wiring import emulated
@@ -83,7 +84,7 @@ def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():
         bus = build_bus(head, {"main": chain}, clock)
         bus.connect()
         parts = Parts(
-            Nobody(), Waves(), motion.timeline, motion.retargeter, motion.limiter, bus, [goals], motion.leads_s,
+            NobodyThere(), Waves(), motion.timeline, motion.retargeter, motion.limiter, bus, [goals], motion.leads_s,
             motion.rest_rad, knobs=lambda: off if len(goals.sent_rad) >= 200 else on,
         )  # fmt: skip
         drive(parts, clock, log, rate_hz=100.0, duration_s=4.0, interrupted=lambda: False)

@@ -32,7 +32,7 @@ from sfms_robot.config.overlay import (
     save_overlay,
 )
 from sfms_robot.emulator.launch import Chain
-from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.errors import BusError, ConfigError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 
@@ -154,7 +154,7 @@ def _one(
                     return _measure(config, identity, at, by_hand, talk, today)
                 except Again as reason:
                     talk.say(f"  {reason}; once more")
-    except (Skipped, BusError) as reason:
+    except (Skipped, BusError, ServoError) as reason:
         outcome.skipped[joint] = str(reason)
         talk.say(f"  left out: {reason}")
         return None

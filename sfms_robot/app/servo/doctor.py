@@ -37,7 +37,7 @@ from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import launch
-from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
+from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
 from sfms_robot.servo.codecs import maestro, ssc32
@@ -127,7 +127,7 @@ def examine_line(
                     found, facts = _look_at_board(line, port, adapter)
                 else:
                     found, facts = _look(line, port, clock, adapter, progress, fix)
-            except BusError as error:
+            except (BusError, PacketError, ServoError) as error:
                 findings.append(Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable"))
                 return _finished({**report, **_NOTHING_SEEN, "adapter": asdict(adapter)}, findings)
             finally:

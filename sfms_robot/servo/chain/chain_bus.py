@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import Faults
-from sfms_robot.errors import BusError
+from sfms_robot.errors import BusError, PacketError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
@@ -353,6 +353,9 @@ class ChainBus(WireBus[L], Generic[L]):
                 self._send(link, places, ticks, link.port.now_s())
             except BusError as error:
                 self._lose(error, now_s)
+            except PacketError as error:  # this one cannot be built: the next may
+                self._counts["errors"] += 1
+                log.warning("bus %r: %s", self.name, error)
 
     def _accepted(self, goals_rad: Doubles) -> bool:
         """Whether a rejoining member takes goals from now on."""
