@@ -51,7 +51,6 @@ from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 from sfms_robot.sources.registry import open_source
 
 logger = logging.getLogger(__name__)
@@ -59,7 +58,6 @@ logger = logging.getLogger(__name__)
 SIM_READ_DEADLINE_S: Final = 0.02  # an emulator shares the computer's cores: it may be late without being silent
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 INTERRUPTED: Final = 130
-EVENTS: Final = {"nods": find_nods, "blinks": find_blinks, "smiles": find_smiles}
 
 
 # --- a head and its servos ------------------------------------------------------------------------------------------
@@ -311,7 +309,7 @@ def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, 
         programme.retargeter or motion.retargeter, motion.limiter, opened.bus, programme.observers, motion.leads_s,
         motion.rest_rad, programme.life, programme.knobs, programme.overlay,
     )  # fmt: skip
-    log = RunLog(motion.retargeter.joints, 1.0 / opened.rate_hz, motion.audit, EVENTS)
+    log = RunLog(motion.retargeter.joints, 1.0 / opened.rate_hz, motion.audit)
     duration_s = math.inf if programme.duration_s is None else programme.duration_s
     real = not opened.options.fast
     outcome, error = "failed", None

@@ -8,22 +8,21 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Audit
 from sfms_robot.runtime.clock import TickTime
+from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.quantiles import Quantiles
 
 LATE_SHARE: Final = 0.5  # a tick is late when it starts more than this share of a period behind its deadline
 SPEECH_RMS: Final = 0.01  # a frame louder than this counts as speech when latency is measured
-_PITCH: Final = CHANNEL_INDEX["pitch"]
-_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
-_SMILES: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
 _REMEMBERED: Final = 250  # frames of speech and plans that wait to be measured: ten seconds
 _BLOCK_S: Final = 20.0  # counted at once
 _MARGIN_S: Final = 8.0  # looked at on both sides of a block; no nod is longer
@@ -36,41 +35,50 @@ class EventCounter:
 
     Args:
         find: signal (N,) and its rate -> events (start_s, end_s, size) in order, as those of `signals.events`.
+        worker: where blocks are counted; a block takes milliseconds, which no tick has to spare.
 
     Blocks overlap, and an event counts in the block that it starts in, so the count is that of the whole signal.
     """
 
-    def __init__(self, find: FindEvents, rate_hz: float) -> None:
-        self._find, self._rate_hz = find, rate_hz
+    def __init__(self, find: FindEvents, rate_hz: float, worker: Executor) -> None:
+        self._find, self._rate_hz, self._worker = find, rate_hz, worker
         self._block, self._margin = round(_BLOCK_S * rate_hz), round(_MARGIN_S * rate_hz)
         self._values: list[float] = []
         self._before = 0  # values of the block before, at the front
         self._counted = 0
+        self._counting: Future[int] | None = None
 
     def add(self, value: float) -> None:
         self._values.append(value)
         if len(self._values) >= self._before + self._block + self._margin:
-            self._counted += self._starting(self._before, self._before + self._block)
-            keep = self._before + self._block - self._margin
-            self._values, self._before = self._values[keep:], self._margin
+            self._collect()
+            last = self._before + self._block
+            self._counting = self._worker.submit(self._starting, tuple(self._values), self._before, last)
+            self._values, self._before = self._values[last - self._margin :], self._margin
 
     def total(self) -> int:
-        """Events so far, those in the unfinished block included."""
-        return self._counted + self._starting(self._before, len(self._values))
+        """Events so far, those in the unfinished block included. Blocks for the block that is being counted."""
+        self._collect()
+        return self._counted + self._starting(self._values, self._before, len(self._values))
 
-    def _starting(self, first: int, last: int) -> int:
-        events = self._find(np.asarray(self._values), self._rate_hz)
+    def _collect(self) -> None:
+        """The block before was given twenty seconds."""
+        if self._counting is not None:
+            self._counted += self._counting.result()
+            self._counting = None
+
+    def _starting(self, values: Sequence[float], first: int, last: int) -> int:
+        events = self._find(np.asarray(values), self._rate_hz)
         return sum(first <= max(0, round(start_s * self._rate_hz)) < last for start_s, _, _ in events)
 
 
 @dataclass
 class RunLog:
-    """Filled by the loop, read once at the end. `period_s` is the tick's, `find` finds events by name."""
+    """Filled by the loop, read once at the end. `period_s` is the tick's."""
 
     joints: Sequence[str]
     period_s: float
     audit: Audit
-    find: Mapping[str, FindEvents] = field(default_factory=dict)
     ticks: int = 0
     late: int = 0
     skipped: int = 0
@@ -93,7 +101,10 @@ class RunLog:
     _counters: dict[str, EventCounter] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._counters = {name: EventCounter(find, 1.0 / self.period_s) for name, find in self.find.items()}
+        worker = ThreadPoolExecutor(1, "event counter")
+        worker.submit(int).result()  # its thread begins now, before the loop's takes real-time priority
+        rate_hz = 1.0 / self.period_s
+        self._counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
 
     def start(self, held_rad: Doubles) -> None:
         """Torque came on at `held_rad` (J,)."""
@@ -118,11 +129,8 @@ class RunLog:
         """What the limiter gave for this tick, sent or not: `goals_rad` (J,) of `asked_rad` (J,), for a face (58,)."""
         self.listened_s = tick.time_s
         self._tick(tick, goals_rad, asked_rad)
-        for name, value in (
-            ("nods", motion[_PITCH]), ("blinks", motion[_BLINKS].max()), ("smiles", motion[_SMILES].mean()),
-        ):  # fmt: skip
-            if name in self._counters:
-                self._counters[name].add(float(value))
+        for name, kind in MOTION_EVENTS.items():
+            self._counters[name].add(float(kind.signal(motion)))
 
     def wrote(self, wire_s: float, reach_s: float) -> None:
         """The command is on the wire at `wire_s`; it played the timeline up to `reach_s`."""
@@ -155,7 +163,7 @@ class RunLog:
 
     def motion_report(self) -> dict[str, int]:
         """`motion` of the report."""
-        return {name: counter.total() for name, counter in self._counters.items()}
+        return {f"{name}s": counter.total() for name, counter in self._counters.items()}
 
     def tick_report(self, target_hz: float, elapsed_s: float | None) -> dict[str, Any]:
         """`tick` of the report; wall-clock figures are null where there is no wall clock (`elapsed_s` None)."""

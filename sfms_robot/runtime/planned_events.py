@@ -17,18 +17,15 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.errors import InputError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, Doubles, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.signals.events import Event, find_blinks, find_nods, find_smiles
+from sfms_robot.signals.events import MOTION_EVENTS
 
 log = logging.getLogger(__name__)
 
 WINDOW: Final = 8 * FRAME_HZ  # frames that are looked at; no nod is longer
 NEWS: Final = 2 * FRAME_HZ  # what ended longer ago than this many frames is no news: the window's edge made it
 MOST_WAITING: Final = 10 * FRAME_HZ  # plans
-_PITCH: Final = CHANNEL_INDEX["pitch"]
-_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
-_SMILES: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
 
 
 @dataclass(frozen=True)
@@ -47,43 +44,27 @@ class MotionEvent:
     size: float
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """How an event shows: the signal of motion (N, 58), its detector, and whether it has to be over to be told."""
-
-    signal: Callable[[Floats], Floats]
-    find: Callable[[Doubles, float], list[Event]]
-    whole: bool
-
-
-EVENTS: Final = {
-    "nod": _Kind(lambda motion: motion[:, _PITCH], find_nods, whole=True),
-    "blink": _Kind(lambda motion: motion[:, _BLINKS].max(axis=1), find_blinks, whole=True),
-    "smile": _Kind(lambda motion: motion[:, _SMILES].mean(axis=1), find_smiles, whole=False),
-}
-
-
 class PlannedEvents:
     """Plans in, events out. Remembers `WINDOW` frames."""
 
     def __init__(self) -> None:
-        self._signals = np.zeros((len(EVENTS), 0))
+        self._signals = np.zeros((len(MOTION_EVENTS), 0))
         self._first = 0  # index, in frames of 40 ms, of the first column
         self._told_until_s: dict[str, float] = {}
 
     def add(self, plan: Plan) -> list[MotionEvent]:
         """Events that this plan completes, in the order in which they begin."""
         self._join(plan)
-        found = [event for row, kind in enumerate(EVENTS) for event in self._new(kind, self._signals[row])]
+        found = [event for row, kind in enumerate(MOTION_EVENTS) for event in self._new(kind, self._signals[row])]
         return sorted(found, key=lambda event: event.start_s)
 
     def _join(self, plan: Plan) -> None:
-        columns = np.array([kind.signal(plan.frames) for kind in EVENTS.values()], np.float64)
+        columns = np.array([kind.signal(plan.frames) for kind in MOTION_EVENTS.values()], np.float64)
         begins = round(float(plan.times_s[0]) * FRAME_HZ)
         known = self._signals.shape[1]
         if not known or not 0 <= begins - self._first <= known + WINDOW:  # the first plan, or another time altogether
             self._signals, self._first, known = columns[:, :0], begins, 0
-            self._told_until_s = dict.fromkeys(EVENTS, float("-inf"))
+            self._told_until_s = dict.fromkeys(MOTION_EVENTS, float("-inf"))
         at = begins - self._first
         if at > known:  # nothing was planned meanwhile: the face stays
             self._signals = np.pad(self._signals, ((0, 0), (0, at - known)), mode="edge")
@@ -92,7 +73,7 @@ class PlannedEvents:
         self._signals = joined[:, -WINDOW:]
 
     def _new(self, name: str, signal: Doubles) -> list[MotionEvent]:
-        kind, begins_s, last_s = EVENTS[name], self._first / FRAME_HZ, (len(signal) - 1) / FRAME_HZ
+        kind, begins_s, last_s = MOTION_EVENTS[name], self._first / FRAME_HZ, (len(signal) - 1) / FRAME_HZ
         news = []
         for start, end, size in kind.find(signal, FRAME_HZ):
             if end < last_s - NEWS / FRAME_HZ or (kind.whole and end > last_s - 0.5 / FRAME_HZ):
@@ -123,8 +104,8 @@ class EventWatch:
 
     def on(self, kind: str, callback: Callable[[MotionEvent], object]) -> None:
         """Call `callback` with every `MotionEvent` of a kind. Raises InputError for an unknown kind."""
-        if kind not in EVENTS:
-            raise InputError(f"on({kind!r}): no such event ({', '.join(EVENTS)})")
+        if kind not in MOTION_EVENTS:
+            raise InputError(f"on({kind!r}): no such event ({', '.join(MOTION_EVENTS)})")
         with self._changed:
             self._callbacks.append((kind, callback))
             if self._thread is None and not self._closing:

@@ -6,12 +6,14 @@ ratio compares two windows after the same phrase ends, so a listener who nods at
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.signals.peaks import band_pass, find_peaks, half_widths
 
 Event = tuple[float, float, float]
@@ -86,6 +88,32 @@ def find_smiles(smile: ArrayLike, rate_hz: float, least: float = 0.2) -> list[Ev
         if peak > least and np.count_nonzero(level[start:end] > least) >= 0.4 * rate_hz:
             found.append((start / rate_hz, end / rate_hz, peak))
     return found
+
+
+@dataclass(frozen=True)
+class EventKind:
+    """How an event shows in motion.
+
+    Attributes:
+        signal: motion (..., 58) -> the signal (...,) it shows in.
+        find: signal (N,) and its rate -> events in order.
+        whole: it has to be over to be told.
+    """
+
+    signal: Callable[[NDArray[np.floating]], NDArray[np.floating]]
+    find: Callable[[ArrayLike, float], list[Event]]
+    whole: bool
+
+
+_LIDS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
+_CORNERS: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
+
+# What counts as a nod, a blink, a smile of a face: for the report, for callbacks, for whoever asks.
+MOTION_EVENTS: Final[Mapping[str, EventKind]] = {
+    "nod": EventKind(lambda motion: motion[..., CHANNEL_INDEX["pitch"]], find_nods, whole=True),
+    "blink": EventKind(lambda motion: motion[..., _LIDS].max(axis=-1), find_blinks, whole=True),
+    "smile": EventKind(lambda motion: motion[..., _CORNERS].mean(axis=-1), find_smiles, whole=False),
+}
 
 
 def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.04) -> Bools:

@@ -1,6 +1,7 @@
 """What a run measures of itself: counted in blocks as from the whole, and in memory that does not grow."""
 
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -28,11 +29,17 @@ def talkative(seconds, seed):
     return pitch, blink, smile
 
 
+@pytest.fixture
+def worker():
+    with ThreadPoolExecutor(1) as pool:
+        yield pool
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("seconds", [5.0, 27.9, 28.0, 200.0])
-def test_events_counted_in_blocks_are_those_of_the_whole(seconds, seed):
+def test_events_counted_in_blocks_are_those_of_the_whole(seconds, seed, worker):
     for signal, find in zip(talkative(seconds, seed), (find_nods, find_blinks, find_smiles), strict=True):
-        counter = EventCounter(find, RATE_HZ)
+        counter = EventCounter(find, RATE_HZ, worker)
         for value in signal:
             counter.add(float(value))
         whole = len(find(signal, RATE_HZ))
@@ -50,7 +57,7 @@ class NoAudit:
 
 
 def test_a_log_of_hours_is_as_large_as_one_of_minutes():
-    log = RunLog(["a", "b"], 1 / RATE_HZ, NoAudit(), {"nods": find_nods, "blinks": find_blinks})
+    log = RunLog(["a", "b"], 1 / RATE_HZ, NoAudit())
     log.start(np.zeros(2))
     goals, motion = np.zeros(2), np.zeros(MOTION_DIM, np.float32)
 

@@ -197,11 +197,11 @@ def _heat(axes: Axes, recording: RunRecording, joints: Sequence[int]) -> None:
     off = goals_deg - np.median(goals_deg, axis=0)
     travel_deg = np.ptp(goals_deg, axis=0)
     scaled = off / np.maximum(np.abs(off).max(axis=0), _LEAST_SCALE_DEG)
-    step_s = float(np.median(np.diff(recording.times_s))) if len(recording.times_s) > 1 else FRAME_S
-    axes.imshow(
-        scaled.T, aspect="auto", cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest",
-        extent=(recording.times_s[0] - step_s / 2, recording.times_s[-1] + step_s / 2, len(joints) - 0.5, -0.5),
-    )  # fmt: skip
+    times_s = recording.times_s
+    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else FRAME_S
+    edges_s = np.append(times_s, times_s[-1] + step_s) - step_s / 2  # ticks that were skipped leave a longer cell
+    axes.pcolormesh(edges_s, np.arange(len(joints) + 1) - 0.5, scaled.T, cmap="RdBu_r", vmin=-1, vmax=1)
+    axes.set_ylim(len(joints) - 0.5, -0.5)
     rows = range(len(joints))
     size: dict[str, Any] = {"fontsize": min(10.0, max(6.0, 8.0 * 26 / len(joints))), "color": _INK}
     axes.set_yticks(rows, [recording.joints[joint] for joint in joints], **size)
