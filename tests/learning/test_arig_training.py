@@ -267,9 +267,10 @@ def test_only_short_dyads_are_refused(data):
 def test_agent_and_user_keep_their_tracks():
     one = dyad("a", "speaking", 0)
     found = gather({"speaking": [one]}, WINDOW, ARKIT, WIDTHS["mel"])
-    assert found.agent_heard.all() and not found.user_heard.any() and not found.user_seen.any()
-    assert found.voiced[:, 0].any() and not found.voiced[:, 1].any()
-    assert len(found.states) == HZ * 12
+    frames = found.frames
+    assert frames.agent_heard.all() and not frames.user_heard.any() and not frames.user_seen.any()
+    assert frames.voiced[:, 0].any() and not frames.voiced[:, 1].any()
+    assert len(frames.states) == HZ * 12
 
 
 @pytest.mark.parametrize(

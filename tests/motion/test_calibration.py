@@ -57,7 +57,7 @@ def test_what_is_not_finite_has_no_tick(bad):
         FACE.to_ticks(np.where(np.arange(28) == 1, bad, 0.0))
 
 
-@pytest.mark.parametrize("changes", [{"zero_ticks": 50}, {"zero_ticks": 4000}, {"ratio": 20.0}])
+@pytest.mark.parametrize("changes", [{"zero_ticks": 50}, {"zero_ticks": 4000}, {"max_deg": 200}])
 def test_a_range_that_leaves_the_turn_of_the_servo_is_an_error(changes):
     with pytest.raises(ConfigError, match=r"joints.jaw: .* outside the servo's 0..4095; change zero_ticks = "):
         Calibration({"jaw": joint(**changes)}, np.array([4096]))

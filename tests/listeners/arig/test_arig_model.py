@@ -174,7 +174,7 @@ def test_context_depends_on_how_far_apart_chunks_are_not_on_when():
     def cis(first: int) -> torch.Tensor:
         cache = torch.zeros(2, 2, 1, 2, 0, 4)
         for index, each in enumerate([*past, summary]):
-            made, keys = long.step(each, cache, long.turn(torch.tensor([first + index])))
+            made, keys = long.step(each, cache, long.rotary(torch.tensor([first + index])))
             cache = torch.cat([cache, keys], dim=-2)
         return made
 
