@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PARALLEL := -n auto --dist loadfile  # a file of tests to a process, as many processes as cores
 
 .PHONY: run test test-all lint bench install clean
 
@@ -16,10 +17,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 test: install
-	$(BIN)/python -m pytest -m "not slow and not hardware and not gpu"
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow and not hardware and not gpu"
 
 test-all: install
-	$(BIN)/python -m pytest -m "not hardware and not gpu"
+	$(BIN)/python -m pytest $(PARALLEL) -m "not hardware and not gpu"
 
 lint: install
 	$(BIN)/ruff check .
