@@ -389,7 +389,7 @@ def run(
     prepare_head(options.servos)
     if options.record is not None:
         check_folder(options.record, options.overwrite)
-    limited = limitation(options.listener) if feed is None else None
+    limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
     if limited is not None:
         logger.warning("%s: %s", Path(options.listener).name, limited)
     with ExitStack() as stack:
@@ -405,7 +405,7 @@ def run(
         if feed is None:
             return {"version": 1, "head": opened.config.name, "port": options.port, "exit": "done", **_present(opened)}
         if isinstance(feed, ListenerProcess):
-            feed.wait_ready()
+            feed.wait_loaded()
         turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
         recorder = _recorder(options, opened.config)
         own = [each for each in (recorder, progress(duration_s) if progress else None) if each is not None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import sys
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import typer
@@ -91,17 +92,20 @@ def run(
     ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.listen.preflight import check_names
+    from sfms_robot.app.listen.preflight import begin_listening, check_names
 
     check_names(head, listener, port, audio, face, agent_audio)
-    from sfms_robot.app import session
-    from sfms_robot.app.listen.progress import RunProgress
+    with ExitStack() as stack:
+        # The listener loads from here on, in a process of its own, while this one imports what drives a head.
+        feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(listener, seed)))
+        from sfms_robot.app import session
+        from sfms_robot.app.listen.progress import RunProgress
 
-    options = session.RunOptions(
-        head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
-        tuple(intensity), tuple(style), tuple(without),
-    )  # fmt: skip
-    report = session.run(options, RunProgress)
+        options = session.RunOptions(
+            head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
+            tuple(intensity), tuple(style), tuple(without),
+        )  # fmt: skip
+        report = session.run(options, RunProgress, feed=feed)
     if json:
         print(json_module.dumps(report))
     else:

@@ -12,6 +12,9 @@ minute and it stays down.
 A machine that cannot keep up must not answer what was said seconds ago: when more than half a second is waiting, the
 listener goes on at the newest frame. What it did not hear is counted, and said once.
 
+A listener that is loaded is not yet fast: it builds its graphs while the head eases in. What it did not hear meanwhile
+it hears then, as fast as it can.
+
     parent -> child    pickle: (name, seed), then SpeakerFrame after SpeakerFrame
     child -> parent    pickle: (kind, value, number) of KINDS below
 """
@@ -43,15 +46,16 @@ HUNG_S: Final = 1.0
 RESTART_S: Final = 3.0
 RESTARTS: Final = 5  # in a minute; more than that is no accident
 _MINUTE_S: Final = 60.0
-# ready: it listens. done: a frame was taken. plan: a frame was taken, this is the answer, it took so many ms.
+# loaded: nothing is wrong with it. ready: it listens. done: a frame was taken. plan: the same, this is the answer, and
+# it took so many ms.
 # skipped: so many frames were left out. error: it cannot listen, and why.
-KINDS: Final = ("ready", "done", "plan", "skipped", "error")
+KINDS: Final = ("loaded", "ready", "done", "plan", "skipped", "error")
 
 log = logging.getLogger(__name__)
 
 
 class ListenerProcess:
-    """`ports.PlanFeed` over a child process that starts at once; `wait_ready` waits until it listens.
+    """`ports.PlanFeed` over a child process that starts at once; `wait_loaded` waits until it can be relied upon.
 
     Args:
         name: what `registry.load_listener` takes: a shipped listener, a folder, or a kind of another package.
@@ -69,20 +73,28 @@ class ListenerProcess:
         self._unanswered = 0
         self._child = _Child(name, seed)
 
-    def wait_ready(self, limit_s: float = START_LIMIT_S) -> None:
+    def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
         """Block until the listener is loaded. Raises ModelError with its own message when it cannot be."""
-        if self._state != "starting":
+        self._wait("loaded", "building", ("starting",), limit_s)
+
+    def wait_ready(self, limit_s: float = START_LIMIT_S) -> None:
+        """Block until the listener listens. Raises ModelError with its own message when it cannot."""
+        self.wait_loaded(limit_s)
+        self._wait("ready", "listening", ("building",), limit_s)
+
+    def _wait(self, wanted: str, then: str, states: Sequence[str], limit_s: float) -> None:
+        if self._state not in states:
             return
         kind, value, _ = self._child.next(limit_s)
-        if kind == "ready":
-            self._state = "listening"
+        if kind == wanted:
+            self._state = then
             return
         self.close()
-        raise ModelError(value or f"the listener process was not ready after {limit_s:g} s")
+        raise ModelError(value or f"the listener process was not {wanted} after {limit_s:g} s")
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Never blocks; what a child that does not listen leaves behind is dropped, oldest first, and counted."""
-        if self._state == "given up":
+        if self._state in ("starting", "given up"):
             return
         self._skipped += self._child.send(frame)
         self._unanswered += 1
@@ -99,7 +111,7 @@ class ListenerProcess:
         return plans
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` (starting, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms` p50 and p99."""
+        """`state` (starting, building, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms`."""
         return {
             "state": self._state,
             "restarts": self._restarts,
@@ -119,9 +131,12 @@ class ListenerProcess:
                 log.warning("the listener is slower than the person: it leaves frames out to keep up")
             self._skipped += int(number)
             self._answered(int(number), now_s)
+        elif kind == "loaded":
+            self._state = "building"
         elif kind == "ready":
-            log.warning("the listener is back")
-            self._state = "listening"
+            if self._restarts:
+                log.warning("the listener is back")
+            self._state, self._waits_since_s = "listening", now_s if self._unanswered else None
         else:
             self._answered(1, now_s)
             if self._state == "hung":
@@ -141,7 +156,7 @@ class ListenerProcess:
             return
         if self._child.ended:
             self._restart("died", now_s)
-        elif self._state != "starting" and self._waits_since_s is not None:
+        elif self._state in ("listening", "hung") and self._waits_since_s is not None:
             silent_s = now_s - self._waits_since_s
             if silent_s > RESTART_S:
                 self._restart(f"has not answered for {silent_s:.1f} s", now_s)
@@ -268,10 +283,12 @@ def main() -> None:
     try:
         import torch
 
-        from sfms_robot.listeners.registry import load_listener
+        from sfms_robot.listeners.registry import build_graphs, load_listener
 
         torch.set_num_threads(threads())
-        listener = load_listener(name)
+        listener = load_listener(name, graphs=False)
+        _say(plans, "loaded")
+        build_graphs(listener)
     except RobotError as error:
         _say(plans, "error", str(error))
         return
@@ -308,6 +325,8 @@ def _say(plans: IO[bytes], kind: str, value: Any = None, number: float = 0.0) ->
 class Inbox:
     """Frames in the order in which they came, until None does; the newest alone when too many are waiting.
 
+    Those that came before the first one was asked for do not count as too many.
+
     Attributes:
         skipped: frames left out before the last one given.
     """
@@ -316,6 +335,7 @@ class Inbox:
         self._queue: queue.SimpleQueue[SpeakerFrame | None] = queue.SimpleQueue()
         self._most = most
         self._waiting: deque[SpeakerFrame | None] = deque()
+        self._kept_up = False  # at least once
         self.skipped = 0
 
     def put(self, frame: SpeakerFrame | None) -> None:
@@ -329,7 +349,9 @@ class Inbox:
             self._waiting.append(self._queue.get())
         if None in self._waiting:
             return None
-        self.skipped = len(self._waiting) - 1 if len(self._waiting) > self._most else 0
+        too_many = len(self._waiting) > self._most
+        self._kept_up |= not too_many
+        self.skipped = len(self._waiting) - 1 if too_many and self._kept_up else 0
         for _ in range(self.skipped):
             self._waiting.popleft()
         return self._waiting.popleft()

@@ -11,15 +11,26 @@ from sfms_robot.listeners.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
 
-def load_listener(name: str | Path) -> Listener:
+def load_listener(name: str | Path, graphs: bool = True) -> Listener:
     """A listener by shipped name, of a folder with config.yaml and weights, or of another package.
 
+    `graphs`: ready to run at full speed, which takes another second or two; else `build_graphs` is still to be called.
     Raises ConfigError or ModelError.
     """
     folder = listener_folder(str(name))
     if folder is None:
         return load_plugin(str(name))
-    return cast(Listener, LISTENER_KINDS[load_config(folder).kind].load_folder(folder))
+    listener = cast(Listener, LISTENER_KINDS[load_config(folder).kind].load_folder(folder))
+    if graphs:
+        build_graphs(listener)
+    return listener
+
+
+def build_graphs(listener: Listener) -> None:
+    """The weights stay as they are from now on; a listener of somebody else's may know nothing of graphs."""
+    build = getattr(listener, "build_graphs", None)
+    if build is not None:
+        build()
 
 
 def one_thread() -> None:

@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dct
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, Doubles, Floats
 
@@ -55,6 +54,8 @@ def cepstra(windows: NDArray[np.floating], rate_hz: int) -> Doubles:
     fft = 1 << (size - 1).bit_length()
     power = np.abs(np.fft.rfft((centred - PREEMPHASIS * before) * povey, fft)) ** 2
     logs = np.log(np.maximum(power[..., :-1] @ _filters(rate_hz, fft).T, EPSILON))
+    from scipy.fft import dct  # a quarter of a second, and few listeners hear these features
+
     out: Doubles = dct(logs, type=2, norm="ortho", axis=-1)[..., :CEPSTRA]
     out = out * (1.0 + 0.5 * LIFTER * np.sin(np.pi * np.arange(CEPSTRA) / LIFTER))
     out[..., 0] = energy

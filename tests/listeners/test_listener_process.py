@@ -41,10 +41,19 @@ def test_frames_come_in_their_order_and_none_is_left_out_while_few_are_waiting(c
 
 def test_when_too_many_are_waiting_the_newest_is_next_and_the_others_are_counted():
     sent = frames(MOST_WAITING + 1)
-    inbox = filled(sent)
+    inbox = filled(frames(1))
+    inbox.next()
+    for frame in sent:
+        inbox.put(frame)
     assert inbox.next() is sent[-1] and inbox.skipped == MOST_WAITING
     inbox.put(after := frames(1)[0])
     assert inbox.next() is after and inbox.skipped == 0
+
+
+def test_what_was_said_before_the_listener_was_ready_is_heard_in_full():
+    sent = frames(5 * MOST_WAITING)
+    inbox = filled(sent)
+    assert [inbox.next() for _ in sent] == sent and inbox.skipped == 0
 
 
 def test_the_end_waits_for_nothing():
@@ -126,8 +135,10 @@ def test_a_child_that_dies_is_started_anew_and_listens_again(listener):
     listener._child._process.wait()
     while listener.statistics()["restarts"] == 0:  # until the reading thread has seen the end of the pipe
         listener.poll(1.0)
-    assert listener._child.next(60.0)[0] == "ready"
-    listener._take("ready", None, 0.0, 1.0)
+    for kind in ("loaded", "ready"):
+        message = listener._child.next(60.0)
+        assert message[0] == kind
+        listener._take(*message, 1.0)
     assert answered(listener, 1.0) and listener.statistics()["state"] == "listening"
 
 

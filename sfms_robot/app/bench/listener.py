@@ -84,7 +84,7 @@ def _sfms_paper() -> Row:
         torch.manual_seed(0)
         model = SfmsModel(training.listener)
     params = sum(each.numel() for each in model.parameters())
-    return _plans(SfmsListener(training.listener, model).settle()) | {
+    return _plans(SfmsListener(training.listener, model).build_graphs()) | {
         "params": params,
         "weights": "seeded, not trained",
     }
@@ -122,7 +122,7 @@ def _arig(folder: Path, settings: config.Arig) -> Row:
     else:  # motion inside 0..1, where nothing is clipped
         model.motion_mean.copy_(torch.tensor([0.5 * (name not in POSE_CHANNELS) for name in settings.channels]))
         model.motion_std.fill_(0.02)
-    quick = ArigListener(settings, model).settle()
+    quick = ArigListener(settings, model).build_graphs()
     exact = ArigListener(settings.model_copy(update={"precision": "fp32"}), model)
     speaker = _speaker()
     full = _after_minutes(quick, 60)

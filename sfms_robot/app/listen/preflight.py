@@ -6,11 +6,16 @@ library only, so the answer takes as long as the interpreter does to start.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from sfms_robot.data import find
 from sfms_robot.errors import PortError
 from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.sources.registry import check_source
+
+if TYPE_CHECKING:
+    from sfms_robot.listeners.process import ListenerProcess
 
 
 def check_names(
@@ -29,3 +34,10 @@ def check_names(
         device = part.rpartition("=")[2]
         if device.startswith("/") and (problem := access_problem(device)):
             raise PortError(f"{device}: {problem}")
+
+
+def begin_listening(listener: str, seed: int) -> ListenerProcess:
+    """The listener's own process, which loads from now on. For `session.run(feed=...)`; closed by the caller."""
+    from sfms_robot.listeners.process import ListenerProcess  # numpy: not for who only mistyped a name
+
+    return ListenerProcess(listener, seed)

@@ -19,4 +19,4 @@ def load(folder: Path) -> ArigListener:
         raise ConfigError(f"{folder / checkpoint.CONFIG}: kind = {settings.kind!r} is not arig")
     model = ArigModel(settings)
     checkpoint.load_weights(folder / checkpoint.WEIGHTS, model)
-    return ArigListener(settings, model, MotionSpace.of(settings, folder)).settle()
+    return ArigListener(settings, model, MotionSpace.of(settings, folder))

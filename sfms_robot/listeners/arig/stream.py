@@ -85,7 +85,7 @@ class ArigListener:
         return 1
 
     @torch.inference_mode()
-    def settle(self) -> ArigListener:
+    def build_graphs(self) -> ArigListener:
         """The weights stay as they are from now on: what a frame computes becomes graphs. Itself."""
         memory = self.start(0)
         told, _ = self._told(SpeakerFrame(0.0, np.zeros(0, np.float32)), memory)

@@ -20,4 +20,4 @@ def load(folder: Path) -> SfmsListener:
         raise ConfigError(f"{folder / checkpoint.CONFIG}: kind = {settings.kind!r} is not sfms")
     model = SfmsModel(settings)
     checkpoint.load_weights(folder / checkpoint.WEIGHTS, model)
-    return SfmsListener(settings, model, MotionSpace.of(settings, folder), AudioFrontend.of(settings, folder)).settle()
+    return SfmsListener(settings, model, MotionSpace.of(settings, folder), AudioFrontend.of(settings, folder))

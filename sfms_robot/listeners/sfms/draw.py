@@ -104,7 +104,7 @@ class Sampler:
         self._graphs: tuple[Callable[..., Any], Callable[..., Any]] | None = None
 
     @torch.inference_mode()
-    def settle(self, seen: Context) -> None:
+    def build_graphs(self, seen: Context) -> None:
         """The weights stay as they are: what a single stream such as `seen` draws is drawn by graphs from now on."""
         slots, last, at = self._ahead(*seen.parts)
         frame, chance = torch.tensor(0), torch.zeros(1, seen.tokens.shape[2])

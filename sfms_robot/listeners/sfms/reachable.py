@@ -27,7 +27,8 @@ class Reach:
             needed = self.needed[group, 1:, 1:]
             for channel in quantizer.member[group].nonzero()[:, 0].tolist():
                 value = motion[:, channel]
-                torch.maximum(needed, (value[:, None] - value[None, :]).abs() / model.motion_speed[channel], out=needed)
+                frames = (value[:, None] - value[None, :]).abs_().div_(model.motion_speed[channel])
+                torch.maximum(needed, frames, out=needed)
             self.needed[group, :, 1 + size :] = torch.inf
         self._groups = torch.arange(len(sizes))
 

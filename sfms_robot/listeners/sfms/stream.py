@@ -111,10 +111,10 @@ class SfmsListener:
         self._decode = Decode(self.model, settings.future_frames + 2).eval()
         self._decode_one: Callable[..., Any] = self._decode
 
-    def settle(self) -> SfmsListener:
+    def build_graphs(self) -> SfmsListener:
         """The weights stay as they are from now on: what a single stream computes of a plan becomes graphs. Itself."""
         memory = self.start(0)
-        self.sampler.settle(_context(memory.speaker, memory.tokens[None]))
+        self.sampler.build_graphs(_context(memory.speaker, memory.tokens[None]))
         self._decode_one = graph(self._decode, (memory.tokens[None],))
         return self
 

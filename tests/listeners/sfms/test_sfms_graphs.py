@@ -19,7 +19,7 @@ def listener(**changes):
 )
 def test_graphs_make_the_same_plans(changes):
     speaker = speech(40)
-    before, after = plans_of(listener(**changes), speaker), plans_of(listener(**changes).settle(), speaker)
+    before, after = plans_of(listener(**changes), speaker), plans_of(listener(**changes).build_graphs(), speaker)
     assert before.keys() == after.keys() and len(after) >= 5
     for index, plan in before.items():
         np.testing.assert_allclose(after[index].frames, plan.frames, atol=1e-5)
@@ -28,13 +28,13 @@ def test_graphs_make_the_same_plans(changes):
 @pytest.mark.parametrize("missing", ["face", "audio"])
 def test_what_is_not_heard_or_seen_is_the_same_with_graphs(missing):
     speaker = speech(20, **{missing: False})
-    before, after = plans_of(tiny_listener(), speaker), plans_of(tiny_listener().settle(), speaker)
+    before, after = plans_of(tiny_listener(), speaker), plans_of(tiny_listener().build_graphs(), speaker)
     for index, plan in before.items():
         np.testing.assert_allclose(after[index].frames, plan.frames, atol=1e-5)
 
 
 def test_many_streams_at_once_are_none_the_worse_for_the_graphs_of_one():
-    found = guided_listener(2.0).settle()
+    found = guided_listener(2.0).build_graphs()
     memories, alone = (
         [found.start(seed) for seed in (1, 2, 3)],
         [plans_of(found, speech(9), seed) for seed in (1, 2, 3)],
