@@ -392,7 +392,8 @@ def run(
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
     if limited is not None:
         logger.warning("%s: %s", Path(options.listener).name, limited)
-    with ExitStack() as stack:
+    interrupt = interrupt or Interrupt()
+    with signals_to(interrupt) if signals else nullcontext(), ExitStack() as stack:  # until all is closed again
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         if source is None:
@@ -418,7 +419,7 @@ def run(
             overlay=overlay,
             observers=[*observers, *own],
         )  # fmt: skip
-        drove = drive_head(opened, programme, interrupt or Interrupt(), signals=signals)
+        drove = drive_head(opened, programme, interrupt, signals=False)
         report = run_report(
             drove.log, opened.bus, feed, head=opened.config.name, listener=Path(options.listener).name,
             port=options.port, seed=options.seed, outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz,

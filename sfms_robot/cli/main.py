@@ -5,9 +5,11 @@ from __future__ import annotations
 import json as json_module
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 import typer
 
@@ -84,15 +86,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if _COMPLETION in os.environ:
         app()
     words = list(sys.argv[1:] if arguments is None else arguments)
-    code, problem = _outcome([word for word in words if word in ("-v", "--verbose")] + [
-        word for word in words if word not in ("-v", "--verbose")
-    ])  # fmt: skip
+    verbose = [word for word in words if word in ("-v", "--verbose")]
+    with _endings_as_interrupts():
+        code, problem = _outcome(verbose + [word for word in words if word not in verbose])
     if problem is not None and "--json" in words:
         ended = "interrupted" if code == INTERRUPTED else "failed"
         told = {"version": 1, "exit": ended, "error": problem, "exit_code": code}
         with suppress(OSError):
             print(json_module.dumps(told), flush=True)
     sys.exit(code)
+
+
+@contextmanager
+def _endings_as_interrupts() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does, so that what a command has open is put right.
+
+    Not where they are ignored (nohup) or handled, and only in the main thread: Python gives signals to no other.
+    """
+    main_thread = threading.current_thread() is threading.main_thread()
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if main_thread and hasattr(signal, name)]
+    heeded = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    for number in heeded:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number in heeded:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _outcome(words: list[str]) -> tuple[int, str | None]:

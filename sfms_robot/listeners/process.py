@@ -276,7 +276,10 @@ def main() -> None:
     plans, frames = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")
     os.dup2(2, 1)  # whatever a library prints goes to stderr
     inbox = Inbox()
-    name, seed = pickle.load(frames)
+    try:
+        name, seed = pickle.load(frames)
+    except (EOFError, pickle.UnpicklingError):
+        return  # the parent ended before it said what to load
     threading.Thread(target=_receive, args=(frames, inbox), daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(NICE)

@@ -109,14 +109,16 @@ class Interrupt:
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """A request from the main thread's signal handler. Ctrl-\\ asks for release at once, as a second Ctrl-C does.
 
-        Raises KeyboardInterrupt before torque, `Released` after the second request: what blocks then is cut short.
+        Raises KeyboardInterrupt before torque, `Released` at the second request: what blocks then is cut short. Those
+        after it send torque-off again and raise nothing, so that the cleaning up goes on.
         """
+        before = self._asked
         if number == getattr(signal, "SIGQUIT", None):
             self._asked += 1
         self.ask()
         if self._bus is None:
             raise KeyboardInterrupt
-        if self._asked > 1:
+        if before < 2 <= self._asked:
             raise Released
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 
@@ -59,6 +60,33 @@ def test_a_failure_is_a_line_and_with_json_an_object(command, error, code, text)
 def test_an_interruption_is_130_without_a_word(command):
     ended, out, err = command(KeyboardInterrupt(), "breaks", "--json")
     assert (ended, err) == (130, "") and json.loads(out)["exit"] == "interrupted"
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_that_would_kill_is_an_interruption_and_its_handler_is_put_back(monkeypatch, capsys, name):
+    number = getattr(signal, name, None)
+    if number is None:
+        pytest.skip(f"no {name} here")
+    cleaned = []
+
+    def body() -> None:
+        try:
+            signal.raise_signal(number)
+        finally:
+            cleaned.append(True)
+
+    app = typer.Typer()
+    app.command("breaks")(body)
+    monkeypatch.setattr(command_line, "app", app)
+    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)  # whatever the tests were started under
+    try:
+        with pytest.raises(SystemExit) as ended:
+            command_line.main([])
+        assert signal.getsignal(number) is usual
+    finally:
+        signal.signal(number, before)
+    assert ended.value.code == 130 and cleaned and capsys.readouterr().err == ""
 
 
 def test_a_command_that_said_how_it_ended_is_not_spoken_for(command):

@@ -181,6 +181,12 @@ def test_the_child_ends_when_its_parent_is_killed():
     assert _ends(child)
 
 
+def test_a_child_whose_parent_goes_before_it_says_what_to_load_ends_without_a_word():
+    command = [sys.executable, "-c", "from sfms_robot.listeners.process import main; main()"]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def _ends(pid):
     """Whether a process that is not our child is gone, or soon will be: it has nothing left to wait for."""
     for _ in range(10_000_000):

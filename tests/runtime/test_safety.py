@@ -17,7 +17,7 @@ class NoBus:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_first_signal_is_a_request_and_a_second_releases(number: signal.Signals) -> None:
+def test_a_first_signal_is_a_request_a_second_releases_and_a_third_only_says_so_again(number: signal.Signals) -> None:
     ours, bus = signal.default_int_handler, NoBus()
     before = signal.signal(number, ours)  # whatever the tests were started under
     try:
@@ -30,6 +30,8 @@ def test_a_first_signal_is_a_request_and_a_second_releases(number: signal.Signal
             with pytest.raises(Released):
                 signal.raise_signal(number)
             assert bus.released == 1
+            signal.raise_signal(number)  # it must not cut short what the second has begun
+            assert bus.released == 2
         assert signal.getsignal(number) is ours
     finally:
         signal.signal(number, before)

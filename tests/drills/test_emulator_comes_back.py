@@ -1,0 +1,27 @@
+"""All servos lose their supply at once, and are found again somewhere else."""
+
+import json
+import os
+import signal
+
+import pytest
+from drill_rig import HEAD, PAN, TILT, listening, run, servos, torque
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("found_ticks", [1800, 3500], ids=["inside", "outside"])
+def test_servos_that_were_all_away_come_back_and_the_run_ends_as_usual(device, found_ticks):
+    with servos(device) as first, run(HEAD, device, "--json", duration_s=12) as running:
+        listening(running, first)
+        os.kill(first.pid, signal.SIGKILL)
+        running.until(lambda: not device.exists())  # until the host has let go of what is gone
+        with servos(device, found_ticks) as second:
+            listening(running, second)
+            code, out, err = running.ended()
+            states = [second.state(servo) for servo in (PAN, TILT)]
+            assert torque(second) == (False, False)
+    report = json.loads(out.splitlines()[-1])
+    assert (code, report["exit"], report["error"]) == (0, "done", None), err
+    assert report["limits"]["violations"] == 0 and report["bus"]["reconnects"] >= 1
+    assert all(abs(state["position"] - 2048) <= 10 for state in states)

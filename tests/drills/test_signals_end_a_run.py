@@ -1,0 +1,130 @@
+"""Signals from a terminal, a service manager or a hand on the keyboard, in every phase of a run on the command line."""
+
+import json
+import os
+import pty
+import signal
+import threading
+
+import pytest
+from drill_rig import (
+    DURATION_S,
+    PAN,
+    Command,
+    connecting,
+    enabling,
+    listening,
+    loading,
+    more_said,
+    resting,
+    run,
+    said,
+    torque,
+)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here"),
+]
+PHASES = (loading, connecting, enabling, listening, resting)
+HIDE, SHOW = b"\x1b[?25l", b"\x1b[?25h"
+CASES = [(phase, number) for phase in PHASES for number in (signal.SIGINT, signal.SIGTERM)]
+CASES += [(listening, signal.SIGHUP), (connecting, signal.SIGHUP)]
+
+
+def assert_limp(chain):
+    assert torque(chain) == (False, False)
+
+
+@pytest.mark.parametrize(("phase", "number"), CASES, ids=[f"{p.__name__}-{n.name}" for p, n in CASES])
+def test_a_signal_ends_a_run_without_torque_and_without_a_word(phase, number, slow_head, device, chain):
+    with run(slow_head, device, "--json", duration_s=DURATION_S.get(phase, 600)) as running:
+        phase(running, chain)
+        running.signal(number)
+        code, out, err = running.ended()
+    assert_limp(chain)
+    assert code == 130
+    assert [line for line in err.splitlines() if not line.startswith("WARNING: ")] == []  # of a computer that is busy
+    assert json.loads(out.splitlines()[-1])["exit"] == "interrupted"
+
+
+class Terminal:
+    """What a program shows on a terminal."""
+
+    def __init__(self):
+        self._near, self.far = pty.openpty()
+        self.shown = b""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self):
+        while True:
+            try:
+                part = os.read(self._near, 4096)
+            except OSError:  # nobody has the far end any more
+                return
+            if not part:
+                return
+            self.shown += part
+
+    def closed(self):
+        """All that was shown."""
+        os.close(self.far)
+        self._reader.join()
+        os.close(self._near)
+        return self.shown
+
+
+def once(running, chain):
+    running.signal(signal.SIGQUIT)
+
+
+def twice(running, chain):
+    running.signal(signal.SIGINT)
+    running.until(running.heeded)
+    more_said(running, chain, 100)  # Python has seen it too: a tick has passed
+    running.signal(signal.SIGINT)
+
+
+def many_times(running, chain):
+    for _ in range(27):
+        if running.process.poll() is None:
+            running.signal(signal.SIGINT)
+            said(chain)  # something else meanwhile
+
+
+@pytest.mark.parametrize(
+    ("phase", "press"),
+    [
+        (enabling, once),
+        (listening, once),
+        (resting, once),
+        (listening, twice),
+        (resting, twice),
+        (listening, many_times),
+    ],
+    ids=lambda each: each.__name__,
+)
+def test_who_insists_gets_no_torque_and_the_cursor_back(phase, press, slow_head, device, chain):
+    terminal = Terminal()
+    with run(
+        slow_head, device, stderr=terminal.far, duration_s=DURATION_S.get(phase, 600), TERM="xterm", COLUMNS="80"
+    ) as running:
+        phase(running, chain)
+        press(running, chain)
+        code, _, _ = running.ended()
+    shown = terminal.closed()
+    assert_limp(chain)
+    assert code == 130 and b"Traceback" not in shown and b"Error" not in shown
+    assert HIDE in shown and shown.rfind(SHOW) > shown.rfind(HIDE)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda each: each.name)
+def test_a_servo_moved_by_hand_is_limp_again_after_a_signal(number, device, chain):
+    with Command("servo", "move", PAN, "--by", "1000", "--baud", 1_000_000, "--port", device, "--json") as moving:
+        moving.until(lambda: any(torque(chain)))
+        moving.signal(number)
+        code, out, err = moving.ended()
+    assert_limp(chain)
+    assert code == 130 and "Traceback" not in err
+    assert json.loads(out.splitlines()[-1])["exit"] == "interrupted"
