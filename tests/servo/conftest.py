@@ -45,6 +45,9 @@ class Time:
     def now_s(self) -> float:
         return self.t
 
+    def wait_until(self, time_s: float) -> None:
+        self.t = max(self.t, time_s)
+
 
 @dataclass
 class Rig:

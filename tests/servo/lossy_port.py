@@ -52,6 +52,9 @@ class LossyPort:
     def now_s(self) -> float:
         return self.t
 
+    def wait_until(self, time_s: float) -> None:
+        self.t = max(self.t, time_s)
+
     def set_baud(self, baud: int) -> None:
         self.baud = baud
 

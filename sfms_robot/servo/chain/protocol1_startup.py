@@ -54,7 +54,7 @@ class Protocol1Startup(Startup[Frame1Link]):
         if self.value(index, level) != level.high:
             self._acknowledge(index)
         yield 0.0
-        now = yield from self._snapshot(index, table.size)
+        now = yield from self._release_outside(index, (yield from self._snapshot(index, table.size)))
         torque = now[self._name(index, "torque_enable")]
         for name, target in self._settings(index, now).items():
             if now[name] == target or (name == self._name(index, "torque_limit") and not now[name]):
