@@ -194,8 +194,7 @@ class Startup(ABC, Generic[L]):
         return present
 
     def _arrival(self, index: int, way: WayInside, limits: tuple[int, int]) -> Steps[int | None]:
-        """Where it stands, inside its limits; None when it does not come to stand there in time, or loses its torque.
-        """
+        """Where it stands, inside its limits; None when it does not come to stand there in time, or loses its torque."""
         torque, position = self._field(index, "torque_enable"), self._field(index, "present_position")
         before: int | None = None
         for _ in range(math.ceil(way.bound_s / _LOOK_S)):
