@@ -194,7 +194,7 @@ class Startup(ABC, Generic[L]):
         return present
 
     def _arrival(self, index: int, way: WayInside, limits: tuple[int, int]) -> Steps[int | None]:
-        """Where it stands, inside its limits; None when it does not come to stand there in time, or loses its torque."""
+        """Where it stands inside its limits; None where it does not come there in time, or loses its torque."""
         torque, position = self._field(index, "torque_enable"), self._field(index, "present_position")
         before: int | None = None
         for _ in range(math.ceil(way.bound_s / _LOOK_S)):
@@ -209,11 +209,13 @@ class Startup(ABC, Generic[L]):
         return None
 
     def _release_outside(self, index: int, now: Mapping[str, int]) -> Steps[dict[str, int]]:
-        """Torque off where a servo stands outside its own limits under torque: it was lost sight of while it was moved
-        inside, and its usual profile would let it jump. The registers `now`, with that.
+        """Torque off where a servo stands outside its own limits under torque with another profile than its usual:
+        it was lost sight of while it was moved inside, and its usual profile would let it jump. `now`, with that.
         """
-        limits, torque = self._limits_in(index, now), self._field(index, "torque_enable")
-        if limits is None or not now[torque.name] or _inside(now[self._name(index, "present_position")], limits):
+        limits, torque, usual = self._limits_in(index, now), self._field(index, "torque_enable"), self.wanted(index)
+        slow = any(now[name] != usual.get(name, 0) for name in slow_profile(self.tables[index], 0, 0.0))
+        outside = limits is not None and not _inside(now[self._name(index, "present_position")], limits)
+        if not (now[torque.name] and slow and outside):
             return dict(now)
         yield from self._write(index, torque, 0)
         return {**now, torque.name: 0}
