@@ -24,8 +24,8 @@ from sfms_robot.app.servo.diagnosis import (
     udev_rule,
 )
 from sfms_robot.app.servo.doctor import Line, examine, examine_line
-from sfms_robot.app.servo.servo_tools import parse_ids, reboot, set_baud, write_register
-from sfms_robot.app.servo.servo_wire import Wire
+from sfms_robot.app.servo.serial_line import Wire
+from sfms_robot.app.servo.single_servo import parse_ids, reboot, set_baud, write_register
 from sfms_robot.cli.main import app
 from sfms_robot.config import load_firmware_map, map_files
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch

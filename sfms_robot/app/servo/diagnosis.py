@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 from sfms_robot.app.servo.budget import Budget
-from sfms_robot.app.servo.servo_state import State
-from sfms_robot.app.servo.servo_wire import Seen
+from sfms_robot.app.servo.register_view import State
+from sfms_robot.app.servo.serial_line import Seen
 from sfms_robot.servo.discovery import Holder, SerialDevice
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names

@@ -31,9 +31,9 @@ from sfms_robot.app.servo.diagnosis import (
     udev_rule,
 )
 from sfms_robot.app.servo.protocol_hint import protocol_hint
-from sfms_robot.app.servo.servo_state import State, read_all
-from sfms_robot.app.servo.servo_tools import Confirm, Progress, field_named, guard, put, scan, twins
-from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.register_view import State, read_all
+from sfms_robot.app.servo.serial_line import SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.single_servo import Confirm, Progress, field_named, guard, put, scan, twins
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import launch

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from sfms_robot.app.servo.servo_wire import Wire, table_of
+from sfms_robot.app.servo.serial_line import Wire, table_of
 from sfms_robot.errors import PortError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs import protocol1 as frame1

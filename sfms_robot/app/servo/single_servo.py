@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from sfms_robot.app.servo.servo_wire import PATIENCE_S, TRIES, Seen, Wire
+from sfms_robot.app.servo.serial_line import PATIENCE_S, TRIES, Seen, Wire
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.duplicate_ids import hear_ping
