@@ -14,7 +14,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.servo.chain.dynamixel2_bus import DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.stored_settings import JointNeeds, unique_turn
@@ -46,7 +46,7 @@ def test_its_whole_range_is_reached_on_the_wire(tmp_path):
     (servos,) = emulated(head).values()
     table = load_firmware_map("xm430-w350")
     with launch(servos, virtual=True) as chain:
-        bus = DynamixelBus(
+        bus = Dynamixel2Bus(
             "main",
             [
                 BusServo(name, j.id, table, j.min_rad, j.max_rad, head.safety_of(name))

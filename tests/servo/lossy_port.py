@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
 from sfms_robot.emulator.protocol1_chain import Protocol1Chain
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.registers import Table
 
 BAUD = 1_000_000
@@ -72,5 +72,5 @@ def device_of(table: Table, *rows: dict[str, object]) -> Dynamixel2Chain | Proto
 
 def link_on(port: LossyPort, table: Table) -> RegisterLink:
     if table.protocol == 2:
-        return Dxl2Link(port, port.baud, SILENCE_S)
-    return Frame1Link(port, port.baud, SILENCE_S, table.family)
+        return Dynamixel2Link(port, port.baud, SILENCE_S)
+    return Protocol1Link(port, port.baud, SILENCE_S, table.family)

@@ -217,7 +217,7 @@ def _judge_model(seen: Seen, want: Wanted, command: Command) -> Iterator[Finding
         )
 
 
-def judge_twins(ids: Sequence[int]) -> Iterator[Finding]:
+def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
     """Ids to which two servos seem to answer."""
     for servo in ids:
         yield Finding(

@@ -8,7 +8,7 @@ from typing import Final
 
 from sfms_robot.config import variant
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.link import Found
 from sfms_robot.servo.chain.startup import Silent, Startup, Steps
 from sfms_robot.servo.policy import torque_limit
@@ -23,7 +23,7 @@ _REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
 _AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers that startup reads
 
 
-class Dynamixel2Startup(Startup[Dxl2Link]):
+class Dynamixel2Startup(Startup[Dynamixel2Link]):
     """`Startup` with servos that tell their firmware, which decides where their registers lie."""
 
     can_reboot = True

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from frame1_rig import rig_of
+from protocol1_rig import rig_of
 
 from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
 from sfms_robot.errors import BusError, ConfigError, ServoError
