@@ -9,7 +9,7 @@ import logging
 from collections.abc import Collection, Mapping
 from typing import Final
 
-from sfms_robot.app.servo.servo_wire import Seen, Wire
+from sfms_robot.app.servo.serial_line import Seen, Wire
 from sfms_robot.app.wiring import SIM, devices, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.calibrate_first import held_back

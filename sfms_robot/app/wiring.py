@@ -20,6 +20,8 @@ from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import list_ports, stable_name
 from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
 from sfms_robot.servo.port_choice import AUTO, choose_ports, parse_ports
+from sfms_robot.servo.registers import Table
+from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
 SIM: Final = "sim"
 
@@ -51,16 +53,24 @@ def calibration_of(joints: dict[str, Joint]) -> Calibration:
 
 
 def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
-    """Per bus, the servos of a head that was switched off: sagged onto its stops, torque off."""
+    """Per bus, the servos of a head that was switched off: sagged onto its stops, torque off.
+
+    A geared joint hangs where its servo, which counts turns from power-up only, can be in one place of its range.
+    """
     by_bus: dict[str, list[EmulatedServo]] = {}
     calibration, sagging = calibration_of(head.joints), sagging_joints(head)
     for index, (name, joint) in enumerate(head.joints.items()):
+        table = Table.of(load_firmware_map(joint.model))
         ticks = sagged_ticks(
             sagged_rad(joint, name in sagging),
             calibration.zero_ticks[index],
             calibration.ticks_per_rad[index],
-            load_firmware_map(joint.model).center_ticks,
+            table.center_ticks,
         )
+        needs = JointNeeds(int(calibration.low_ticks[index]), int(calibration.high_ticks[index]))
+        if multi_turn(table, needs):
+            first, last = home_ticks(table.ticks_per_revolution, needs)
+            ticks = max(first, min(ticks, last))
         baud = head.buses[joint.bus].baud
         servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
         by_bus.setdefault(joint.bus, []).append(servo)

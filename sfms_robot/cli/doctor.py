@@ -26,7 +26,7 @@ def doctor(
     Exit code 0: fit to run. 3: the port cannot be opened. 4: a finding stops the head from running.
     """
     from sfms_robot.app.servo.doctor import examine
-    from sfms_robot.app.servo.servo_wire import real_clock
+    from sfms_robot.app.servo.serial_line import real_clock
     from sfms_robot.cli.show_servo import bar, print_doctor
 
     confirm = confirmation(yes) if fix else None

@@ -15,7 +15,7 @@ from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
-    from sfms_robot.app.servo.servo_wire import Seen, Wire
+    from sfms_robot.app.servo.serial_line import Seen, Wire
 
 app = typer.Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
 
@@ -40,8 +40,8 @@ def scan(
 ) -> None:
     """Who is there, at which rate."""
     from sfms_robot.app.servo.protocol_hint import protocol_hint
-    from sfms_robot.app.servo.servo_tools import parse_ids
-    from sfms_robot.app.servo.servo_tools import scan as look
+    from sfms_robot.app.servo.single_servo import parse_ids
+    from sfms_robot.app.servo.single_servo import scan as look
 
     asked = parse_ids(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
@@ -80,7 +80,7 @@ def read(
     registers: Annotated[list[str], typer.Argument(metavar="REGISTER...", help="Names, or 'all'.")],
 ) -> None:
     """Registers by name: raw and in their unit."""
-    from sfms_robot.app.servo.servo_tools import read_registers
+    from sfms_robot.app.servo.single_servo import read_registers
 
     def look(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
         return [{"id": seen.id, **value.row()} for value in read_registers(wire, seen, registers)]
@@ -98,7 +98,7 @@ def write(
     yes: YesOption = False,
 ) -> None:
     """Write a register and read it back. What lasts (EEPROM) is asked about first, and refused while torque is on."""
-    from sfms_robot.app.servo.servo_tools import write_register
+    from sfms_robot.app.servo.single_servo import write_register
 
     confirm = confirmation(yes, ids)
 
@@ -135,7 +135,7 @@ def dump(
     """All registers of servos into a YAML file."""
     from sfms_robot.app.servo.dump import dump as taken
     from sfms_robot.app.servo.dump import save_dump
-    from sfms_robot.app.servo.servo_tools import scan as look
+    from sfms_robot.app.servo.single_servo import scan as look
 
     with on.open() as wire, _bar("reading", hidden=on.json) as progress:
         servos = [wire.find(servo) for servo in _parsed(ids)] if ids is not None else look(wire, None, progress)
@@ -185,7 +185,7 @@ def set_id(
     yes: YesOption = False,
 ) -> None:
     """Give a servo another id. Best with that one servo on the wire."""
-    from sfms_robot.app.servo.servo_tools import set_id as change
+    from sfms_robot.app.servo.single_servo import set_id as change
 
     _each(
         str(old),
@@ -204,7 +204,7 @@ def set_baud(
     yes: YesOption = False,
 ) -> None:
     """Give servos another rate, and check that they answer at it."""
-    from sfms_robot.app.servo.servo_tools import set_baud as change
+    from sfms_robot.app.servo.single_servo import set_baud as change
 
     confirm = confirmation(yes, ids)
     _each(
@@ -223,7 +223,7 @@ def reboot(
     yes: YesOption = False,
 ) -> None:
     """Start servos over: torque goes off, latched hardware errors go away."""
-    from sfms_robot.app.servo.servo_tools import reboot as restart
+    from sfms_robot.app.servo.single_servo import reboot as restart
 
     confirm = confirmation(yes, ids)
     _each(
@@ -243,7 +243,7 @@ def factory_reset(
     yes: YesOption = False,
 ) -> None:
     """Put a servo's settings back to what they were when it was new."""
-    from sfms_robot.app.servo.servo_tools import factory_reset as reset
+    from sfms_robot.app.servo.single_servo import factory_reset as reset
 
     _each(
         str(servo),
@@ -262,8 +262,8 @@ def monitor(
     rate: Annotated[float, typer.Option("--rate", min=0.1, max=50.0, help="Looks per second.")] = 5.0,
 ) -> None:
     """Position, load, voltage, temperature and faults, live. Reads only."""
-    from sfms_robot.app.servo.servo_state import samples as looks
-    from sfms_robot.app.servo.servo_tools import scan as look
+    from sfms_robot.app.servo.register_view import samples as looks
+    from sfms_robot.app.servo.single_servo import scan as look
 
     taken: list[list[dict[str, Any]]] = []
     with on.open() as wire:
@@ -316,7 +316,7 @@ def maps(
 
 
 def _parsed(ids: str) -> list[int]:
-    from sfms_robot.app.servo.servo_tools import parse_ids
+    from sfms_robot.app.servo.single_servo import parse_ids
 
     return parse_ids(ids)
 

@@ -16,7 +16,7 @@ import typer
 from sfms_robot.errors import ConfigError
 
 if TYPE_CHECKING:
-    from sfms_robot.app.servo.servo_wire import Wire
+    from sfms_robot.app.servo.serial_line import Wire
 
 
 class Family(StrEnum):
@@ -42,7 +42,7 @@ class Wiring:
 
     @contextmanager
     def open(self) -> Iterator[Wire]:
-        from sfms_robot.app.servo.servo_wire import open_wire, real_clock
+        from sfms_robot.app.servo.serial_line import open_wire, real_clock
 
         with open_wire(self.port, self.family.value, self.baud, self.head, real_clock(), self.model) as wire:
             yield wire

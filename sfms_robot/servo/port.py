@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, Protocol
 
 from sfms_robot.errors import BusError, PortError
+from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import Holder, holders
 from sfms_robot.servo.serial_io import (
     DEVICE_ERRORS,
@@ -43,12 +44,6 @@ _NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs behind which servos
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
 
 
-class Now(Protocol):
-    """The part of a clock that a port needs."""
-
-    def now_s(self) -> float: ...
-
-
 class Port(Protocol):
     """What a bus needs of a port."""
 
@@ -66,6 +61,9 @@ class Port(Protocol):
 
     def now_s(self) -> float: ...
 
+    def wait_until(self, time_s: float) -> None:
+        """Let time go by until `time_s` of `now_s`."""
+
     def set_baud(self, baud: int) -> None: ...
 
     def close(self) -> None:
@@ -78,7 +76,7 @@ class SerialPort:
     `rs485` says who switches the direction of a half-duplex RS-485 driver; None: nobody has to.
     """
 
-    def __init__(self, device: str, baud: int, clock: Now, rs485: Rs485 | None = None) -> None:
+    def __init__(self, device: str, baud: int, clock: Clock, rs485: Rs485 | None = None) -> None:
         """Opens it. Raises PortError of one line; nothing stays open then."""
         self.name = device
         self._clock = clock
@@ -106,6 +104,9 @@ class SerialPort:
     def now_s(self) -> float:
         return self._clock.now_s()
 
+    def wait_until(self, time_s: float) -> None:
+        self._clock.wait_until(time_s)
+
     def set_baud(self, baud: int) -> None:
         try:
             self._serial.baudrate = baud
@@ -123,7 +124,7 @@ class VirtualTimePort:
 
     _WINDOW = 2048  # bytes on their way at most: more than the terminal holds would block for good
 
-    def __init__(self, device: str, control_path: str, baud: int, clock: Now) -> None:
+    def __init__(self, device: str, control_path: str, baud: int, clock: Clock) -> None:
         self.name = device
         self._clock = clock
         self._written = 0
@@ -172,6 +173,9 @@ class VirtualTimePort:
 
     def now_s(self) -> float:
         return self._clock.now_s()
+
+    def wait_until(self, time_s: float) -> None:
+        self._clock.wait_until(time_s)
 
     def set_baud(self, baud: int) -> None:
         if self._told < self._written:

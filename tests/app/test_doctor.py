@@ -17,15 +17,15 @@ from sfms_robot.app.servo.diagnosis import (
     grouped,
     ids_text,
     judge_adapter,
+    judge_duplicate_ids,
     judge_opening,
     judge_port,
     judge_rate,
-    judge_twins,
     udev_rule,
 )
 from sfms_robot.app.servo.doctor import Line, examine, examine_line
-from sfms_robot.app.servo.servo_tools import parse_ids, reboot, set_baud, write_register
-from sfms_robot.app.servo.servo_wire import Wire
+from sfms_robot.app.servo.serial_line import Wire
+from sfms_robot.app.servo.single_servo import parse_ids, reboot, set_baud, write_register
 from sfms_robot.cli.main import app
 from sfms_robot.config import load_firmware_map, map_files
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
@@ -433,7 +433,7 @@ def test_fast_sync_read_makes_a_slow_bus_fast_enough_where_it_works():
 
 def test_findings_alike_are_one_and_the_worst_come_first():
     notes = [Finding("note", f"id {i}", "slow", "do {id}", i) for i in (3, 1, 2)]
-    out = grouped([*notes, *judge_twins([7])])
+    out = grouped([*notes, *judge_duplicate_ids([7])])
     assert [(each.severity, each.about) for each in out] == [("error", "id 7"), ("note", "ids 1-3")]
     assert out[1].fix == "do 1-3"
 

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from sfms_robot.app.head.head_check import check as check_head
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.servo.doctor import examine
 from sfms_robot.app.wiring import calibration_of, emulated
@@ -13,9 +14,10 @@ from sfms_robot.data import data_dir
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.servo.chain.dynamixel2_bus import DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import VirtualTimePort
+from sfms_robot.servo.stored_settings import JointNeeds, unique_turn
 
 GEAR = "ratio: 3.0\n    min_deg: -80\n    max_deg: 80"  # 2048 +- 2731 ticks
 
@@ -44,7 +46,7 @@ def test_its_whole_range_is_reached_on_the_wire(tmp_path):
     (servos,) = emulated(head).values()
     table = load_firmware_map("xm430-w350")
     with launch(servos, virtual=True) as chain:
-        bus = DynamixelBus(
+        bus = Dynamixel2Bus(
             "main",
             [
                 BusServo(name, j.id, table, j.min_rad, j.max_rad, head.safety_of(name))
@@ -89,6 +91,24 @@ def test_a_range_that_leaves_no_place_for_certain_after_power_up_is_refused(tmp_
     head = geared(tmp_path, "ratio: 8.0\n    min_deg: -80\n    max_deg: 80")
     with pytest.raises(ConfigError, match="joints.pan.zero_ticks.*less than two turns"):
         checked(head)
+
+
+def test_a_head_that_could_never_be_driven_is_told_by_head_check(tmp_path):
+    head = geared(tmp_path, "ratio: 8.0\n    min_deg: -80\n    max_deg: 80")
+    (problem,) = check_head(str(tmp_path / "geared")).problems
+    with pytest.raises(ConfigError, match="joints.pan.zero_ticks") as refused:
+        checked(head)
+    assert problem == str(refused.value)
+
+
+@pytest.mark.parametrize("end_deg", [80, 110, 118])
+def test_its_emulated_servo_hangs_where_its_turn_is_certain(tmp_path, end_deg):
+    head = geared(tmp_path, GEAR.replace("80", str(end_deg)))
+    checked(head)
+    conversion = calibration_of(head.joints)
+    needs = JointNeeds(int(conversion.low_ticks[0]), int(conversion.high_ticks[0]))
+    pan = next(servo for servo in emulated(head)["main"] if servo.id == head.joints["pan"].id)
+    assert unique_turn(pan.start_ticks, 4096, needs)
 
 
 def test_the_doctor_wants_its_mode(tmp_path):

@@ -1,7 +1,7 @@
 """Asked in the wrong protocol, servos are named in theirs, quickly."""
 
 import pytest
-from test_servo_tools import wire_on
+from test_single_servo import wire_on
 
 from sfms_robot.app.servo.protocol_hint import protocol_hint
 from sfms_robot.config import load_firmware_map

@@ -1,7 +1,7 @@
 """Registers of a servo in a file and back into another one of the same model."""
 
 import pytest
-from test_servo_tools import no, put, wire_on, yes
+from test_single_servo import no, put, wire_on, yes
 
 from sfms_robot.app.servo.dump import differences, dump, load_dump, restore, save_dump
 from sfms_robot.config import load_firmware_map

@@ -1,10 +1,10 @@
 """`servo move`: slowly there, and the servo left as it was found, whatever happens on the way."""
 
 import pytest
-from test_servo_tools import put, wire_on
+from test_single_servo import put, wire_on
 
 from sfms_robot.app.servo.move import BEHIND_DEG, SPEED_DEG_S, move
-from sfms_robot.app.servo.servo_tools import field_named, read
+from sfms_robot.app.servo.single_servo import field_named, read
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import ConfigError, ServoError

@@ -10,8 +10,7 @@ from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.protocol1_chain import Protocol1Chain
 from sfms_robot.emulator.pulse_boards import Ssc32Board
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
 from sfms_robot.servo.registers import Table
 
@@ -142,7 +141,7 @@ def test_two_protocols_share_one_wire():
     for _ in range(3):
         wire.receive(encode_instruction(1, dxl2.PING), BAUD, 0.0)
         assert ids_in(wire.take(0.0)) == [1]
-        wire.receive(frame1.encode(20, frame1.PING), BAUD, 0.0)
+        wire.receive(protocol1.encode(20, protocol1.PING), BAUD, 0.0)
         assert [out.servos for out in wire.take(0.0)] == [(20,)]
 
 

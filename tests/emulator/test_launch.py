@@ -11,7 +11,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch, wait
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
 
@@ -95,8 +95,8 @@ def test_what_somebody_stored_is_there_in_the_older_families_too(model, name, va
     table = Table.of(load_firmware_map(model))
     servo = EmulatedServo(1, model, start_ticks=table.center_ticks, registers={name: value}, supply_v=20.0)
     with launch([servo], virtual=True) as chain:
-        link = Frame1Link(VirtualTimePort(chain.device, chain.control, servo.baud, VirtualClock()), servo.baud, 0.003,
-                          table.family)  # fmt: skip
+        port = VirtualTimePort(chain.device, chain.control, servo.baud, VirtualClock())
+        link = Protocol1Link(port, servo.baud, 0.003, table.family)
         answer = link.read(1, table[name].address, table[name].size)
         link.port.close()
         assert table[name].from_bytes(answer.data) == value

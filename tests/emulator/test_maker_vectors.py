@@ -26,7 +26,7 @@ def vectors(file, column):
 
 
 NEW = {name: bytes.fromhex(text) for name, text in vectors("dxl2_packets.csv", "packet").items()}
-OLD = {name: bytes.fromhex(text) for name, text in vectors("frame1_packets.csv", "frame").items()}
+OLD = {name: bytes.fromhex(text) for name, text in vectors("protocol1_packets.csv", "frame").items()}
 BOARD = vectors("board_commands.csv", "bytes")
 
 

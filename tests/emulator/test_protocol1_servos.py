@@ -4,8 +4,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.protocol1_chain import Protocol1Chain
-from sfms_robot.servo.codecs import dxl1, feetech
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
 from sfms_robot.servo.registers import Table
 
@@ -43,14 +42,14 @@ def ask(device, servo, code, params=b"", now_s=0.0, baud=BAUD) -> list[Frame]:
 
 def get(device, servo, name, now_s=0.0) -> int:
     field = device.servo(servo).table[name]
-    (answer,) = ask(device, servo, frame1.READ, bytes([field.address, field.size]), now_s)
+    (answer,) = ask(device, servo, protocol1.READ, bytes([field.address, field.size]), now_s)
     return field.from_bytes(answer.params)
 
 
 def put(device, servo, name, value, now_s=0.0) -> int:
     """Error byte of the acknowledgement."""
     field = device.servo(servo).table[name]
-    (answer,) = ask(device, servo, frame1.WRITE, bytes([field.address]) + field.to_bytes(value), now_s)
+    (answer,) = ask(device, servo, protocol1.WRITE, bytes([field.address]) + field.to_bytes(value), now_s)
     return answer.code
 
 
@@ -58,7 +57,7 @@ def put(device, servo, name, value, now_s=0.0) -> int:
 def test_every_model_answers_a_ping_and_goes_where_it_is_told(model):
     device = device_of(model)
     table = device.servo(1).table
-    assert ask(device, 1, frame1.PING) == [Frame(1, 0, b"")]
+    assert ask(device, 1, protocol1.PING) == [Frame(1, 0, b"")]
     assert get(device, 1, "model_number") == (table.model_number or 0)
     goal = table.center_ticks + 100
     assert put(device, 1, "goal_position", goal) == 0
@@ -84,7 +83,7 @@ def test_torque_without_a_goal_is_a_jump_to_the_middle(model):
 
 def test_byte_order_is_that_of_the_series():
     device = device_of("sts3215", "scs0009", start_ticks=0x0123)
-    little, big = (ask(device, servo, frame1.READ, bytes([56, 2]))[0].params for servo in (1, 2))
+    little, big = (ask(device, servo, protocol1.READ, bytes([56, 2]))[0].params for servo in (1, 2))
     assert (little, big) == (b"\x23\x01", b"\x01\x23")
 
 
@@ -98,20 +97,20 @@ def test_speed_backwards_carries_its_sign_bit():
 def test_only_servos_at_the_hosts_baud_hear_it_give_or_take_three_percent():
     device = device_of("ax-12a")
     put(device, 1, "baud_rate", 34)  # 57,142 in truth
-    assert ask(device, 1, frame1.PING) == []
-    assert len(ask(device, 1, frame1.PING, baud=57_600)) == 1
-    assert ask(device, 1, frame1.PING, baud=None) == []
+    assert ask(device, 1, protocol1.PING) == []
+    assert len(ask(device, 1, protocol1.PING, baud=57_600)) == 1
+    assert ask(device, 1, protocol1.PING, baud=None) == []
 
 
 def test_dynamixel_says_what_it_refuses_and_changes_nothing():
     device = device_of("ax-12a")
     put(device, 1, "cw_angle_limit", 200)
     assert put(device, 1, "goal_position", 100) == dxl1.ANGLE_LIMIT
-    assert ask(device, 1, frame1.WRITE, bytes([36, 0, 0]))[0].code == dxl1.RANGE  # read-only
-    assert ask(device, 1, frame1.WRITE, bytes([24, 7]))[0].code == dxl1.RANGE
-    assert ask(device, 1, frame1.READ, bytes([48, 20]))[0] == Frame(1, dxl1.RANGE, b"")
+    assert ask(device, 1, protocol1.WRITE, bytes([36, 0, 0]))[0].code == dxl1.RANGE  # read-only
+    assert ask(device, 1, protocol1.WRITE, bytes([24, 7]))[0].code == dxl1.RANGE
+    assert ask(device, 1, protocol1.READ, bytes([48, 20]))[0] == Frame(1, dxl1.RANGE, b"")
     assert ask(device, 1, 0x77)[0].code == dxl1.INSTRUCTION
-    assert ask(device, 1, frame1.ACTION)[0].code == dxl1.INSTRUCTION  # nothing was registered
+    assert ask(device, 1, protocol1.ACTION)[0].code == dxl1.INSTRUCTION  # nothing was registered
     assert (get(device, 1, "goal_position"), get(device, 1, "torque_enable")) == (512, 0)
 
 
@@ -119,7 +118,7 @@ def test_feetech_takes_what_it_can_and_says_nothing():
     device = device_of("scs0009")
     assert put(device, 1, "goal_position", 5) == 0
     assert get(device, 1, "goal_position") == 20  # its own limit
-    assert ask(device, 1, frame1.WRITE, bytes([56, 0, 0]))[0].code == 0
+    assert ask(device, 1, protocol1.WRITE, bytes([56, 0, 0]))[0].code == 0
     assert ask(device, 1, 0x77) == []
 
 
@@ -127,9 +126,9 @@ def test_feetech_takes_what_it_can_and_says_nothing():
 def test_registered_write_waits_for_action(model, kept):
     device = device_of(model)
     goal = device.servo(1).table["goal_position"]
-    ask(device, 1, frame1.REG_WRITE, bytes([goal.address]) + goal.to_bytes(300))
+    ask(device, 1, protocol1.REG_WRITE, bytes([goal.address]) + goal.to_bytes(300))
     assert get(device, 1, "goal_position") == kept
-    assert ask(device, BROADCAST, frame1.ACTION) == []
+    assert ask(device, BROADCAST, protocol1.ACTION) == []
     assert get(device, 1, "goal_position") == 300
 
 
@@ -155,15 +154,15 @@ def test_status_level_decides_who_is_answered():
     device = device_of("ax-12a", "sts3215")
     put(device, 1, "status_return_level", 0)
     put(device, 2, "response_level", 0)
-    assert ask(device, 1, frame1.READ, bytes([3, 1])) == [] and len(ask(device, 1, frame1.PING)) == 1
-    assert len(ask(device, 2, frame1.READ, bytes([5, 1]))) == 1  # reads are answered whatever the level
-    assert ask(device, 2, frame1.WRITE, bytes([40, 0])) == []
+    assert ask(device, 1, protocol1.READ, bytes([3, 1])) == [] and len(ask(device, 1, protocol1.PING)) == 1
+    assert len(ask(device, 2, protocol1.READ, bytes([5, 1]))) == 1  # reads are answered whatever the level
+    assert ask(device, 2, protocol1.WRITE, bytes([40, 0])) == []
 
 
 def test_sync_write_reaches_all_and_nobody_answers():
     device = device_of("sts3215", "sts3215")
     params = dxl1.sync_write_params(42, {1: b"\x00\x04", 2: b"\x00\x05"})
-    assert ask(device, BROADCAST, frame1.SYNC_WRITE, params) == []
+    assert ask(device, BROADCAST, protocol1.SYNC_WRITE, params) == []
     assert [get(device, i, "goal_position") for i in (1, 2)] == [0x400, 0x500]
 
 
@@ -190,15 +189,15 @@ def test_scs_knows_no_sync_read_and_ax_no_bulk_read():
 
 def test_broadcast_ping_is_a_feetech_matter():
     device = device_of("sts3215", "ax-12a", "scs0009")
-    assert [frame.servo for frame in ask(device, BROADCAST, frame1.PING)] == [1, 3]
+    assert [frame.servo for frame in ask(device, BROADCAST, protocol1.PING)] == [1, 3]
 
 
 def test_factory_reset_gives_back_id_and_baud():
     device = device_of("sts3215")
     put(device, 1, "lock", 0)
-    assert ask(device, 1, frame1.WRITE, bytes([5, 9])) == [Frame(1, 0, b"")]  # the old id says yes
-    assert ask(device, 1, frame1.PING) == []
-    assert ask(device, 9, frame1.FACTORY_RESET) == [Frame(9, 0, b"")]
+    assert ask(device, 1, protocol1.WRITE, bytes([5, 9])) == [Frame(1, 0, b"")]  # the old id says yes
+    assert ask(device, 1, protocol1.PING) == []
+    assert ask(device, 9, protocol1.FACTORY_RESET) == [Frame(9, 0, b"")]
     assert get(device, 1, "id") == 1
 
 
@@ -206,29 +205,29 @@ def test_overload_comes_from_the_motor_and_takes_the_torque():
     device = device_of("ax-12a")
     device.servo(1).plant.stuck = True
     put(device, 1, "goal_position", 900)
-    (answer,) = ask(device, 1, frame1.PING, now_s=3.0)
+    (answer,) = ask(device, 1, protocol1.PING, now_s=3.0)
     assert answer.code == dxl1.OVERLOAD
     assert (get(device, 1, "torque_enable", 3.0), get(device, 1, "torque_limit", 3.0)) == (0, 0)
     device.servo(1).plant.stuck = False
     put(device, 1, "torque_limit", 1023, 3.0)
     put(device, 1, "torque_enable", 1, 3.0)
-    assert ask(device, 1, frame1.PING, now_s=3.0)[0].code == 0
+    assert ask(device, 1, protocol1.PING, now_s=3.0)[0].code == 0
 
 
 def test_voltage_bit_is_there_as_long_as_the_voltage_is_wrong():
     device = device_of("sts3215")
     device.servo(1).set_supply(9.5, 0.0)
-    assert ask(device, 1, frame1.PING)[0].code == feetech.VOLTAGE
+    assert ask(device, 1, protocol1.PING)[0].code == feetech.VOLTAGE
     assert get(device, 1, "present_voltage") == 95
     device.servo(1).set_supply(7.4, 0.0)
-    assert ask(device, 1, frame1.PING)[0].code == 0
+    assert ask(device, 1, protocol1.PING)[0].code == 0
 
 
 def test_brown_out_is_silence_and_then_a_start_without_torque():
     device = device_of("scs0009")
     put(device, 1, "goal_position", 600)
     device.servo(1).set_supply(1.0, 0.5)
-    assert ask(device, 1, frame1.PING, now_s=0.5) == []
+    assert ask(device, 1, protocol1.PING, now_s=0.5) == []
     device.servo(1).set_supply(6.0, 1.0)
     assert (get(device, 1, "torque_enable", 1.0), get(device, 1, "goal_position", 1.0)) == (0, 512)
 
@@ -275,21 +274,21 @@ def test_where_it_is_does_not_depend_on_who_looked():
 
 def test_two_servos_with_one_id_both_answer():
     device = device_of("ax-12a", "ax-12a")
-    ask(device, 2, frame1.WRITE, bytes([3, 1]))
-    assert len(ask(device, 1, frame1.PING)) == 2
+    ask(device, 2, protocol1.WRITE, bytes([3, 1]))
+    assert len(ask(device, 1, protocol1.PING)) == 2
 
 
 def test_frame_of_the_other_protocol_is_rubbish():
     device = device_of("ax-12a")
     other = bytes.fromhex("FF FF FD 00 01 03 00 01 19 4E")
     assert device.receive(other, BAUD, 0.0) == b""
-    assert len(ask(device, 1, frame1.PING)) == 1
+    assert len(ask(device, 1, protocol1.PING)) == 1
 
 
 def test_unfinished_frame_is_forgotten_after_a_pause():
     device = device_of("ax-12a")
-    assert device.receive(encode(1, frame1.READ, b"\x24\x02")[:-1], BAUD, 0.0) == b""
-    assert len(ask(device, 1, frame1.PING, now_s=1.0)) == 1
+    assert device.receive(encode(1, protocol1.READ, b"\x24\x02")[:-1], BAUD, 0.0) == b""
+    assert len(ask(device, 1, protocol1.PING, now_s=1.0)) == 1
 
 
 @given(st.lists(st.binary(max_size=80), max_size=10))

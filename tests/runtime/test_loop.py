@@ -19,7 +19,7 @@ from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.sources.recording import Recording
 
@@ -122,7 +122,7 @@ def run(
 
 def chain_state(chain: Chain, clock: VirtualClock) -> dict[int, dict[str, int]]:
     """Torque and position of every servo, read by the vendor-independent codec over a second port."""
-    link = Dxl2Link(VirtualTimePort(chain.device, chain.control, 4_000_000, clock), 4_000_000, 0.05)
+    link = Dynamixel2Link(VirtualTimePort(chain.device, chain.control, 4_000_000, clock), 4_000_000, 0.05)
     try:
         ids = [joint.id for joint in HEAD.joints.values()]
         torque = link.sync_read(64, 1, ids)

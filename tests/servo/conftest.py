@@ -10,8 +10,8 @@ from hypothesis import settings
 
 from sfms_robot.config import Bus, Faults, Safety, load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
 
 settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure
@@ -45,12 +45,15 @@ class Time:
     def now_s(self) -> float:
         return self.t
 
+    def wait_until(self, time_s: float) -> None:
+        self.t = max(self.t, time_s)
+
 
 @dataclass
 class Rig:
     chain: Chain
     clock: Time
-    bus: DynamixelBus
+    bus: Dynamixel2Bus
     count: int
     baud: int
 
@@ -58,9 +61,9 @@ class Rig:
         return VirtualTimePort(self.chain.device, self.chain.control, self.baud, self.clock)
 
     @contextmanager
-    def link(self) -> Iterator[Dxl2Link]:
+    def link(self) -> Iterator[Dynamixel2Link]:
         """Another host on the same wire; the bus must be closed."""
-        link = Dxl2Link(self.port(), self.baud, 0.003)
+        link = Dynamixel2Link(self.port(), self.baud, 0.003)
         try:
             yield link
         finally:
@@ -109,7 +112,7 @@ def rig_of(
     ids = expected or [servo.id for servo in servos]
     with launch(servos, virtual=True) as chain:
         clock = Time()
-        bus = DynamixelBus(
+        bus = Dynamixel2Bus(
             "face",
             [BusServo(f"joint{i}", i, table, -LIMIT_RAD, LIMIT_RAD, safety or Safety()) for i in ids],
             Linear(LIMIT_RAD, table.center_ticks, 2 * np.pi / table.ticks_per_revolution),

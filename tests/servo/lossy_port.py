@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
 from sfms_robot.emulator.protocol1_chain import Protocol1Chain
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.registers import Table
 
 BAUD = 1_000_000
@@ -52,6 +52,9 @@ class LossyPort:
     def now_s(self) -> float:
         return self.t
 
+    def wait_until(self, time_s: float) -> None:
+        self.t = max(self.t, time_s)
+
     def set_baud(self, baud: int) -> None:
         self.baud = baud
 
@@ -69,5 +72,5 @@ def device_of(table: Table, *rows: dict[str, object]) -> Dynamixel2Chain | Proto
 
 def link_on(port: LossyPort, table: Table) -> RegisterLink:
     if table.protocol == 2:
-        return Dxl2Link(port, port.baud, SILENCE_S)
-    return Frame1Link(port, port.baud, SILENCE_S, table.family)
+        return Dynamixel2Link(port, port.baud, SILENCE_S)
+    return Protocol1Link(port, port.baud, SILENCE_S, table.family)

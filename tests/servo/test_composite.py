@@ -9,7 +9,7 @@ from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import Reading
 from sfms_robot.servo.absent_bus import AbsentBus
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.port import SerialPort
 
@@ -94,7 +94,7 @@ class Gate:
 def test_slow_bus_does_not_hold_up_the_others_and_gets_the_newest_goals(linear):
     slow, clock = Gate(), Monotonic()
     with launch([EmulatedServo(1)]) as chain:
-        fast = DynamixelBus(
+        fast = Dynamixel2Bus(
             "fast",
             [BusServo("quick", 1, load_firmware_map("xl330-m288"), -1.0, 1.0)],
             linear(1.0),

@@ -7,7 +7,7 @@ import pytest
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
 from sfms_robot.servo.port import SerialPort
 
 RAD_PER_TICK = 2 * math.pi / 4096
@@ -239,7 +239,7 @@ class Monotonic:
 def test_bus_works_in_real_time_on_the_serial_port_alone(linear):
     firmware_map = load_firmware_map("xl330-m288")
     with launch([EmulatedServo(i, start_ticks=2000) for i in range(1, 29)]) as chain:
-        bus = DynamixelBus(
+        bus = Dynamixel2Bus(
             "face",
             [BusServo(f"joint{i}", i, firmware_map, -1.0, 1.0) for i in range(1, 29)],
             linear(1.0),

@@ -6,7 +6,7 @@ import pytest
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
 from sfms_robot.servo.chain.telemetry import common
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
@@ -52,7 +52,7 @@ def test_servos_of_these_models_share_a_bus_and_follow(models):
     ]
     clock = Time()
     with launch(servos, virtual=True) as chain:
-        bus = DynamixelBus(
+        bus = Dynamixel2Bus(
             "mixed",
             [BusServo(f"joint{i}", i, each, -0.5, 0.5) for i, each in enumerate(maps, 1)],
             Ticks(maps),
@@ -83,7 +83,7 @@ def test_firmware_picks_the_layout_that_the_bus_goes_by():
     base = load_firmware_map("xl330-m288")
     clock = Time()
     with launch([EmulatedServo(1, firmware=50)], virtual=True) as chain:
-        bus = DynamixelBus(
+        bus = Dynamixel2Bus(
             "old",
             [BusServo("jaw", 1, base, -0.5, 0.5)],
             Ticks([base]),

@@ -10,7 +10,7 @@ import pytest
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.discovery import stable_name
 from sfms_robot.servo.port import SerialPort, VirtualTimePort
@@ -220,25 +220,25 @@ def test_answers_are_taken_by_id_and_length():
         dxl2.encode_status(1, 0, b"\x09"),
         dxl2.encode_status(2, 0, b"\x05\x06\x07\x08"),
     )
-    link = Dxl2Link(Script(late + foreign[:5], foreign[5:] + b"\xff\xff" + four), 1_000_000, 0.003)
+    link = Dynamixel2Link(Script(late + foreign[:5], foreign[5:] + b"\xff\xff" + four), 1_000_000, 0.003)
     assert link.read(1, 132, 4).data == b"\x01\x02\x03\x04"
 
 
 def test_own_echo_is_not_an_answer():
     echo = dxl2.encode_instruction(1, dxl2.PING)
-    link = Dxl2Link(Script(echo), 1_000_000, 0.003)
+    link = Dynamixel2Link(Script(echo), 1_000_000, 0.003)
     assert link.ping(1) is None
 
 
 def test_refusal_without_data_is_an_answer():
-    link = Dxl2Link(Script(dxl2.encode_status(1, dxl2.ACCESS_ERROR)), 1_000_000, 0.003)
+    link = Dynamixel2Link(Script(dxl2.encode_status(1, dxl2.ACCESS_ERROR)), 1_000_000, 0.003)
     assert link.read(1, 132, 4).error == dxl2.ACCESS_ERROR
 
 
 @pytest.mark.parametrize("data", [b"\xff\xff\xfd\x00", b"\xff\xff\xfd\xfd", b"\x00\xff\xff\xfd"])
 def test_data_that_look_like_a_header_are_stuffed(data):
     port = Script()
-    link = Dxl2Link(port, 1_000_000, 0.003)
+    link = Dynamixel2Link(port, 1_000_000, 0.003)
     link.write(1, 116, data)
     link.sync_write(116, {1: data, 2: bytes(4)})
     for sent in port.sent:

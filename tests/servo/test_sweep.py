@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Bus, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, DynamixelBus
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.chain.schedule import Rotation, blocks_per_tick, read_s, write_s
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.protocol1 import encode
@@ -82,7 +82,7 @@ def bus_over(rig, make_port, fast_read="auto"):
     port = make_port(VirtualTimePort(rig.chain.device, rig.chain.control, rig.baud, rig.clock))
     servos = [BusServo(f"joint{i}", i, load_firmware_map("xl330-m288"), -1.0, 1.0) for i in range(1, rig.count + 1)]
     config = Bus(family="dynamixel", baud=rig.baud, fast_read=fast_read)
-    rig.bus = DynamixelBus("face", servos, rig.bus._conversion, lambda: port, rig.baud, config=config)
+    rig.bus = Dynamixel2Bus("face", servos, rig.bus._conversion, lambda: port, rig.baud, config=config)
     try:
         yield port
     finally:
@@ -214,7 +214,7 @@ def test_fast_answer_of_another_length_is_none():
 
 @pytest.mark.parametrize(
     ("kind", "more", "answer"),
-    [(Dxl2Link, (), dxl2.encode_status(1, 0, bytes(4))), (Frame1Link, ("feetech",), encode(1, 0, bytes(4)))],
+    [(Dynamixel2Link, (), dxl2.encode_status(1, 0, bytes(4))), (Protocol1Link, ("feetech",), encode(1, 0, bytes(4)))],
 )
 def test_adapter_that_holds_answers_back_is_waited_for(kind, more, answer, caplog):
     clock = [0.0]

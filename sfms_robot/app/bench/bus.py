@@ -169,12 +169,12 @@ def _ours(head: Head, device: str) -> Iterator[Host]:
 @contextmanager
 def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
     """The two requests of a tick that `where` stands for, as the bus makes them: goals, and one fast sync read."""
-    from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+    from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
     from sfms_robot.servo.port import SerialPort
 
     config = next(iter(head.buses.values()))
     port = SerialPort(device, config.baud, RealClock())
-    link = Dxl2Link(port, config.baud, DEADLINE_MS / 1e3)
+    link = Dynamixel2Link(port, config.baud, DEADLINE_MS / 1e3)
     ids = _ids(head)
     data = np.full(len(ids), 2048, "<i4").tobytes()
 

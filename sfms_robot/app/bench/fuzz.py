@@ -99,6 +99,9 @@ class NoisyPort:
     def now_s(self) -> float:
         return self.inner.now_s()
 
+    def wait_until(self, time_s: float) -> None:
+        self.inner.wait_until(time_s)
+
     def set_baud(self, baud: int) -> None:
         self.inner.set_baud(baud)
 

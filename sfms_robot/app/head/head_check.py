@@ -16,6 +16,8 @@ from scipy.interpolate import CubicSpline
 
 from sfms_robot.app.head.faces import recorded_faces
 from sfms_robot.app.listen.limitation import limitation
+from sfms_robot.app.safety_settings import check_safety
+from sfms_robot.app.wiring import firmware_maps
 from sfms_robot.config import Head, drives, load_head
 from sfms_robot.config.check import check_head
 from sfms_robot.errors import ConfigError
@@ -100,8 +102,9 @@ def check(name: str, data: Path | None = None, listener: str | None = None) -> H
         return HeadCheck(name, problems)
     head = load_head(name)
     try:
+        check_safety(head, head.joints, firmware_maps(head.joints))
         retargeter = HeadRetargeter(head, 1.0 / _TICK_HZ)
-    except ConfigError as error:  # a home that is out of reach
+    except ConfigError as error:  # what no servo of it can do, or a home that is out of reach
         return HeadCheck(head.name, [str(error)])
     clips = recorded_faces(data)
     angles = [_angles(retargeter, _at_ticks(clip)) for clip in clips]

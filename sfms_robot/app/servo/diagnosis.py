@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 from sfms_robot.app.servo.budget import Budget
-from sfms_robot.app.servo.servo_state import State
-from sfms_robot.app.servo.servo_wire import Seen
+from sfms_robot.app.servo.register_view import State
+from sfms_robot.app.servo.serial_line import Seen
 from sfms_robot.servo.discovery import Holder, SerialDevice
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
@@ -217,7 +217,7 @@ def _judge_model(seen: Seen, want: Wanted, command: Command) -> Iterator[Finding
         )
 
 
-def judge_twins(ids: Sequence[int]) -> Iterator[Finding]:
+def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
     """Ids to which two servos seem to answer."""
     for servo in ids:
         yield Finding(

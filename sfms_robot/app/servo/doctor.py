@@ -20,26 +20,26 @@ from sfms_robot.app.servo.diagnosis import (
     grouped,
     judge_adapter,
     judge_board,
+    judge_duplicate_ids,
     judge_opening,
     judge_port,
     judge_presence,
     judge_rate,
     judge_servo,
-    judge_twins,
     stored_contradictions,
     summary,
     udev_rule,
 )
 from sfms_robot.app.servo.protocol_hint import protocol_hint
-from sfms_robot.app.servo.servo_state import State, read_all
-from sfms_robot.app.servo.servo_tools import Confirm, Progress, field_named, guard, put, scan, twins
-from sfms_robot.app.servo.servo_wire import SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.register_view import State, read_all
+from sfms_robot.app.servo.serial_line import SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.single_servo import Confirm, Progress, field_named, guard, has_duplicate, put, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
 from sfms_robot.servo.families import servo_families
@@ -203,7 +203,7 @@ def _look(
         if progress:
             progress(done, len(here) + len(elsewhere), f"id {seen.id}")
         wire.at(seen.baud)
-        double += [seen.id] if twins(wire, seen.id) else []
+        double += [seen.id] if has_duplicate(wire, seen.id) else []
         try:
             state = read_all(wire, seen)
             if fix is not None and (done_here := _fix(wire, state, line.wanted.get(seen.id), fix)):
@@ -212,7 +212,7 @@ def _look(
             states.append(state)
         except ServoError as error:
             findings.append(Finding("error", f"id {seen.id}", str(error), _speak_again(seen, command), seen.id))
-    findings += judge_twins(double)
+    findings += judge_duplicate_ids(double)
     for state in states:
         findings += judge_servo(state, line.wanted.get(state.seen.id), command)
     members = [state for state in states if state.seen.id in here and state.seen.table is not None]
@@ -254,7 +254,7 @@ def _fix(wire: Wire, state: State, want: Wanted | None, confirm: Confirm) -> lis
 
 def _clear_turns(wire: Wire, seen: Seen) -> None:
     """Forget whole turns; the shaft stays where it is."""
-    answer = cast(Dxl2Link, wire.link).clear_turns(seen.id)
+    answer = cast(Dynamixel2Link, wire.link).clear_turns(seen.id)
     if answer is None or (refusal := wire.link.refusal(answer)):
         raise ServoError(f"id {seen.id} does not forget its turns: {refusal if answer else 'no answer'}")
 
@@ -341,7 +341,7 @@ def _fast_read_works(wire: Wire, members: Sequence[State]) -> bool | None:
     alike = [state.seen.id for state in members if field is not None and _table(state).role(field.name) == field]
     if field is None:
         return None
-    link = cast(Dxl2Link, wire.link)
+    link = cast(Dynamixel2Link, wire.link)
     return any(set(link.fast_sync_read(field.address, field.size, alike)) == set(alike) for _ in range(2))
 
 

@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import yaml
 
-from sfms_robot.app.servo.servo_state import read_all
-from sfms_robot.app.servo.servo_tools import Confirm, guard, put, set_baud, set_id
-from sfms_robot.app.servo.servo_wire import Seen, Wire
+from sfms_robot.app.servo.register_view import read_all
+from sfms_robot.app.servo.serial_line import Seen, Wire
+from sfms_robot.app.servo.single_servo import Confirm, guard, put, set_baud, set_id
 from sfms_robot.config.base import Model, load
 from sfms_robot.errors import ConfigError
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from sfms_robot.app.servo.servo_tools import field_named, put, read
-from sfms_robot.app.servo.servo_wire import Seen, Wire
+from sfms_robot.app.servo.serial_line import Seen, Wire
+from sfms_robot.app.servo.single_servo import field_named, put, read
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.registers import Field, Table
 from sfms_robot.servo.stored_settings import limit_names

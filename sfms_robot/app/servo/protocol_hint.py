@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from sfms_robot.app.servo.servo_wire import Wire, table_of
+from sfms_robot.app.servo.serial_line import Wire, table_of
 from sfms_robot.errors import PortError
-from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import Port
 
@@ -45,7 +44,7 @@ def _speaks(port: Port, wire: Wire, baud: int) -> str | None:
     """The family that answers at the port's rate."""
     if _DXL2_HEADER in _heard(port, dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING)):
         return "dynamixel2"
-    frames = frame1.salvage(bytearray(_heard(port, frame1.encode(frame1.BROADCAST, frame1.PING))))
+    frames = protocol1.salvage(bytearray(_heard(port, protocol1.encode(protocol1.BROADCAST, protocol1.PING))))
     if not frames and baud in servo_families()["dynamixel1"].bauds[:2]:  # these answer only to their own id
         link = Wire(port, "dynamixel1", wire.clock, baud, fixed=True).link
         link.silence_s = _ID_S

@@ -3,7 +3,8 @@
 Four promises:
 
 1. Torque comes on without a jump: goal := present, read back, then torque. A servo that stands outside the limits of
-   its joint is held where it stands; it may come in, and never go further out.
+   its joint is held where it stands; it may come in, and never go further out. One that stands outside its own stored
+   limits is moved inside by its own profile, slowly.
 2. One servo never costs the frame. What becomes of each is its own `Member`'s affair; `StatusPoll` asks them within a
    time budget. Each joint has its own last position, age and fault.
 3. What was away (a servo, the wire, the supply) is found again, checked and switched on as at start-up, beside the
@@ -192,8 +193,9 @@ class ChainBus(WireBus[L], Generic[L]):
         that whoever eases goals has a number to begin with. Its goals are withheld; when it appears it is started up,
         held where it stands, and its reading says `rejoined`.
 
-        Blocks a few exchanges per servo, and `stagger_ms`. Raises ServoError when a servo refuses or falls silent
-        meanwhile, BusError when `torque_off` comes meanwhile; others may then have torque, so call `stop`.
+        Blocks a few exchanges per servo, and `stagger_ms`; for one that stands outside its own stored limits also the
+        seconds until its own profile has moved it inside (`slow_profile`). Raises ServoError when a servo refuses or
+        falls silent meanwhile, BusError when `torque_off` comes meanwhile; others may then have torque, so call `stop`.
         """
         link = self._connected()
         startup = self._begin(link)
@@ -211,16 +213,21 @@ class ChainBus(WireBus[L], Generic[L]):
             self._forget_member(index)
             with link.patient(PATIENCE_S):
                 steps = startup.torque_on(index) if member.identified else startup.bring_back(index, reboot=False)
-                self._telemetry.ticks[index] = finish(steps)
-            if self._released:
-                self.torque_off("release")
-                raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
+                self._telemetry.ticks[index] = finish(steps, partial(self._wait_enabling, link, joint))
+            self._wait_enabling(link, joint, 0.0)
             member.enabled()
             held.append(self._hold(index))
             link.rest(self._config.stagger_ms / 1e3)
         self._enabled = True
         self._update_places()
         return np.array(held)
+
+    def _wait_enabling(self, link: L, joint: str, duration_s: float) -> None:
+        """Raises BusError, with torque off, when `torque_off` has come."""
+        link.wait(duration_s)
+        if self._released:
+            self.torque_off("release")
+            raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
 
     def _forget_member(self, index: int) -> None:
         self._writes.drop(index)

@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.port import Port
 
 _CHUNK: Final = 4096
@@ -20,19 +19,19 @@ _LONGEST: Final = 64  # reads after which a wire that never falls silent is left
 
 
 @dataclass(frozen=True)
-class Heard:
+class PingReplies:
     """What one ping brought: whole answers of that id, and bytes that belong to no answer."""
 
     answers: int
     stray: int
 
     @property
-    def twins(self) -> bool:
+    def duplicate(self) -> bool:
         """Whether this looks like two servos."""
         return self.answers > 1 or self.stray > 0
 
 
-def hear_ping(port: Port, protocol: int, servo: int, silence_s: float) -> Heard:
+def ping_replies(port: Port, protocol: int, servo: int, silence_s: float) -> PingReplies:
     """Ping one id and listen until nothing came for `silence_s`. `protocol` is 2, or 1 (Feetech too)."""
     request, count = _PINGS[protocol]
     port.discard_input()
@@ -49,24 +48,24 @@ def hear_ping(port: Port, protocol: int, servo: int, silence_s: float) -> Heard:
     return count(servo, data)
 
 
-def _heard_dxl2(servo: int, data: bytearray) -> Heard:
+def _dynamixel2_replies(servo: int, data: bytearray) -> PingReplies:
     total, answers, known = len(data), 0, 0
     while (packet := dxl2.maybe_packet(data)) is not None:
         if packet.instruction == dxl2.STATUS:
             known += dxl2.STATUS_OVERHEAD + len(packet.params)
             answers += packet.servo == servo
-    return Heard(answers, total - known)
+    return PingReplies(answers, total - known)
 
 
-def _heard_frame1(servo: int, data: bytearray) -> Heard:
+def _protocol1_replies(servo: int, data: bytearray) -> PingReplies:
     total, answers, known = len(data), 0, 0
-    for frame in frame1.salvage(data):
-        known += frame1.OVERHEAD + len(frame.params)
+    for frame in protocol1.salvage(data):
+        known += protocol1.OVERHEAD + len(frame.params)
         answers += frame.servo == servo
-    return Heard(answers, total - known)
+    return PingReplies(answers, total - known)
 
 
-_PINGS: Final[Mapping[int, tuple[Callable[[int], bytes], Callable[[int, bytearray], Heard]]]] = {
-    2: (lambda servo: dxl2.encode_instruction(servo, dxl2.PING), _heard_dxl2),
-    1: (lambda servo: frame1.encode(servo, frame1.PING), _heard_frame1),
+_PINGS: Final[Mapping[int, tuple[Callable[[int], bytes], Callable[[int, bytearray], PingReplies]]]] = {
+    2: (lambda servo: dxl2.encode_instruction(servo, dxl2.PING), _dynamixel2_replies),
+    1: (lambda servo: protocol1.encode(servo, protocol1.PING), _protocol1_replies),
 }

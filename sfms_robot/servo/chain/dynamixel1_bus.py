@@ -6,15 +6,15 @@ are read one by one, in rotation. Which it is, the bus finds out when it connect
 
 from __future__ import annotations
 
-from sfms_robot.servo.chain.protocol1_bus import Frame1Bus
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_bus import Protocol1Bus
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.chain.status_poll import GroupRead
 
 
-class Dynamixel1Bus(Frame1Bus):
+class Dynamixel1Bus(Protocol1Bus):
     """`ports.Bus` of Dynamixel 1.0 servos."""
 
     family = "dynamixel"
 
-    def _group_reader(self, link: Frame1Link) -> GroupRead | None:
+    def _group_reader(self, link: Protocol1Link) -> GroupRead | None:
         return link.bulk_read

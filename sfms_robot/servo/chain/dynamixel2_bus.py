@@ -19,7 +19,7 @@ from sfms_robot.config import Faults
 from sfms_robot.errors import ConfigError
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.chain.chain_bus import READ_DEADLINE_S, ChainBus
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.policy import BusServo as BusServo
@@ -31,7 +31,7 @@ _WATCHDOG_TICK_S: Final = 0.02
 _STALL: Final = 0.8  # of the watchdog's time without a goal: it may have tripped
 
 
-class DynamixelBus(ChainBus[Dxl2Link]):
+class Dynamixel2Bus(ChainBus[Dynamixel2Link]):
     """One wire of servos, as `ports.Bus`; arguments as of `ChainBus`."""
 
     family = "dynamixel"
@@ -58,13 +58,13 @@ class DynamixelBus(ChainBus[Dxl2Link]):
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
 
-    def _open(self) -> Dxl2Link:
-        return Dxl2Link(self._open_port(), self._baud, self._read_deadline_s)
+    def _open(self) -> Dynamixel2Link:
+        return Dynamixel2Link(self._open_port(), self._baud, self._read_deadline_s)
 
-    def _begin(self, link: Dxl2Link, tries: int = 3) -> Dynamixel2Startup:
+    def _begin(self, link: Dynamixel2Link, tries: int = 3) -> Dynamixel2Startup:
         return Dynamixel2Startup(self.name, link, self._servos, self._tables, self._conversion, self._baud, tries)
 
-    def _found(self, link: Dxl2Link) -> None:
+    def _found(self, link: Dynamixel2Link) -> None:
         self._wrote_s = math.inf
         works = self._config.fast_read == "on"
         if self._config.fast_read == "auto":
@@ -73,7 +73,7 @@ class DynamixelBus(ChainBus[Dxl2Link]):
         fast = link.fast_sync_read if works else None
         self._poll.restart(link.sync_read, fast, proven=self._config.fast_read == "auto")
 
-    def _found_again(self, link: Dxl2Link) -> None:
+    def _found_again(self, link: Dynamixel2Link) -> None:
         self._poll.reconnect(link.sync_read, link.fast_sync_read)
 
     def _sync_write_packet(self, field: Field, values: Mapping[int, int]) -> bytes:
@@ -83,7 +83,7 @@ class DynamixelBus(ChainBus[Dxl2Link]):
 
     # --- every tick ---------------------------------------------------------------------------------------------
 
-    def _send(self, link: Dxl2Link, places: NDArray[np.intp], ticks: NDArray[np.int64], now_s: float) -> None:
+    def _send(self, link: Dynamixel2Link, places: NDArray[np.intp], ticks: NDArray[np.int64], now_s: float) -> None:
         goal = self._telemetry.goal
         if places is not self._streamed[0]:
             self._streamed = places, tuple(self._ids[places].tolist())

@@ -49,7 +49,7 @@ class _Draft:
         """The SDK sets it after each request; we have our own deadlines."""
 
 
-class Dxl2Link(RegisterLink):
+class Dynamixel2Link(RegisterLink):
     """One wire of Protocol 2.0 servos."""
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:

@@ -8,7 +8,7 @@ from typing import Final
 
 from sfms_robot.config import variant
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo.chain.dynamixel2_link import Dxl2Link
+from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.link import Found
 from sfms_robot.servo.chain.startup import Silent, Startup, Steps
 from sfms_robot.servo.policy import torque_limit
@@ -18,11 +18,12 @@ from sfms_robot.servo.stored_settings import contradictions, operating_mode
 log = logging.getLogger(__name__)
 
 _TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
+_UNLIMITED: Final = ("profile_acceleration", "profile_velocity", "moving_speed")  # 0 = none; the last of the XL-320
 _REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
 _AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers that startup reads
 
 
-class Dynamixel2Startup(Startup[Dxl2Link]):
+class Dynamixel2Startup(Startup[Dynamixel2Link]):
     """`Startup` with servos that tell their firmware, which decides where their registers lie."""
 
     can_reboot = True
@@ -54,6 +55,7 @@ class Dynamixel2Startup(Startup[Dxl2Link]):
         table = self.tables[index]
         self._acknowledge(index)
         now = yield from self._clear_turns(index, (yield from self._state(index)))
+        now = yield from self._release_outside(index, now)
         torque = now[self._name(index, "torque_enable")]
         for name, target in self._settings(index, now).items():
             if name not in now:
@@ -95,7 +97,7 @@ class Dynamixel2Startup(Startup[Dxl2Link]):
         current = table.fields.get("goal_current")
         if current is not None and safety.current_limit_mA is not None:
             wanted[current.name] = min(current.high, round(safety.current_limit_mA / current.scale))
-        wanted |= dict.fromkeys(("profile_acceleration", "profile_velocity"), 0)
+        wanted |= dict.fromkeys(_UNLIMITED, 0)
         wanted |= torque_limit(self._servos[index])
         return {name: value for name, value in wanted.items() if name in table.fields} | self._registers(index)
 

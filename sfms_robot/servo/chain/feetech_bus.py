@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain.member import State
-from sfms_robot.servo.chain.protocol1_bus import Frame1Bus
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_bus import Protocol1Bus
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.chain.status_poll import GroupRead
 
 
-class FeetechBus(Frame1Bus):
+class FeetechBus(Protocol1Bus):
     """`ports.Bus` of Feetech servos, all of one byte order."""
 
     family = "feetech"
 
-    def _group_reader(self, link: Frame1Link) -> GroupRead | None:
+    def _group_reader(self, link: Protocol1Link) -> GroupRead | None:
         return link.sync_read if self._tables[0].byte_order == "little" else None
 
     def calibrate_here(self, joint: str) -> None:

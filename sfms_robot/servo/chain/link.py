@@ -139,6 +139,11 @@ class RegisterLink(ABC):
         """A request was not answered by everybody."""
         self._left_s = max(0.0, self._left_s - in_vain_s)
 
+    def wait(self, duration_s: float) -> None:
+        """Let so long go by on the port's clock, in virtual time too."""
+        if duration_s > 0.0:
+            self.port.wait_until(self.port.now_s() + duration_s)
+
     def rest(self, duration_s: float) -> None:
         """Leave the wire alone for so long; in virtual time that is no time. What comes meanwhile is dropped."""
         end_s = self.port.now_s() + duration_s

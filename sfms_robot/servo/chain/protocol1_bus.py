@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.servo.chain.chain_bus import ChainBus
-from sfms_robot.servo.chain.protocol1_link import Family, Frame1Link
+from sfms_robot.servo.chain.protocol1_link import Family, Protocol1Link
 from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
 from sfms_robot.servo.chain.status_poll import GroupRead
-from sfms_robot.servo.codecs import dxl1
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs import dxl1, protocol1
 from sfms_robot.servo.registers import Field
 
 log = logging.getLogger(__name__)
@@ -29,7 +28,7 @@ log = logging.getLogger(__name__)
 _GROUP_TRIAL_S: Final = 0.05
 
 
-class Frame1Bus(ChainBus[Frame1Link]):
+class Protocol1Bus(ChainBus[Protocol1Link]):
     """One wire of servos, as `ports.Bus`; arguments as of `ChainBus`.
 
     Subclasses say which family, and how it reads several servos at once.
@@ -39,16 +38,16 @@ class Frame1Bus(ChainBus[Frame1Link]):
     protocol = 1
 
     @abstractmethod
-    def _group_reader(self, link: Frame1Link) -> GroupRead | None:
+    def _group_reader(self, link: Protocol1Link) -> GroupRead | None:
         """How the family reads several servos by one request; None when it does not."""
 
-    def _open(self) -> Frame1Link:
-        return Frame1Link(self._open_port(), self._baud, self._read_deadline_s, self.family)
+    def _open(self) -> Protocol1Link:
+        return Protocol1Link(self._open_port(), self._baud, self._read_deadline_s, self.family)
 
-    def _begin(self, link: Frame1Link, tries: int = 3) -> Protocol1Startup:
+    def _begin(self, link: Protocol1Link, tries: int = 3) -> Protocol1Startup:
         return Protocol1Startup(self.name, link, self._servos, self._tables, self._conversion, self._baud, tries)
 
-    def _found(self, link: Frame1Link) -> None:
+    def _found(self, link: Protocol1Link) -> None:
         group, present = self._group_reader(link), self._present()
         if group is not None:
             with link.patient(_GROUP_TRIAL_S):
@@ -59,13 +58,13 @@ class Frame1Bus(ChainBus[Frame1Link]):
                     group = None
         self._poll.restart(group)
 
-    def _found_again(self, link: Frame1Link) -> None:
+    def _found_again(self, link: Protocol1Link) -> None:
         self._poll.reconnect(self._group_reader(link), None)
 
     def _sync_write_packet(self, field: Field, values: Mapping[int, int]) -> bytes:
         params = dxl1.sync_write_params(field.address, {servo: field.to_bytes(v) for servo, v in values.items()})
-        return frame1.encode(frame1.BROADCAST, frame1.SYNC_WRITE, params)
+        return protocol1.encode(protocol1.BROADCAST, protocol1.SYNC_WRITE, params)
 
-    def _send(self, link: Frame1Link, places: NDArray[np.intp], ticks: NDArray[np.int64], now_s: float) -> None:
+    def _send(self, link: Protocol1Link, places: NDArray[np.intp], ticks: NDArray[np.int64], now_s: float) -> None:
         goal = self._telemetry.goal
         link.sync_write(goal.address, {self._servos[i].id: goal.to_bytes(int(ticks[i])) for i in places})

@@ -18,8 +18,7 @@ from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
-from sfms_robot.servo.codecs import dxl1, feetech
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, OVERHEAD, Frame, encode, maybe_frame, salvage
 from sfms_robot.servo.port import Port
 
@@ -45,7 +44,7 @@ class _SdkPort:
         return len(packet)
 
 
-class Frame1Link(RegisterLink):
+class Protocol1Link(RegisterLink):
     """One wire; `family` is whose instructions are spoken."""
 
     def __init__(self, port: Port, baud: int, silence_s: float, family: Family) -> None:
@@ -61,7 +60,7 @@ class Frame1Link(RegisterLink):
 
     def ping(self, servo: int) -> Found | None:
         """Whether it is there; who it is comes from its registers, for this protocol's ping does not say."""
-        if self._ask(servo, frame1.PING, b"", 0) is None:
+        if self._ask(servo, protocol1.PING, b"", 0) is None:
             if not self._echoed:
                 return None
             # With only the voltage bit set, an answer to a ping has the bytes of the ping: it looks like an echo.
@@ -71,20 +70,20 @@ class Frame1Link(RegisterLink):
 
     def broadcast_ping(self) -> dict[int, Found]:
         """Everybody, by id. Dynamixel 1.0 has no such request: all 254 ids are asked, one silence each."""
-        everyone = list(range(frame1.MAX_ID + 1))
+        everyone = list(range(protocol1.MAX_ID + 1))
         if self.family == "dynamixel":
             return {servo: found for servo in everyone if (found := self.ping(servo)) is not None}
-        self._send(BROADCAST, frame1.PING, b"")
+        self._send(BROADCAST, protocol1.PING, b"")
         with self.patient(_STAGGER_S * len(everyone)):
             there = sorted(self._answers(everyone, 0))
         self._owed.clear()  # nobody owes an answer to a question to everybody
         return {servo: self._who(servo) for servo in there}
 
     def read(self, servo: int, address: int, length: int) -> Answer | None:
-        return self._ask(servo, frame1.READ, bytes([address, length]), length)
+        return self._ask(servo, protocol1.READ, bytes([address, length]), length)
 
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
-        return self._ask(servo, frame1.WRITE, bytes([address]) + data, 0)
+        return self._ask(servo, protocol1.WRITE, bytes([address]) + data, 0)
 
     def refusal(self, answer: Answer) -> str:
         """Feetech has no bit that says so: its error byte is about the servo alone."""
@@ -92,11 +91,11 @@ class Frame1Link(RegisterLink):
 
     def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """A write that the servo keeps until `action`."""
-        return self._ask(servo, frame1.REG_WRITE, bytes([address]) + data, 0)
+        return self._ask(servo, protocol1.REG_WRITE, bytes([address]) + data, 0)
 
     def action(self) -> None:
         """Carry out what was kept, all servos at once. Nothing answers."""
-        self._send(BROADCAST, frame1.ACTION, b"")
+        self._send(BROADCAST, protocol1.ACTION, b"")
 
     def reboot(self, servo: int) -> Answer | None:
         """Raises PacketError: there is no such instruction in these protocols."""
@@ -109,7 +108,7 @@ class Frame1Link(RegisterLink):
         """Everything, id and baud included. Raises PacketError when `option` asks to keep something."""
         if option != 0xFF:
             raise PacketError(f"{self.port.name}: a {self.family} servo resets everything (255), not option {option}")
-        return self._ask(servo, frame1.FACTORY_RESET, b"", 0)
+        return self._ask(servo, protocol1.FACTORY_RESET, b"", 0)
 
     def _who(self, servo: int) -> Found:
         """Model number and (of Feetech: major) firmware; a Feetech servo says itself which byte of a word is first."""
@@ -131,7 +130,7 @@ class Frame1Link(RegisterLink):
 
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
         """One packet for all servos; all values have one length. Nothing answers."""
-        self._send(BROADCAST, frame1.SYNC_WRITE, dxl1.sync_write_params(address, values))
+        self._send(BROADCAST, protocol1.SYNC_WRITE, dxl1.sync_write_params(address, values))
 
     def sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Answer]:
         """Answers by id, of those that answered. Feetech STS only."""
@@ -179,9 +178,9 @@ class Frame1Link(RegisterLink):
         """Ask for something that no owed answer can be taken for; whether the servo answered."""
         size = next(size for size in range(MAX_FRAME) if size not in self._owed[servo])
         if size == 0:
-            self._send(servo, frame1.PING, b"")
+            self._send(servo, protocol1.PING, b"")
         else:
-            self._send(servo, frame1.READ, bytes([0, size]))
+            self._send(servo, protocol1.READ, bytes([0, size]))
         return servo in self._answers([servo], size)
 
     def _send(self, servo: int, code: int, params: bytes) -> None:

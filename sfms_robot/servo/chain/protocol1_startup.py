@@ -11,7 +11,7 @@ from typing import Final
 
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain.link import Found
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.chain.startup import PATIENCE_S, Silent, Startup, Steps
 from sfms_robot.servo.chain.verified_write import finish
 from sfms_robot.servo.codecs import feetech
@@ -22,7 +22,7 @@ from sfms_robot.servo.stored_settings import operating_mode
 _UNLIMITED: Final = ("moving_speed", "goal_velocity", "acceleration", "goal_acceleration", "goal_time")  # 0 = none
 
 
-class Protocol1Startup(Startup[Frame1Link]):
+class Protocol1Startup(Startup[Protocol1Link]):
     """`Startup` with servos that have no reboot, and tell their faults in every answer."""
 
     can_reboot = False
@@ -54,7 +54,7 @@ class Protocol1Startup(Startup[Frame1Link]):
         if self.value(index, level) != level.high:
             self._acknowledge(index)
         yield 0.0
-        now = yield from self._snapshot(index, table.size)
+        now = yield from self._release_outside(index, (yield from self._snapshot(index, table.size)))
         torque = now[self._name(index, "torque_enable")]
         for name, target in self._settings(index, now).items():
             if now[name] == target or (name == self._name(index, "torque_limit") and not now[name]):

@@ -3,17 +3,21 @@
     identify   who answers, is it the model that the head's file names, of a firmware whose registers are known
     verify     what the unit has stored against what the head's file reckons with (`stored_settings`); refused by name
     prepare    mode, profile, torque limit and the registers of the head's file, each written and read back
-    enable     goal := present, then torque: no jump
+    enable     goal := present, then torque: no jump. A servo that stands outside its own limits, as of a sagged head,
+               cannot be told to hold there: its own profile moves it inside, slowly (`slow_profile`)
 
 The same steps bring a servo back that was away. They are generators (`Steps`): between two exchanges on the wire they
-yield how long they would like to wait. At startup they are run through at once; while the bus is running, a tick takes
-a few and goes on with its own work.
+yield how long they would like to wait. At startup they are run through; while the bus is running, a tick takes a few
+and goes on with its own work.
 """
 
 from __future__ import annotations
 
+import logging
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import ClassVar, Final, Generic, TypeVar
 
 import numpy as np
@@ -22,6 +26,7 @@ from numpy.typing import NDArray
 from sfms_robot.errors import BusError, ServoError
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.chain.link import Found, RegisterLink
+from sfms_robot.servo.chain.slow_profile import SPEED_DEG_S, WayInside, slow_profile, way_inside
 from sfms_robot.servo.chain.verified_write import TRIES, finish, verified_write
 from sfms_robot.servo.chain.verified_write import Silent as Silent
 from sfms_robot.servo.chain.verified_write import Steps as Steps
@@ -31,8 +36,12 @@ from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradi
 
 L = TypeVar("L", bound=RegisterLink)
 
+log = logging.getLogger(__name__)
+
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms
 LONGEST_READ: Final = 128
+_LOOK_S: Final = 0.05  # between two looks at a servo that is moved inside its limits
+_STILL_TICKS: Final = 1  # between two looks: it stands
 
 
 class Startup(ABC, Generic[L]):
@@ -103,7 +112,7 @@ class Startup(ABC, Generic[L]):
     def switch_on(self, index: int) -> int:
         """`torque_on`, run through; the position held, in ticks."""
         with self._link.patient(PATIENCE_S):
-            return finish(self.torque_on(index))
+            return finish(self.torque_on(index), self._link.wait)
 
     def _identify(self) -> dict[int, Found]:
         """Who answers a ping, by index."""
@@ -133,21 +142,83 @@ class Startup(ABC, Generic[L]):
     def torque_on(self, index: int) -> Steps[int]:
         """Goal := present, read back, torque on, read back; the position held, in ticks.
 
-        Raises ServoError for a servo that stands outside its own limits: its first goal would make it jump.
+        A servo that stands outside its own limits is moved inside first, at `SPEED_DEG_S`, which takes as long as that.
+        Raises ServoError, with torque off, for one that does not arrive, or that has no speed of its own.
         """
         limits = self.own_limits(index)
         yield 0.0
         present = self.value(index, self._field(index, "present_position"))  # from here on without a pause
-        if limits is not None and not limits[0] <= present <= limits[1]:
-            raise self._error(
-                index,
-                f"stands at {present}, outside its own limits {limits[0]}..{limits[1]}: torque would make it jump; "
-                "turn it in by hand",
-            )
-        yield from self._write(index, self._field(index, "goal_position"), present)
+        if limits is not None and not _inside(present, limits):
+            return (yield from self._move_inside(index, present, limits))
+        yield from self._enable_at(index, present)
+        return present
+
+    def _enable_at(self, index: int, goal: int) -> Steps[None]:
+        """The goal first, since some servos switch their torque on when it is written."""
+        yield from self._write(index, self._field(index, "goal_position"), goal)
         yield from self._restore_torque(index)
         yield from self._write(index, self._field(index, "torque_enable"), 1)
+
+    def _move_inside(self, index: int, start: int, limits: tuple[int, int]) -> Steps[int]:
+        """Slow profile, torque with a goal just inside, and once it stands there, goal := present and its usual
+        profile; the position held. Whatever ends it before, also somebody who closes it, leaves torque off.
+        """
+        table, servo = self.tables[index], self._servos[index].id
+        drive_mode = table.fields.get("drive_mode")
+        mode = 0 if drive_mode is None else self.value(index, drive_mode)
+        way = way_inside(start, limits, table.ticks_per_revolution)
+        profile = slow_profile(table, mode, 0.0 if way is None else way.distance_deg)
+        where = f"stands at {start}, outside its own limits {limits[0]}..{limits[1]}"
+        if way is None or not profile:
+            raise self._error(index, f"{where}: torque would make it jump; turn it in by hand")
+        log.warning("%s", self._about(index, f"{where}: moving it inside at {SPEED_DEG_S:g} deg/s"))
+        torque, usual = self._field(index, "torque_enable"), self.wanted(index)
+        try:
+            for name, value in profile.items():
+                yield from self._write(index, table[name], value)
+            yield from self._enable_at(index, way.goal_ticks)
+            present = yield from self._arrival(index, way, limits)
+            if present is None:
+                yield from self._write(index, torque, 0)
+            else:
+                yield from self._write(index, self._field(index, "goal_position"), present)
+            for name in profile:
+                yield from self._write(index, table[name], usual.get(name, 0))
+        except BaseException:
+            with suppress(BusError):  # a port that is gone: nothing can be said
+                self._link.sync_write(torque.address, {servo: torque.to_bytes(0)})
+            raise
+        if present is None:
+            late = f"{where}, and does not come inside in {way.bound_s:.1f} s"
+            raise self._error(index, f"{late}: torque is off; see what holds it, and turn it in by hand")
         return present
+
+    def _arrival(self, index: int, way: WayInside, limits: tuple[int, int]) -> Steps[int | None]:
+        """Where it stands inside its limits; None where it does not come there in time, or loses its torque."""
+        torque, position = self._field(index, "torque_enable"), self._field(index, "present_position")
+        before: int | None = None
+        for _ in range(math.ceil(way.bound_s / _LOOK_S)):
+            yield _LOOK_S
+            present = self.value(index, position)
+            if before is not None and abs(present - before) <= _STILL_TICKS and _inside(present, limits):
+                return present
+            before = present
+            yield 0.0
+            if not self.value(index, torque):
+                break
+        return None
+
+    def _release_outside(self, index: int, now: Mapping[str, int]) -> Steps[dict[str, int]]:
+        """Torque off where a servo stands outside its own limits under torque with another profile than its usual:
+        it was lost sight of while it was moved inside, and its usual profile would let it jump. `now`, with that.
+        """
+        limits, torque, usual = self._limits_in(index, now), self._field(index, "torque_enable"), self.wanted(index)
+        slow = any(now[name] != usual.get(name, 0) for name in slow_profile(self.tables[index], 0, 0.0))
+        outside = limits is not None and not _inside(now[self._name(index, "present_position")], limits)
+        if not (now[torque.name] and slow and outside):
+            return dict(now)
+        yield from self._write(index, torque, 0)
+        return {**now, torque.name: 0}
 
     @abstractmethod
     def wanted(self, index: int) -> Mapping[str, int]:
@@ -161,11 +232,16 @@ class Startup(ABC, Generic[L]):
 
     def own_limits(self, index: int) -> tuple[int, int] | None:
         """The position limits stored in the servo, ticks; None where it has none or they do not count."""
+        names = limit_names(self.tables[index]) or ()
+        return self._limits_in(index, {name: self.value(index, self.tables[index][name]) for name in names})
+
+    def _limits_in(self, index: int, values: Mapping[str, int]) -> tuple[int, int] | None:
+        """As `own_limits`, of registers that have been read."""
         table = self.tables[index]
         names = limit_names(table)
         if names is None or not limits_count(table, self._needs[index]):
             return None
-        low, high = (self.value(index, table[name]) for name in names)
+        low, high = (values[name] for name in names)
         return (low, high) if low < high else None
 
     def _verify(self, index: int, values: Mapping[str, int]) -> list[Contradiction]:
@@ -259,6 +335,10 @@ class Startup(ABC, Generic[L]):
     def _about(self, index: int, problem: str) -> str:
         servo = self._servos[index]
         return f"{servo.joint} (id {servo.id}) {problem}"
+
+
+def _inside(ticks: int, limits: tuple[int, int]) -> bool:
+    return limits[0] <= ticks <= limits[1]
 
 
 def needs_of(servos: Sequence[BusServo], conversion: TickConversion) -> list[JointNeeds]:

@@ -7,7 +7,8 @@ counts.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
+from contextlib import closing
 from typing import Final, TypeVar
 
 from sfms_robot.errors import ServoError
@@ -87,11 +88,17 @@ def _write(link: RegisterLink, servo_id: int, field: Field, value: int, tries: i
     raise failure
 
 
-def finish(steps: Steps[T]) -> T:
-    """Run a job through at once, without the pauses it would like; its result."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+def finish(steps: Steps[T], wait: Callable[[float], None] = lambda duration_s: None) -> T:
+    """Run a job through; its result.
+
+    Args:
+        wait: what to do between two exchanges, for so many seconds. What it raises ends the job.
+    """
+    with closing(steps):
+        while True:
+            try:
+                pause_s = next(steps)
+            except StopIteration as end:
+                result: T = end.value
+                return result
+            wait(pause_s)

@@ -84,7 +84,7 @@ class Linear:
 
 SURE = {"confirmed": True}  # hobby servos jump to their first pose, and the tests know it
 FAMILIES = {
-    "dynamixel2": Family("chain.dynamixel2_bus:DynamixelBus", "xl330-m288", other="xl330-m077"),
+    "dynamixel2": Family("chain.dynamixel2_bus:Dynamixel2Bus", "xl330-m288", other="xl330-m077"),
     "dynamixel1": Family("chain.dynamixel1_bus:Dynamixel1Bus", "ax-12a", other="ax-18a"),
     "dynamixel1-mx": Family("chain.dynamixel1_bus:Dynamixel1Bus", "mx-28-1.0", other="mx-64-1.0"),
     "sts": Family("chain.feetech_bus:FeetechBus", "sts3215", other="sts3250"),

@@ -55,6 +55,9 @@ class Tapped:
     def now_s(self) -> float:
         return self.inner.now_s()
 
+    def wait_until(self, time_s: float) -> None:
+        self.inner.wait_until(time_s)
+
     def set_baud(self, baud: int) -> None:
         self.inner.set_baud(baud)
 

@@ -87,6 +87,9 @@ class TimedPort:
     def now_s(self) -> float:
         return self.clock.t
 
+    def wait_until(self, time_s: float) -> None:
+        self.clock.t = max(self.clock.t, time_s)
+
     def set_baud(self, baud: int) -> None:
         self.baud = baud
 

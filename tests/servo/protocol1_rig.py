@@ -26,6 +26,9 @@ class Time:
     def now_s(self) -> float:
         return self.t
 
+    def wait_until(self, time_s: float) -> None:
+        self.t = max(self.t, time_s)
+
 
 @dataclass
 class Wire:
@@ -74,6 +77,9 @@ class Wire:
 
     def now_s(self) -> float:
         return self.clock.t
+
+    def wait_until(self, time_s: float) -> None:
+        self.clock.wait_until(time_s)
 
     def set_baud(self, baud: int) -> None:
         self.baud = baud

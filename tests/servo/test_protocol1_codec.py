@@ -8,16 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
-from sfms_robot.servo.codecs import dxl1, feetech
-from sfms_robot.servo.codecs import protocol1 as frame1
+from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import Frame, encode, salvage
 from sfms_robot.servo.codecs.protocol1 import maybe_frame as take
 
-ASSET = Path(__file__).parent.parent / "assets" / "frame1_packets.csv"
+ASSET = Path(__file__).parent.parent / "assets" / "protocol1_packets.csv"
 ROWS = list(csv.DictReader(line for line in ASSET.read_text().splitlines() if not line.startswith("#")))
 FRAMES = [pytest.param(bytes.fromhex(row["frame"]), id=row["name"]) for row in ROWS]
 
-ids = st.integers(0, frame1.BROADCAST)
+ids = st.integers(0, protocol1.BROADCAST)
 codes = st.integers(0, 255)
 # Nothing is stuffed, so parameters that look like a header are what a reader has to get over.
 tricky = st.lists(st.sampled_from([b"\xff", b"\xff\xff", b"\x01", b"\x02", b"\x00"]), max_size=40).map(b"".join)
@@ -74,7 +73,7 @@ def test_bulk_read_round_trip(requests):
 
 
 def test_frame_too_long_for_its_length_byte_is_refused():
-    assert len(encode(1, 3, bytes(frame1.MAX_PARAMS))) == frame1.MAX_FRAME
+    assert len(encode(1, 3, bytes(protocol1.MAX_PARAMS))) == protocol1.MAX_FRAME
     with pytest.raises(PacketError, match="254 parameters is longer than 253"):
         encode(1, 3, bytes(254))
 
@@ -102,7 +101,7 @@ def test_any_bytes_leave_at_most_one_unfinished_frame(rubbish):
     buffer = bytearray(rubbish)
     while take(buffer) is not None:
         continue
-    assert len(buffer) < frame1.MAX_FRAME
+    assert len(buffer) < protocol1.MAX_FRAME
 
 
 def test_a_million_random_bytes_hide_no_frame_for_long():
@@ -112,7 +111,7 @@ def test_a_million_random_bytes_hide_no_frame_for_long():
         buffer += rubbish.randbytes(1000 - len(whole)) + whole
         while (frame := take(buffer)) is not None:
             found += frame == Frame(9, 0, b"\x01\x02")
-        assert len(buffer) < frame1.MAX_FRAME
+        assert len(buffer) < protocol1.MAX_FRAME
     assert found > 990
 
 
@@ -159,7 +158,7 @@ class Capture:
 def test_writes_are_those_of_the_vendor_sdk(servo, address, data):
     port = Capture()
     Protocol1PacketHandler().writeTxOnly(port, servo, address, len(data), list(data))
-    assert port.written == encode(servo, frame1.WRITE, bytes([address]) + data)
+    assert port.written == encode(servo, protocol1.WRITE, bytes([address]) + data)
 
 
 @given(st.dictionaries(st.integers(0, 252), st.binary(min_size=2, max_size=2), min_size=1, max_size=40))
@@ -167,7 +166,7 @@ def test_sync_writes_are_those_of_the_vendor_sdk(values):
     port = Capture()
     flat = [byte for servo, data in values.items() for byte in (servo, *data)]
     Protocol1PacketHandler().syncWriteTxOnly(port, 30, 2, flat, len(flat))
-    assert port.written == encode(frame1.BROADCAST, frame1.SYNC_WRITE, dxl1.sync_write_params(30, values))
+    assert port.written == encode(protocol1.BROADCAST, protocol1.SYNC_WRITE, dxl1.sync_write_params(30, values))
 
 
 @given(st.integers(0, 252), st.integers(0, 127), st.binary(min_size=1, max_size=100))

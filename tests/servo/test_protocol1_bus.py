@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from frame1_rig import rig_of
+from protocol1_rig import rig_of
 
 from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
 from sfms_robot.errors import BusError, ConfigError, ServoError
@@ -439,12 +439,13 @@ def test_mode_that_cannot_be_changed_under_torque_is_an_error():
 
 
 @pytest.mark.parametrize(("model", "names"), [("scs0009", "20..1003"), ("ax-12a", "100..900")])
-def test_servo_outside_its_own_limits_is_not_made_to_jump(model, names):
+def test_servo_outside_its_own_limits_that_does_not_come_inside_is_named(model, names):
     rig = rig_of(model, [5])
     if model == "ax-12a":
         rig.set(1, "cw_angle_limit", 100)
         rig.set(1, "ccw_angle_limit", 900)
-    with pytest.raises(ServoError, match=f"stands at 5, outside its own limits {names}"):
+    rig.servo(1).plant.stuck = True
+    with pytest.raises(ServoError, match=f"stands at 5, outside its own limits {names}.*torque is off"):
         rig.hold()
     assert rig.torques() == [0] and rig.servo(1).plant.position == 5
 

@@ -5,8 +5,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from sfms_robot.app.servo.servo_state import read_all, watch
-from sfms_robot.app.servo.servo_tools import (
+from sfms_robot.app.servo.register_view import read_all, watch
+from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire
+from sfms_robot.app.servo.single_servo import (
     factory_reset,
     parse_ids,
     parse_value,
@@ -17,7 +18,6 @@ from sfms_robot.app.servo.servo_tools import (
     set_id,
     write_register,
 )
-from sfms_robot.app.servo.servo_wire import Wire, check_device, open_wire
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sfms_robot.app.servo.servo_tools import read_block
-from sfms_robot.app.servo.servo_wire import TRIES, Seen, Wire
+from sfms_robot.app.servo.serial_line import TRIES, Seen, Wire
+from sfms_robot.app.servo.single_servo import read_block
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
 

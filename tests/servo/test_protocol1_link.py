@@ -1,17 +1,17 @@
 import pytest
-from frame1_rig import rig_of
 from hypothesis import given
 from hypothesis import strategies as st
+from protocol1_rig import rig_of
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink
-from sfms_robot.servo.chain.protocol1_link import Frame1Link
+from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.codecs.protocol1 import encode
 
 
 def link_of(model, starts, **more):
     rig = rig_of(model, starts, **more)
-    link = Frame1Link(rig.wire, 1_000_000, 0.003, rig.bus.family)
+    link = Protocol1Link(rig.wire, 1_000_000, 0.003, rig.bus.family)
     return link, rig
 
 

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from sfms_robot.app.servo.servo_wire import PATIENCE_S, TRIES, Seen, Wire
+from sfms_robot.app.servo.serial_line import PATIENCE_S, TRIES, Seen, Wire
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.ports import Clock
-from sfms_robot.servo.chain.duplicate_ids import hear_ping
+from sfms_robot.servo.chain.duplicate_ids import ping_replies
 from sfms_robot.servo.chain.verified_write import finish, verified_write
 from sfms_robot.servo.registers import Field, Table
 
@@ -68,13 +68,13 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress | None
             if progress:
                 progress(done, total, f"{baud} baud, {len(found)} found")
             here = [wire.seen(servo, each) for servo, each in sorted(wire.link.broadcast_ping().items())]
-            found += [replace(seen, twice=twins(wire, seen.id)) for seen in here]
+            found += [replace(seen, twice=has_duplicate(wire, seen.id)) for seen in here]
             continue
         for step, servo in enumerate(asked):
             if progress:
                 progress(done + step, total, f"{baud} baud, id {servo}, {len(found)} found")
             seen = wire.ping(servo, tries=1)
-            found += [replace(seen, twice=twins(wire, servo))] if seen is not None else []
+            found += [replace(seen, twice=has_duplicate(wire, servo))] if seen is not None else []
     if progress:
         progress(total, total, f"{len(found)} found")
     return found
@@ -183,7 +183,7 @@ def set_id(wire: Wire, seen: Seen, new: int, confirm: Confirm, in_chain: bool = 
         raise ConfigError.at("servo", "new id", new, "is the id it has")
     if wire.ping(new) is not None:
         raise ConfigError.at("servo", "new id", new, "is taken: another servo answers to it")
-    if twins(wire, seen.id):
+    if has_duplicate(wire, seen.id):
         raise ServoError(f"id {seen.id}: two servos seem to answer: unplug all but the one that you mean")
     if not in_chain:
         others = [each.id for each in _neighbours(wire) if each.id != seen.id]
@@ -262,9 +262,9 @@ def factory_reset(wire: Wire, seen: Seen, keep: str, confirm: Confirm) -> Seen:
 # --- inside -----------------------------------------------------------------------------------------------------
 
 
-def twins(wire: Wire, servo: int) -> bool:
+def has_duplicate(wire: Wire, servo: int) -> bool:
     """Whether two servos seem to answer to one id: a ping brings more than one clean answer, again and again."""
-    return all(hear_ping(wire.port, wire.kind.protocol, servo, PATIENCE_S).twins for _ in range(TRIES))
+    return all(ping_replies(wire.port, wire.kind.protocol, servo, PATIENCE_S).duplicate for _ in range(TRIES))
 
 
 def _neighbours(wire: Wire) -> list[Seen]:

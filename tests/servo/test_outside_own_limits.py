@@ -1,0 +1,251 @@
+"""Servos found outside their own stored limits, as those of a sagged head, come in gently or stay without torque."""
+
+import logging
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lossy_port import BAUD, LossyPort, device_of, link_on
+
+from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.emulator.launch import EmulatedServo
+from sfms_robot.errors import BusError, ServoError
+from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
+from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
+from sfms_robot.servo.chain.slow_profile import SPEED_DEG_S, way_inside
+from sfms_robot.servo.chain.verified_write import Silent, finish
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.registers import Table
+
+MODELS = ("xl330-m288", "mx-28-2.0", "xl-320", "ax-12a", "mx-28-1.0", "sts3215", "scs0009")
+LIMIT_DEG, LOW_DEG = 40.0, 45.0  # of the joint; stored in the servo
+BY_TIME = 0x04  # drive mode
+
+
+class Straight:
+    def __init__(self, table):
+        self.center, self.rad = table.center_ticks, 6.283185307179586 / table.ticks_per_revolution
+
+    def to_ticks(self, angles_rad):
+        return (self.center + angles_rad / self.rad).round().astype(int)
+
+
+class Rig:
+    """One servo that stands `outside_deg` beyond an end of what it has stored (below 0: the lower one)."""
+
+    def __init__(self, model, outside_deg, registers=None, tries=3):
+        firmware_map = load_firmware_map(model)
+        self.table = table = Table.of(firmware_map)
+        self.deg = 360.0 / table.ticks_per_revolution
+        self.names = ("cw_angle_limit", "ccw_angle_limit")
+        if "cw_angle_limit" not in table.fields:
+            self.names = ("min_position_limit", "max_position_limit")
+        self.limits = tuple(round(table.center_ticks + end / self.deg) for end in (-LOW_DEG, LOW_DEG))
+        end, sign = (self.limits[0], -1) if outside_deg < 0 else (self.limits[1], 1)
+        self.start = end + sign * max(1, round(abs(outside_deg) / self.deg))
+        stored = dict(zip(self.names, self.limits, strict=True)) | (registers or {})
+        self.device = device_of(table, {"id": 1, "start_ticks": self.start, "registers": stored})
+        self.servo = self.device.servo(1)
+        self.port = LossyPort(self.device)
+        self.fastest_deg_s, self.goals = 0.0, []
+        self.port.write = self._watched(self.port.write)
+        limit_rad = LIMIT_DEG * 6.283185307179586 / 360.0
+        servos = [BusServo("leg", 1, firmware_map, -limit_rad, limit_rad, Safety())]
+        kind = Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
+        self.startup = kind("neck", link_on(self.port, table), servos, [table], Straight(table), BAUD, tries)
+
+    def _watched(self, write):
+        def watched(data):
+            write(data)
+            state = self.servo.state(self.port.t)
+            self.fastest_deg_s = max(self.fastest_deg_s, abs(state["speed"]) * self.deg)
+            if state["torque"]:
+                self.goals.append(state["goal"])
+
+        return watched
+
+    def held(self, name):
+        field = self.table.role(name) or self.table[name]
+        return field.from_bytes(self.servo.read(field.address, field.size, self.port.t)[1])
+
+    def state(self):
+        return self.servo.state(self.port.t)
+
+    def inside(self, ticks):
+        return self.limits[0] <= round(ticks) <= self.limits[1]
+
+    def usual_profile(self):
+        wanted = self.startup.wanted(0)
+        return {name: self.held(name) for name in wanted} == dict(wanted)
+
+
+@pytest.mark.parametrize("outside_deg", [-12.0, -0.3, 0.3, 12.0])
+@pytest.mark.parametrize("model", MODELS)
+def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, outside_deg):
+    rig = Rig(model, outside_deg)
+    rig.startup.run()
+    held = rig.startup.switch_on(0)
+    assert rig.inside(held) and rig.held("torque_enable") == 1 and rig.held("goal_position") == held
+    assert rig.usual_profile()
+    assert all(rig.inside(goal) for goal in rig.goals)
+    assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    assert rig.state()["position"] == pytest.approx(held, abs=2)
+    rig.port.t += 1.0
+    assert rig.state()["position"] == pytest.approx(held, abs=2)
+
+
+@pytest.mark.parametrize("model", ["xl330-m288", "mx-28-2.0"])
+def test_a_profile_that_is_told_in_time_is_as_slow(model):
+    rig = Rig(model, -12.0, {"drive_mode": BY_TIME})
+    rig.startup.run()
+    assert rig.inside(rig.startup.switch_on(0)) and rig.usual_profile()
+    assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+
+
+@pytest.mark.parametrize("model", MODELS)
+@given(fate=st.lists(st.sampled_from(["", "", "", "", "request", "answer"]), max_size=120))
+def test_whatever_is_lost_it_never_goes_faster_or_further_out(model, fate):
+    rig = Rig(model, -5.0)
+    rig.port.fate = iter(fate)
+    try:
+        rig.startup.run()
+        held = rig.startup.switch_on(0)
+        assert rig.inside(held) and rig.usual_profile()
+    except (BusError, ServoError):
+        assert set(fate) - {""}
+    assert all(rig.inside(goal) for goal in rig.goals)
+    assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    rig.port.fate, rig.port.t = iter(()), rig.port.t + 0.3
+    rig.startup.run()  # by now perhaps inside, perhaps lost half way
+    assert rig.inside(rig.startup.switch_on(0)) and rig.usual_profile()
+    assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_one_that_does_not_come_is_let_go_and_named(model):
+    rig = Rig(model, 12.0)
+    rig.startup.run()
+    rig.servo.plant.stuck = True
+    low, high = rig.limits
+    expected = rf"leg \(id 1\) stands at {rig.start}, outside its own limits {low}\.\.{high}.*torque is off"
+    with pytest.raises(ServoError, match=expected):
+        rig.startup.switch_on(0)
+    assert not rig.state()["torque"] and rig.port.t < 5.0 and rig.usual_profile()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_whoever_takes_the_torque_meanwhile_ends_it(model):
+    rig = Rig(model, -12.0)
+    rig.startup.run()
+    steps, torque = rig.startup.torque_on(0), rig.table.role("torque_enable")
+    while not (rig.state()["torque"] and rig.state()["speed"]):
+        rig.port.t += next(steps)
+    rig.servo.write(torque.address, torque.to_bytes(0), rig.port.t)
+    with pytest.raises(ServoError, match="leg"):
+        finish(steps, lambda duration_s: rig.port.wait_until(rig.port.t + duration_s))
+    assert not rig.state()["torque"] and not rig.inside(rig.state()["position"])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_job_that_is_dropped_half_way_leaves_torque_off(model):
+    rig = Rig(model, -12.0)
+    rig.startup.run()
+    steps = rig.startup.torque_on(0)
+    while not (rig.state()["torque"] and rig.state()["speed"]):
+        rig.port.t += next(steps)
+    steps.close()
+    assert not rig.state()["torque"]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_one_that_was_lost_sight_of_half_way_is_let_go_before_its_profile_is_made_usual(model):
+    rig = Rig(model, -30.0)
+    rig.startup.run()
+    steps = rig.startup.torque_on(0)
+    while not (rig.state()["torque"] and rig.state()["speed"]):
+        rig.port.t += next(steps)
+    rig.port.fate = iter(["request"] * 40)
+    with pytest.raises(Silent):
+        finish(steps)
+    rig.port.fate = iter(())
+    assert rig.state()["torque"]  # nobody could tell it
+    rig.startup.run()
+    assert not rig.state()["torque"] and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    assert rig.inside(rig.startup.switch_on(0)) and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+
+
+@given(low=st.integers(0, 4000), width=st.integers(1, 4095), present=st.integers(0, 4095))
+def test_the_way_inside_is_the_short_one_or_none(low, width, present):
+    high = min(4095, low + width)
+    if low <= present <= high:
+        return
+    way = way_inside(present, (low, high), 4096.0)
+    to_low, to_high = (low - present) % 4096, (present - high) % 4096  # round the circle
+    if way is None:
+        assert (min(to_low, to_high), present < low) in ((to_low, False), (to_high, True)) or to_low == to_high
+    else:
+        assert low <= way.goal_ticks <= high
+        assert (to_low <= to_high) if present < low else (to_high <= to_low)
+
+
+def test_one_that_would_go_round_the_other_side_is_refused():
+    """It hangs 5 degrees below its lower limit, past the end of the turn, and so reads high up."""
+    table = Table.of(load_firmware_map("sts3215"))
+    rig = Rig("sts3215", 45.0, {"min_position_limit": 20, "max_position_limit": 3000})
+    rig.servo.turn(4060, 0.0)
+    rig.limits = (20, 3000)
+    assert table.center_ticks == 2048
+    with pytest.raises(ServoError, match=r"stands at 4060, outside its own limits 20\.\.3000.*turn it in by hand"):
+        rig.startup.run()
+        rig.startup.switch_on(0)
+    assert not rig.state()["torque"]
+
+
+# --- with a bus -------------------------------------------------------------------------------------------------
+
+STORED = {"min_position_limit": 1300, "max_position_limit": 2800}
+SAGGED = 1200
+
+
+def sagged(make_rig):
+    return make_rig([EmulatedServo(1, start_ticks=2048), EmulatedServo(2, start_ticks=SAGGED, registers=STORED)])
+
+
+def test_enable_waits_for_it_and_says_so(make_rig, caplog):
+    with sagged(make_rig) as rig, caplog.at_level(logging.WARNING):
+        held = rig.hold()
+        assert rig.chain.state(2)["position"] >= STORED["min_position_limit"]
+        assert "joint2 (id 2) stands at 1200, outside its own limits 1300..2800: moving it inside at 20" in caplog.text
+        readings = rig.ticks(held, 20)
+        assert readings["joint2"].fault is None
+        assert readings["joint2"].position_rad == pytest.approx(held[1], abs=0.01)
+
+
+def test_torque_off_from_outside_ends_enable_with_torque_off(make_rig):
+    with sagged(make_rig) as rig:
+        rig.bus.connect()
+        plain = rig.clock.wait_until
+
+        def wait_until(time_s):
+            plain(time_s)
+            if rig.clock.t > 0.3:
+                rig.bus.torque_off("release")
+
+        rig.clock.wait_until = wait_until
+        with pytest.raises(BusError, match="torque off was asked for while joint2 was being enabled"):
+            rig.bus.enable(rig.bus.joints)
+        rig.bus.stop("release")
+        rig.chain.time_is(rig.clock.t)
+        assert not any(rig.chain.state(i)["torque"] for i in (1, 2))
+        assert rig.chain.state(2)["position"] < STORED["min_position_limit"]
+
+
+def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus(make_rig):
+    with sagged(make_rig) as rig:
+        held = rig.hold()
+        rig.chain.supply(0.0)
+        rig.ticks(held, 60)
+        rig.chain.turn(2, SAGGED)
+        rig.chain.supply(5.0)
+        _, readings = rig.until(held, lambda each: each["joint2"].rejoined, 8.0)
+        assert rig.chain.state(2)["position"] >= STORED["min_position_limit"]
