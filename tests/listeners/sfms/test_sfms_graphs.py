@@ -49,5 +49,5 @@ def test_a_listener_from_a_folder_runs_on_graphs(tmp_path):
     plain = tiny_listener()
     checkpoint.save_config(tmp_path, plain.settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, plain.model)
-    found = sfms.load(tmp_path)
+    found = sfms.load(tmp_path).build_graphs()
     assert isinstance(found._decode_one, torch.jit.ScriptModule) and found.sampler._graphs is not None
