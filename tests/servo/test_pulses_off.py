@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from device_port import DevicePort, Time
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Safety, load_firmware_map
@@ -123,6 +123,7 @@ def model(request):
 EVENTS = st.lists(st.tuples(st.integers(0, 40), st.sampled_from(["unplug", "plug"])), max_size=6)
 
 
+@example(events=[(0, "unplug")], ticks=0, last="torque_off", model="maestro-24")
 @given(
     events=EVENTS,
     ticks=st.integers(0, 40),

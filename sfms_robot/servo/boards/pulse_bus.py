@@ -100,6 +100,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._counts["deferred"] = 0
         self._fault_log: dict[str, None] = {}
         self._off: tuple[int, ...] | None = None  # since torque off: channels that stay off; None: armed
+        self._off_unsent = False  # they could not be told
         self._forget()
 
     def _forget(self) -> None:
@@ -126,7 +127,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         """Open and find the board. Pulses are left as they are. Raises PortError, or BusError when nobody answers."""
         wire = self._open()
         self._forget()
-        self._off = None
+        self._off, self._off_unsent = None, False
         try:
             if not self._present(wire):
                 raise self._absent(wire)
@@ -158,7 +159,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         heard), or when `torque_off` came meanwhile: then no pulse is on.
         """
         wire = self._connected()
-        self._off = None
+        self._off, self._off_unsent = None, False
         self._warn_of_jumps(joints)
         if not self._present(wire):
             raise self._absent(wire)
@@ -237,12 +238,13 @@ class PulseBus(WireBus[RateLimitedPort]):
             data = self._protocol.encode_off(channels, self._silent)
             if self._attempt(lambda: wire.send(data)) is not None:
                 return
-        self._attempt(lambda: self._send_off_anew(channels))
+        self._off_unsent = self._attempt(lambda: self._send_off_anew(channels)) is None
 
-    def _send_off_anew(self, channels: Sequence[int]) -> None:
+    def _send_off_anew(self, channels: Sequence[int]) -> bool:
         wire = self._open()
         try:
             wire.send(self._protocol.encode_off(channels, restarted=True))
+            return True
         finally:
             wire.port.close()
 
@@ -307,6 +309,9 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _ask(self, wire: RateLimitedPort, now_s: float) -> bool:
         """Ask for faults once a second when the line is free; whether there was an answer to that."""
         answered = False
+        if self._off_unsent:  # over a port that was gone, and nobody had noticed: this finds out, and opens it again
+            wire.send(self._protocol.encode_off(self._off or (), restarted=True))
+            self._off_unsent = False
         if self._status_due_s is None:
             self._status_due_s = now_s + _STATUS_EVERY_S
         if wire.awaiting:
