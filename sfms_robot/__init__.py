@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sfms_robot.retarget.head_retargeter import HeadRetargeter as Retargeter
     from sfms_robot.runtime.planned_events import MotionEvent
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = [
     "BLENDSHAPES",

@@ -10,6 +10,7 @@ from sfms_robot.app.replay import plot, read_recording, sheet, summary
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
+from sfms_robot.runtime import recorder as recorder_module
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
 
 JOINTS = ("neck_pitch", "jaw", "brow")
@@ -142,3 +143,12 @@ def test_the_sheet_of_a_run_is_drawn(tmp_path):
     run = read_recording(record(tmp_path, 0.3))
     assert len(sheet(run, tmp_path / "a.png")) == 12
     assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def test_a_recording_in_several_files_is_read_as_one(tmp_path, monkeypatch):
+    one = read_recording(record(tmp_path / "one"))
+    monkeypatch.setattr(recorder_module, "PART_MESSAGES", 100)
+    many = read_recording(record(tmp_path / "many"))
+    assert len(recorder_module.parts_of(tmp_path / "many")) > 3
+    assert many.whole and np.array_equal(one.times_s, many.times_s)
+    assert np.array_equal(one.goals_rad, many.goals_rad) and np.array_equal(one.audio, many.audio)

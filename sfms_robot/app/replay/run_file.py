@@ -1,4 +1,4 @@
-"""DIR/run.mcap -> arrays. A file that lacks its end, because the run was killed, is read up to there."""
+"""DIR/run.mcap, and the files that it goes on in -> arrays. A file that lacks its end, because the run was killed, is read up to there."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
-from sfms_robot.runtime.recorder import RUN_FILE
+from sfms_robot.runtime.recorder import RUN_FILE, parts_of
 
 _PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
 _FLOOR_DB, _BELOW_LOUD_DB = -50.0, 27.0
@@ -96,14 +96,15 @@ class RunRecording:
 
 def read_recording(folder: Path | str) -> RunRecording:
     """Read what `run --record` wrote. Raises ConfigError, in one line, when there is nothing that can be read."""
-    file = Path(folder) / RUN_FILE
-    if not file.is_file():
+    parts = parts_of(Path(folder))
+    if not parts:
         what = f"has no {RUN_FILE}" if Path(folder).is_dir() else "is no folder"
         raise ConfigError(f"{folder}: {what}: not what `sfms-robot run --record DIR` wrote")
-    found = _Found()
+    found, file = _Found(), parts[0]
     try:
-        for kind, value in _records(file):
-            found.take(kind, value)
+        for file in parts:
+            for kind, value in _records(file):
+                found.take(kind, value)
     except (EndOfFile, struct.error) as error:
         if not found.ticks:
             raise ConfigError(f"{file}: holds no tick: the file is cut off") from error
@@ -166,8 +167,8 @@ class _Found:
 
     def take(self, kind: str, value: Any) -> None:
         """One record of `_records`."""
-        if kind == "about":
-            self.about = value
+        if kind == "about":  # at the beginning of every part
+            self.about, self.whole = self.about or value, False
             self._joints = tuple(json.loads(value["joints"]))
         elif kind == "end":
             self.whole = True
