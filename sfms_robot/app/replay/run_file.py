@@ -1,4 +1,4 @@
-"""DIR/run.mcap, and the files that it goes on in -> arrays. A file that lacks its end, because the run was killed, is read up to there."""
+"""DIR/run.mcap, and the files that it goes on in -> arrays. A run that was killed is read up to where its file ends."""
 
 from __future__ import annotations
 
