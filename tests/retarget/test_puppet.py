@@ -105,7 +105,7 @@ def test_whatever_is_asked_the_face_moves_without_a_jump_and_ends_as_the_listene
     turned[[YAW, PITCH]] = True
     turned[[i for name, i in CHANNEL_INDEX.items() if name.startswith("eyeLook")]] = True
     assert steps[~turned].max() < 0.16  # of a tick, where the fastest ramp crosses the whole range in 0.12 s
-    assert steps[turned].max() < 0.4  # a saccade of both eyes
+    assert steps[turned].max() < 0.4 + 0.16  # a saccade of both eyes, while something else fades
     assert np.allclose(rows[-1], face, atol=1e-6)
 
 

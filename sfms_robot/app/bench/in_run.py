@@ -32,7 +32,7 @@ def in_run(folder: Path, duration_s: float = RUN_S) -> dict[str, Any]:
         "head": HEAD,
         "duration_s": report["duration_s"],
         "frames": report["frames"],
-        "unheard_frames": report["plans"]["unheard_frames"],
+        "unheard_frames": report["listener_state"]["skipped_frames"],
         "frames_per_s": 1e3 / step_ms["p50"] if step_ms["p50"] else None,
         "step_ms": step_ms,
         "ticks": report["ticks"],
