@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -69,8 +70,10 @@ def beside(name: str, against: Path, repeats: int = 3) -> dict[str, Row]:
 
 def _rows(name: str, env: Mapping[str, str] | None) -> dict[str, Row]:
     done = subprocess.run(
-        [sys.executable, *MAIN, "bench", name, "--json"], capture_output=True, text=True, check=False, env=env
-    )
+        [sys.executable, *MAIN, "bench", name, "--json"],
+        capture_output=True, text=True, check=False, env=env,
+        cwd=tempfile.gettempdir(),  # processes that it starts look in their own folder first
+    )  # fmt: skip
     if done.returncode:
         raise ConfigError(f"bench {name}: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
     rows: dict[str, Row] = json.loads(done.stdout.splitlines()[-1])
