@@ -43,13 +43,17 @@ class Goals:
         self._conversion = conversion
         self._own = Range(np.array([servo.min_rad for servo in servos]), np.array([servo.max_rad for servo in servos]))
         self._last_rad = self._own.low.copy()  # where each was found, or sent to last
+        self._lowest, self._highest = self._own.low - _SLACK_RAD, self._own.high + _SLACK_RAD
+        self._outside = False  # somebody was found outside its own range, and may not be in yet
         self._rad_at_zero = conversion.to_rad(np.zeros(len(servos), np.int64))
         self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - self._rad_at_zero
 
     def hold(self, index: int, angle_rad: float) -> bool:
         """A servo has torque at this angle, which its range now reaches; whether that is inside its own range."""
         self._last_rad[index] = angle_rad
-        return bool(self._servos[index].min_rad <= angle_rad <= self._servos[index].max_rad)
+        inside = bool(self._servos[index].min_rad <= angle_rad <= self._servos[index].max_rad)
+        self._outside |= not inside
+        return inside
 
     def allows(self, index: int, goal_rad: float) -> bool:
         """Whether a goal lies in the range in force of a servo."""
@@ -63,6 +67,8 @@ class Goals:
         """
         if goals_rad.shape != self._last_rad.shape:
             raise ValueError(f"bus {self._bus!r} has {len(self._servos)} joints, got goals of shape {goals_rad.shape}")
+        if not self._outside and np.logical_and.reduce((goals_rad >= self._lowest) & (goals_rad <= self._highest)):
+            return self._conversion.to_ticks(goals_rad)  # nearly always: every own range is the range in force
         finite = np.isfinite(goals_rad)
         if not finite.all():
             raise ValueError(f"goal of {self._servos[int(np.argmin(finite))].joint} is not finite")
@@ -77,4 +83,5 @@ class Goals:
         for i in np.flatnonzero(~self._own.holds(goals_rad, _SLACK_RAD) & in_force.holds(goals_rad, _SLACK_RAD)):
             ticks[i] = round((goals_rad[i] - self._rad_at_zero[i]) / self.rad_per_tick[i])
         self._last_rad[sent] = in_force.nearest(goals_rad)[sent]
+        self._outside = not self._own.holds(self._last_rad).all()
         return ticks

@@ -100,6 +100,7 @@ class ChainBus(WireBus[L], Generic[L]):
         self._startup: Startup[L] | None = None
         self._enabled = False
         self._places: NDArray[np.intp] = np.zeros(0, np.intp)  # who gets goals
+        self._rejoining: list[Member] = []  # who waits for goals that begin where it stands
         self._own: dict[int, dict[str, int]] = {}  # registers by index that hold something else than startup wanted
         self._compared = 0
         self._compare_s = 0.0
@@ -366,18 +367,18 @@ class ChainBus(WireBus[L], Generic[L]):
 
     def _accepted(self, goals_rad: Doubles) -> bool:
         """Whether a rejoining member takes goals from now on."""
-        waiting = [member for member in self._members if member.state is State.REJOINING]
-        if not waiting:
+        if not self._rejoining:
             return False
         ticks = self._goals.ticks(goals_rad, _NOBODY)
         near = [
             self._goals.allows(member.index, goals_rad[member.index]) and member.accepts(int(ticks[member.index]))
-            for member in waiting
+            for member in self._rejoining
         ]
         return any(near)
 
     def _update_places(self) -> None:
         """Who gets goals; the array stays the same object while it has the same content."""
+        self._rejoining = [member for member in self._members if member.state is State.REJOINING]
         places = [member.index for member in self._members if member.gets_goals]
         if self._places.tolist() != places:
             self._places = np.array(places, np.intp)
@@ -429,20 +430,24 @@ class ChainBus(WireBus[L], Generic[L]):
     def _command(self, link: L, now_s: float) -> None:
         """Torque off, less force: said first, then read back; again in the next poll where nobody confirms it."""
         torque = self._telemetry.torque
-        for member in self._members:
-            if member.to_release:
-                self._writes.want(member.index, torque, 0)
-            elif (member.index, torque.name) in self._writes:
+        released = [member for member in self._members if member.to_release]
+        for member in self._members if self._writes else ():
+            if (member.index, torque.name) in self._writes:
                 self._writes.drop(member.index, torque.name)
+        for member in released:
+            self._writes.want(member.index, torque, 0)
+        for member in self._members:
             if member.state is State.REDUCED and not self._is_reduced(member.index):
                 self._reduce(member.index)
+        if not self._writes:
+            return
         self._writes.step(
             link,
             lambda index: self._members[index].presence.listed,
             lambda where, ids: self._poll.read_some(link, where, ids),
             lambda index, field, value: self._told(index, field, value, now_s),
         )
-        for member in self._members:
+        for member in released:
             member.off_written |= member.to_release
 
     def _told(self, index: int, field: Field, value: int, now_s: float) -> None:

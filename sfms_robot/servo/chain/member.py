@@ -50,6 +50,8 @@ SAID_EVERY_S: Final = 10.0  # a loose contact comes and goes many times a second
 
 
 class State(Enum):
+    __hash__ = object.__hash__  # members are single objects; Enum's own hash is Python, a hundred times a tick
+
     OFF = "off"
     ONLINE = "online"
     REDUCED = "reduced"
@@ -217,6 +219,8 @@ class Member:
     @property
     def fault(self) -> str | None:
         """For `Reading.fault`."""
+        if not self._named and self._trouble is None and self.mismatch is None:
+            return None
         own = [", ".join(self._named)] if self._named else [self._trouble] if self._trouble else []
         return "; ".join(own + ([self.mismatch] if self.mismatch else [])) or None
 

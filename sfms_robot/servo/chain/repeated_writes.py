@@ -29,6 +29,9 @@ class RepeatedWrites:
         self._pending: dict[str, Requests] = {}
         self._read_first: set[tuple[int, str]] = set()
 
+    def __bool__(self) -> bool:
+        return any(self._pending.values())
+
     def __contains__(self, key: tuple[int, str]) -> bool:
         index, name = key
         return index in self._pending.get(name, ())
