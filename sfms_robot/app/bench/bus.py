@@ -151,6 +151,8 @@ def _ours(head: Head, device: str) -> Iterator[Host]:
     bus = build_bus(head, {next(iter(head.buses)): device}, clock)
     bus.connect()
     held = bus.enable(list(head.joints))
+    joints = head.joints.values()  # a head that was switched off has sagged out of its range: it comes in first
+    held = np.clip(held, [joint.min_rad for joint in joints], [joint.max_rad for joint in joints])
 
     def write() -> None:
         bus.write(held, clock.now_s())
