@@ -16,7 +16,12 @@ A listener that is loaded is not yet fast: it builds its graphs while the head e
 it hears then, as fast as it can.
 
     parent -> child    pickle: (name, seed), then SpeakerFrame after SpeakerFrame
-    child -> parent    pickle: (kind, value, number) of KINDS below
+    child -> parent    pickle: (kind, value, number)
+        loaded         nothing is wrong with it
+        ready          it listens
+        done, plan     a frame was taken; for a plan, value is the answer and number the ms that it took
+        skipped        number frames were left out
+        error          it cannot listen, and value says why
 """
 
 from __future__ import annotations
@@ -46,10 +51,6 @@ HUNG_S: Final = 1.0
 RESTART_S: Final = 3.0
 RESTARTS: Final = 5  # in a minute; more than that is no accident
 _MINUTE_S: Final = 60.0
-# loaded: nothing is wrong with it. ready: it listens. done: a frame was taken. plan: the same, this is the answer, and
-# it took so many ms.
-# skipped: so many frames were left out. error: it cannot listen, and why.
-KINDS: Final = ("loaded", "ready", "done", "plan", "skipped", "error")
 
 log = logging.getLogger(__name__)
 
