@@ -139,6 +139,22 @@ class FaceFrame:
 
 
 @dataclass(frozen=True)
+class Sighting:
+    """A person as a camera or a phone saw them.
+
+    Attributes:
+        face: pose and blendshapes; its `time_s` is when they were seen, in loop time.
+        attention: 0..1, whether they look at the head; None where that cannot be told.
+        place_m: (3,) where their eyes are, seen from the camera: x out of its lens, y to its left, z up; None where
+            that cannot be told.
+    """
+
+    face: FaceFrame
+    attention: float | None = None
+    place_m: Floats | None = None
+
+
+@dataclass(frozen=True)
 class SpeakerFrame:
     """What the person did in the last 40 ms.
 
@@ -147,12 +163,15 @@ class SpeakerFrame:
         audio: (n,) mono 16 kHz, -1..1; empty when there is no microphone.
         face: the person's face, or None: a missing modality is normal.
         agent_audio: (n,) what the robot itself says, or None.
+        attention, place_m: see `Sighting`; None without a face.
     """
 
     time_s: float
     audio: Floats
     face: FaceFrame | None = None
     agent_audio: Floats | None = None
+    attention: float | None = None
+    place_m: Floats | None = None
 
 
 @dataclass(frozen=True)

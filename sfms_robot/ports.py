@@ -12,9 +12,58 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import Doubles, Floats, Plan, Reading, SpeakerFrame
+from sfms_robot.frames import Doubles, Floats, Plan, Reading, Sighting, SpeakerFrame
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
+
+
+class Voice(Protocol):
+    """Somebody's voice, cut into frames: frame i is the 640 samples of 16 kHz of loop time (i x 0.04, (i + 1) x 0.04].
+
+    Live voices are filled from another thread or process, whose time stamps are those of `time.monotonic`.
+    """
+
+    @property
+    def duration_s(self) -> float | None:
+        """Length of a recording; None for something live."""
+
+    @property
+    def latency_s(self) -> float:
+        """From the end of a frame to the moment its last sample is at hand; measured, 0 for a recording."""
+
+    def start(self, origin_s: float) -> None:
+        """Loop time 0 is `origin_s` of `time.monotonic`; what was heard before it is dropped."""
+
+    def take(self, index: int) -> Floats | None:
+        """The samples (640,) of frame `index`, asked for in order; None while they are not all there. Never blocks."""
+
+    def statistics(self) -> Mapping[str, Any]:
+        """What was lost, and how far the clocks are apart: for the report."""
+
+    def close(self) -> None: ...
+
+
+class Sight(Protocol):
+    """What a camera or a phone sees of a person. Time stamps as `Voice`."""
+
+    @property
+    def duration_s(self) -> float | None:
+        """Length of a recording; None for something live."""
+
+    @property
+    def latency_s(self) -> float:
+        """From a face to the moment `at` knows of it, as far as it can be measured; 0 for a recording."""
+
+    def start(self, origin_s: float) -> None:
+        """Loop time 0 is `origin_s` of `time.monotonic`."""
+
+    def at(self, time_s: float) -> Sighting | None:
+        """The newest sighting of loop time `time_s` or before, however old; None before the first. Never blocks."""
+
+    def statistics(self) -> Mapping[str, Any]:
+        """What was lost, doubled, refused: for the report."""
+
+    def close(self) -> None: ...
 
 
 class Source(Protocol):
