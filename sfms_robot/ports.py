@@ -284,6 +284,9 @@ class Limiter(Protocol):
     def step(self, reference_rad: Doubles, state: Any) -> tuple[Doubles, Any]:
         """Reference (3, J): angle, speed, acceleration one tick ahead -> angles (J,) that may be sent."""
 
+    def brake(self, state: Any) -> tuple[Doubles, Any]:
+        """Every joint one tick on its way to a stop, as fast as its limits allow -> angles (J,) that may be sent."""
+
     def restart(self, joints: NDArray[np.bool_], angles_rad: Doubles, state: Any) -> Any:
         """Some `joints` (J,) came back and stand still at `angles_rad` (J,); the others go on."""
 
