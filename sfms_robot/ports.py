@@ -209,12 +209,15 @@ class Tick:
         motion: (58,) the face asked for at this instant, without lead.
         goals_rad: (J,) what was written.
         readings: freshest reading per joint.
+        state, why: of the run, see docs/safety.md; `why` names what is lost, or who halted.
     """
 
     time_s: float
     motion: Floats
     goals_rad: Doubles
     readings: Mapping[str, Reading]
+    state: str = "starting"
+    why: tuple[str, ...] = ()
 
 
 class Clock(Protocol):

@@ -104,7 +104,9 @@ def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None
     Raises ConfigError for a chip or line that cannot be used, and for a line that is active already.
     """
     if ioctl is None:
-        from fcntl import ioctl  # Linux only
+        import fcntl  # Linux only
+
+        ioctl = fcntl.ioctl
     name = f"--halt-on {chip}:{line}"
     flags = _INPUT | _RISING | (_ACTIVE_LOW | _PULL_UP if active_low else 0)
     request = bytearray(_REQUEST.pack(line, b"sfms-robot halt", flags, 1, 0))

@@ -30,7 +30,7 @@ ARROWS: Final[frozenset[tuple[StateName, StateName]]] = frozenset(
     [(a, b) for a in _MOVING for b in _RUNNING if a != b]
     + [(a, "halted") for a in _MOVING]
     + [("halted", "starting")]
-    + [(a, "stopping") for a in (*_MOVING, "halted")]  # type: ignore[misc]
+    + [(a, "stopping") for a in (*_MOVING, "halted")]
     + [("stopping", "stopped"), ("stopping", "fault")]
 )
 
