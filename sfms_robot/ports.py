@@ -100,6 +100,10 @@ class Listener(Protocol):
 class PlanFeed(Protocol):
     """A listener seen from the loop: frames go in, plans come out when they are ready."""
 
+    @property
+    def lost(self) -> bool:
+        """Whether it does not answer: hung, or being started anew, or given up."""
+
     def push(self, frame: SpeakerFrame, now_s: float) -> None: ...
 
     def poll(self, now_s: float) -> Sequence[Plan]:
@@ -172,6 +176,13 @@ class Bus(Protocol):
         May be called from any thread at any time after `connect`, also while another one is inside `poll`. Never
         raises, never waits for an answer. No goal is sent from then on, until `enable`. With the policy "hold" nothing
         happens.
+        """
+
+    def release(self, joints: Sequence[str]) -> None:
+        """Torque off for `joints` alone: their goals are withheld, until `enable`; the others go on.
+
+        Written at once in one packet per wire, and again in every poll until each servo says that it is off. Never
+        waits for an answer; raises nothing. Called by who calls `write`.
         """
 
     def stop(self, policy: StopPolicy) -> None:

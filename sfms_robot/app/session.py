@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.listen.knobs import turned
@@ -42,6 +43,8 @@ from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.spontaneous import Life
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.heat import HeatGuard
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
@@ -65,7 +68,7 @@ INTERRUPTED: Final = 130
 
 @dataclass(frozen=True)
 class Motion:
-    """What lies between a plan and the bus."""
+    """What lies between a plan and the bus. `holds` (J,): joints that keep their torque in an emergency stop."""
 
     timeline: PlanTimeline
     retargeter: HeadRetargeter
@@ -73,6 +76,8 @@ class Motion:
     audit: Audit
     leads_s: Doubles
     rest_rad: Doubles
+    holds: NDArray[np.bool_]
+    heat: HeatGuard
 
 
 @dataclass(frozen=True)
@@ -184,6 +189,9 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     leads_s = np.array([joint.lag_ms / 1e3 for joint in head.joints.values()])
     if len(neck := retargeter.neck_columns):
         leads_s[neck] = leads_s[neck].max()  # its joints show one pose together
+    safety = [head.safety_of(joint) for joint in head.joints]
+    holds = np.array([each.halt == "hold" for each in safety])
+    holds[neck] |= np.array([safety[column].halt is None for column in neck], np.bool_)
     return Motion(
         PlanTimeline(1.0 / rate_hz),
         retargeter,
@@ -191,6 +199,8 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
         Audit(limits, calibration_of(head.joints), 1.0 / rate_hz),
         leads_s,
         np.array([joint.rest_rad for joint in head.joints.values()]),
+        holds,
+        HeatGuard(np.array([each.warm_C for each in safety]), np.array([each.hot_C for each in safety]), neck.tolist()),
     )
 
 
@@ -263,8 +273,7 @@ class Programme:
         timeline: None for that of plans.
         retargeter: None for the head's own.
         life: what the head does of itself; None for nothing.
-        knobs: see `Parts`.
-        overlay: see `Parts`.
+        knobs, overlay, answers, halt: see `Parts`.
         observers: closed by whoever made them.
     """
 
@@ -276,6 +285,8 @@ class Programme:
     life: Life | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
+    answers: bool = False
+    halt: HaltLatch = field(default_factory=HaltLatch)
     observers: Sequence[Observer] = ()
 
 
@@ -307,13 +318,15 @@ def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, 
     parts = Parts(
         programme.source, programme.feed, programme.timeline or motion.timeline,
         programme.retargeter or motion.retargeter, motion.limiter, opened.bus, programme.observers, motion.leads_s,
-        motion.rest_rad, programme.life, programme.knobs, programme.overlay,
+        motion.rest_rad, programme.life, programme.knobs, programme.overlay, programme.answers, programme.halt,
+        motion.holds, motion.heat, frozenset(opened.options.without),
     )  # fmt: skip
     log = RunLog(motion.retargeter.joints, 1.0 / opened.rate_hz, motion.audit)
     duration_s = math.inf if programme.duration_s is None else programme.duration_s
     real = not opened.options.fast
     outcome, error = "failed", None
-    with signals_to(interrupt) if signals else nullcontext(), realtime_priority(wanted=real) as priority:
+    watched = programme.halt.watched(opened.bus) if real else nullcontext()
+    with signals_to(interrupt) if signals else nullcontext(), watched, realtime_priority(wanted=real) as priority:
         interrupt.arm(opened.bus)
         began_s = time.monotonic()
         try:

@@ -17,6 +17,7 @@ from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.voice_activity import Ear
 
 GONE_S: Final = 10.0  # neither seen nor heard for so long
+LOST_S: Final = 0.5  # without sound or face from any source
 TURN_GAP_S: Final = 0.6  # a pause between the robot's own words
 SAYS_DB: Final = -55.0  # what is played is clean: anything louder is speech
 
@@ -30,12 +31,14 @@ class Presence:
     Attributes:
         ear: the person's voice activity.
         person_s, spoke_s: when the person was last seen or heard, and the robot last made a sound.
+        sensed_s: when anything last came, silence included.
         attention: of the newest frame, see `Sighting`.
     """
 
     ear: Ear
     person_s: float = _NEVER_S
     spoke_s: float = _NEVER_S
+    sensed_s: float = _NEVER_S
     attention: float | None = None
 
     @classmethod
@@ -51,11 +54,16 @@ class Presence:
             ear,
             frame.time_s if there else self.person_s,
             frame.time_s if says else self.spoke_s,
+            frame.time_s if len(frame.audio) or frame.face is not None else self.sensed_s,
             frame.attention,
         )
 
     def person(self, now_s: float) -> bool:
         return now_s - self.person_s <= GONE_S
+
+    def answered(self, now_s: float) -> bool:
+        """Whether what the listener plans is to show: somebody is there, or is spoken to, and can be sensed."""
+        return self.speaking(now_s) or (self.person(now_s) and now_s - self.sensed_s <= LOST_S)
 
     def speaking(self, now_s: float) -> bool:
         return now_s - self.spoke_s <= TURN_GAP_S

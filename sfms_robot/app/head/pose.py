@@ -140,6 +140,7 @@ class NobodyThere:
     """The empty source and the empty feed: nobody speaks, nobody listens."""
 
     duration_s = None
+    lost = False
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
         return ()
