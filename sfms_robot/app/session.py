@@ -26,6 +26,7 @@ from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import run_report
+from sfms_robot.app.listen.status_server import status_server
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import Head, Joint, load_head
@@ -44,11 +45,13 @@ from sfms_robot.retarget.spontaneous import Life
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.halt_switches import halt_signals, halt_switch
 from sfms_robot.runtime.heat import HeatGuard
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
+from sfms_robot.runtime.status import RunStatus
 from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
@@ -365,7 +368,9 @@ class RunOptions:
     yes: bool = False
     intensity: tuple[str, ...] = ()
     style: tuple[str, ...] = ()
-    without: tuple[str, ...] = field(default=())
+    without: tuple[str, ...] = ()
+    halt_on: str | None = None
+    status: int | None = None
 
     @property
     def servos(self) -> HeadOptions:
@@ -383,6 +388,7 @@ def run(
     knobs: Callable[[HeadRetargeter], Callable[[], Any]] | None = None,
     overlay: Callable[[Floats, Doubles], Floats] | None = None,
     interrupt: Interrupt | None = None,
+    halt: HaltLatch | None = None,
     signals: bool = True,
 ) -> dict[str, Any]:
     """Listen until the duration is over or somebody interrupts. Returns the report.
@@ -396,6 +402,7 @@ def run(
         knobs: from the retargeter of the opened head, what is asked at every tick; None: the options' own.
         observers, overlay: see `Programme`.
         interrupt: asked to end the run from another thread.
+        halt: closed and opened from other threads.
 
     Raises RobotError before torque came on.
     """
@@ -405,8 +412,12 @@ def run(
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
     if limited is not None:
         logger.warning("%s: %s", Path(options.listener).name, limited)
-    interrupt = interrupt or Interrupt()
+    interrupt, halt = interrupt or Interrupt(), halt or HaltLatch()
     with signals_to(interrupt) if signals else nullcontext(), ExitStack() as stack:  # until all is closed again
+        if signals:
+            stack.enter_context(halt_signals(halt))
+        if options.halt_on is not None:
+            stack.enter_context(halt_switch(options.halt_on, halt))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         if source is None:
@@ -422,15 +433,25 @@ def run(
             feed.wait_loaded()
         turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
         recorder = _recorder(options, opened.config)
+        status = RunStatus(
+            list(opened.config.joints),
+            {"head": opened.config.name, "port": options.port, "listener": Path(options.listener).name},
+            lambda: {"source": dict(source.statistics()), "listener_state": dict(feed.statistics())},
+        )
         own = [each for each in (recorder, progress(duration_s) if progress else None) if each is not None]
         for observer in own:
             stack.callback(observer.close)
+        if options.status is not None:
+            port = stack.enter_context(status_server(options.status, status.document))
+            logger.warning("status: http://127.0.0.1:%d/", port)
         programme = Programme(
             source, feed, duration_s,
             life=Life(opened.config.life, options.seed),
             knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
             overlay=overlay,
-            observers=[*observers, *own],
+            answers=True,
+            halt=halt,
+            observers=[status, *observers, *own],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt, signals=False)
         report = run_report(

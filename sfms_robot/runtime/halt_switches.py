@@ -1,4 +1,4 @@
-"""What closes the halt latch from outside the program: a file that appears, or a line of a GPIO chip.
+"""What closes the halt latch from outside the program: a signal, a file that appears, or a line of a GPIO chip.
 
 A button of a GPIO line is wired to ground: the line's own pull-up holds it high, and pressing it closes the latch. With
 `active-high` a line that rises does. Linux only: the chip is `/dev/gpiochipN`, by its character device (kernel 5.10 and
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import select
+import signal
 import stat
 import struct
 import threading
@@ -34,6 +35,26 @@ _EVENT_BYTES: Final = 48  # struct gpio_v2_line_event
 _LINE: Final = re.compile(r"(?P<chip>/dev/gpiochip\d+):(?P<line>\d+)(?P<high>,active-high)?")
 
 Ioctl = Callable[[int, int, bytearray], Any]
+
+
+@contextmanager
+def halt_signals(latch: HaltLatch) -> Iterator[None]:
+    """SIGUSR1 closes the latch while inside, SIGUSR2 opens it. Main thread only; nothing where there are no such."""
+    if not hasattr(signal, "SIGUSR1"):
+        yield
+        return
+    before = [
+        (number, signal.signal(number, handler))
+        for number, handler in (
+            (signal.SIGUSR1, lambda *_: latch.close("signal")),
+            (signal.SIGUSR2, lambda *_: latch.open()),
+        )
+    ]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The latch keeps, only a person opens it, a dead loop is released, and switches outside the program close it."""
 
 import os
+import signal
 import struct
 import threading
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.halt_switches import halt_switch, open_line
+from sfms_robot.runtime.halt_switches import halt_signals, halt_switch, open_line
 
 LONG_S = 5.0  # for what must happen; nothing waits so long unless it fails
 
@@ -86,6 +87,16 @@ def test_a_file_that_appears_closes_it(tmp_path: Path) -> None:
         button.touch()
         assert latch.closed.wait(LONG_S)
     assert latch.by == str(button)
+
+
+def test_one_signal_halts_and_another_lets_go() -> None:
+    latch = HaltLatch()
+    with halt_signals(latch):
+        signal.raise_signal(signal.SIGUSR1)
+        assert latch.by == "signal"
+        signal.raise_signal(signal.SIGUSR2)
+        assert latch.by is None
+    assert signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize(
