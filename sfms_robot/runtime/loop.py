@@ -136,6 +136,7 @@ def drive(
             return "interrupted"
         start_s = clock.now_s()
         try:
+            parts.source.start(clock.origin_s + start_s)
             for tick in tick_times(clock, rate_hz, start_s):
                 if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
                     break
@@ -202,7 +203,7 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
 def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
     """What the run is doing, from here on."""
     presence = state.presence
-    lost = (*parts.source.lost, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
+    lost = (*parts.source.missing, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
     eased_in = bool(now_s - state.since_s.max() >= EASE_S)
     halted = parts.halt.by
     if halted is None and state.run.name == "halted" and not state.released:

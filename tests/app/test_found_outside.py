@@ -16,7 +16,8 @@ from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.safety import Interrupt
-from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.paired import PairedSource
+from sfms_robot.sources.recording import RecordedVoice
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
 SECONDS = 1.6
@@ -66,7 +67,7 @@ def test_a_head_found_outside_its_limits_runs_and_comes_to_rest(name, careful, s
         stack.callback(bus.close)
         bus.connect()
         options = HeadOptions(name, fast=True)
-        silence = Recording(np.zeros(round(SECONDS * 16_000), np.float32), None, SECONDS)
+        silence = PairedSource(RecordedVoice(np.zeros(round(SECONDS * 16_000), np.float32)), duration_s=SECONDS)
         motion = build_motion(head, rate_hz)
         there = OpenHead(options, head, motion, bus, clock, rate_hz, opened)
         programme = Programme(silence, InlineFeed(Restless(), seed, 0.01), SECONDS)
