@@ -31,12 +31,12 @@ from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import Faults
 from sfms_robot.errors import BusError, PacketError
 from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import StopPolicy, TickConversion
+from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.member import FaultReporter, Member, State, members_of
 from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
-from sfms_robot.servo.chain.schedule import TURN_S
+from sfms_robot.servo.chain.schedule import TURN_S, read_bytes
 from sfms_robot.servo.chain.startup import PATIENCE_S, Startup
 from sfms_robot.servo.chain.status_poll import StatusPoll
 from sfms_robot.servo.chain.telemetry import Telemetry
@@ -48,7 +48,7 @@ from sfms_robot.servo.registers import Field, Table
 log = logging.getLogger(__name__)
 
 READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
-STOP_S: Final = 0.2  # that `stop` waits for servos to confirm
+_CONFIRM_S: Final = 0.2  # that `stop` waits for servos to confirm, at most
 _STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
 _EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
 _EXCHANGE_BYTES: Final = 160  # of the longest of them: a whole control table
@@ -253,9 +253,9 @@ class ChainBus(WireBus[L], Generic[L]):
             if alone:
                 self._sending.release()
 
-    def stop(self, policy: StopPolicy) -> None:
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """As `ports.Bus`: torque off first, in one packet, then watchdogs off, in another; then both are read back and
-        written again, for `STOP_S` at most. Waits for nobody before the torque is off."""
+        written again, while there is time. Waits for nobody before the torque is off."""
         self._enabled = False
         armed = self._armed()
         for member in self._members:
@@ -275,28 +275,28 @@ class ChainBus(WireBus[L], Generic[L]):
         self._say_off(link, torque, limp)
         if watchdog is not None:
             self._say_off(link, watchdog, armed)
-        until_s = link.port.now_s() + STOP_S
-        with link.patient(min(_STOP_PATIENCE_S, STOP_S)):
-            self._confirm_off(link, torque, limp, until_s)
+        budget_s = min(_CONFIRM_S, within_s)
+        with link.patient(_STOP_PATIENCE_S), link.within(budget_s, budget_s):
+            self._confirm_off(link, torque, limp)
             if watchdog is not None:
-                self._confirm_off(link, watchdog, [i for i in armed if i not in limp], until_s)
+                self._confirm_off(link, watchdog, [i for i in armed if i not in limp])
 
     def _say_off(self, link: L, field: Field, indices: Iterable[int]) -> None:
         values = {self._servos[i].id: field.to_bytes(0) for i in indices}
         if values:
             self._attempt(lambda: link.sync_write(field.address, values))
 
-    def _confirm_off(self, link: L, field: Field, indices: Sequence[int], until_s: float) -> None:
+    def _confirm_off(self, link: L, field: Field, indices: Sequence[int]) -> None:
         """Read a register of all back, and write 0 again to those that do not say 0.
 
         Whoever is asked first in one round is asked last in the next: behind a dead servo the others are silent.
         """
         rest = list(indices)
         for _ in range(len(indices) + 2):
-            if not rest or link.port.now_s() >= until_s:
+            if not rest or not link.affords(read_bytes(1, field.size, False)):
                 break
             ids = [self._servos[i].id for i in rest]
-            got = self._attempt(partial(self._poll.read_all, link, (field.address, field.size), ids, until_s))
+            got = self._attempt(partial(self._poll.read_some, link, (field.address, field.size), ids))
             if got is None:
                 break  # the port is gone
             off = field.to_bytes(0)

@@ -178,18 +178,6 @@ class StatusPoll:
                 answers[servo] = answer
         return answers
 
-    def read_all(self, link: RegisterLink, where: Block, ids: Sequence[int], until_s: float) -> dict[int, Answer]:
-        """Answers of all who are there, outside of a poll: as long as it takes, but not beyond `until_s`."""
-        if self._group is not None:
-            return dict(self._group(*where, ids))
-        answers: dict[int, Answer] = {}
-        for servo in ids:
-            if link.port.now_s() >= until_s:
-                break
-            if (answer := link.read(servo, *where)) is not None:
-                answers[servo] = answer
-        return answers
-
     def _everybody(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Outcome:
         """All by one request, and those behind a silent one by a second."""
         out = Outcome()
