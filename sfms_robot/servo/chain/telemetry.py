@@ -136,7 +136,8 @@ class Telemetry:
 
     def supply_mA(self) -> float:
         """Sum of the motor currents that are known: an upper bound of what the servos take from the supply."""
-        return float(np.nansum(np.abs(self.current_mA)))
+        currents: list[float] = self.current_mA.tolist()
+        return sum(abs(current) for current in currents if current == current)
 
     def readings(
         self, joints: Sequence[str], faults: Sequence[str | None], rejoined: set[int], now_s: float
