@@ -46,6 +46,7 @@ class PairedSource:
     Attributes:
         duration_s: None for one without end.
         latency_s: see `ports.Voice`.
+        missing: voice, face, agent_audio: those that are lost.
     """
 
     def __init__(
@@ -59,17 +60,13 @@ class PairedSource:
             raise ConfigError(f"--duration = {duration_s:g}: a run lasts longer than 0 s")
         self.duration_s = _length_s(voice, sight, agent) if duration_s is None else duration_s
         self.latency_s = 0.0
+        self.missing: tuple[str, ...] = ()
         self._voice, self._sight, self._agent = voice, sight, agent
         self._judge = FrameJudge()
         self._given = 0
         self._overruns = 0
         self._wait_ms = Quantiles()
         self._face_age_ms = Quantiles()
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """voice, face, agent_audio: those that are lost."""
-        return tuple(name for name, part in self._parts().items() if part.lost)
 
     def start(self, origin_s: float) -> None:
         """Loop time 0 is `origin_s` of `time.monotonic`."""
@@ -87,6 +84,7 @@ class PairedSource:
                 break
             frames.append(self._frame(self._given, heard))
             self._given += 1
+        self.missing = tuple(name for name, part in self._parts().items() if part.lost)
         return frames
 
     def statistics(self) -> Mapping[str, Any]:

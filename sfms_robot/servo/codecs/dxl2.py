@@ -31,6 +31,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
+from fastcrc.crc16 import umts
+
 from sfms_robot.errors import PacketError
 
 PING: Final = 0x01
@@ -84,25 +86,9 @@ class Packet(NamedTuple):
     error: int = 0
 
 
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 8
-        for _ in range(8):
-            crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
-        table.append(crc & 0xFFFF)
-    return tuple(table)
-
-
-_CRC: Final = _crc_table()
-
-
 def crc16(data: bytes | bytearray, crc: int = 0) -> int:
     """CRC-16/BUYPASS: polynomial 0x8005, start 0, not reflected. `crc` continues an earlier call."""
-    table = _CRC
-    for byte in data:
-        crc = ((crc & 0xFF) << 8) ^ table[(crc >> 8) ^ byte]
-    return crc
+    return umts(data, crc)  # the other name of the same crc
 
 
 def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> bytes:
