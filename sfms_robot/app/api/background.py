@@ -77,6 +77,12 @@ class Background:
         seen = self.progress.seen
         return "starting" if seen is None else seen.state
 
+    @property
+    def running(self) -> bool:
+        """Torque is on, and nobody has asked it to stop."""
+        ended = self._error is not None or self.report is not None or self._stopping
+        return self.progress.came.is_set() and not ended
+
     def start(self) -> None:
         """Returns with the first tick, all torque on. Raises what kept it from that, as RobotError."""
         atexit.register(self.stop)
