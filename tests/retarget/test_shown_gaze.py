@@ -27,8 +27,9 @@ knobs = {"intensity": st.floats(0, 2), "style": st.floats(0, 2)}
 
 def turned(name, intensity, style):
     retargeter = RETARGETERS[name]
-    region = "neck" in HEADS[name].regions
-    return retargeter, retargeter.mapping.knobs({"neck": intensity} if region else {}, {"neck": style} if region else {})
+    if "neck" not in HEADS[name].regions:
+        return retargeter, retargeter.mapping.knobs()
+    return retargeter, retargeter.mapping.knobs({"neck": intensity}, {"neck": style})
 
 
 @pytest.mark.parametrize("name", RETARGETERS)
