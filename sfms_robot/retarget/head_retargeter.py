@@ -18,7 +18,6 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import ChannelMapping, Knobs
 from sfms_robot.retarget.kinematics import build_neck
-from sfms_robot.retarget.kinematics.serial import EXACT_RAD
 
 _POSE = len(POSE_CHANNELS)
 _LARGE = np.array([0.5, 0.6, 1.0, 0.05, 0.05, 0.05])  # roll, pitch, yaw [rad], place [m]: where style changes nothing
@@ -82,19 +81,13 @@ class HeadRetargeter:
     def shown_pose(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
         """Motion (..., 58) -> the poses (..., 6) that the neck shows: after the knobs, as far as its joints go.
 
-        Turns only are followed: shifts come back as they were asked. Without kinematics a channel that no joint
-        follows is 0. Raises ValueError where a pose is not finite.
+        Always finite. Without kinematics a channel that no joint follows is 0, the others are as they were asked.
+        Raises ValueError where a pose is not finite.
         """
         if self.neck is None:
             blind = [name in self.blind_channels for name in POSE_CHANNELS]
             return np.where(blind, 0.0, motion[..., :_POSE].astype(np.float64))
-        poses = self._turned(motion[..., :_POSE].astype(np.float64), knobs)
-        solved = self.neck.solve(poses)
-        short = solved.residual_rad > EXACT_RAD
-        if short.any():
-            shown = self.neck.forward(solved.angles_rad[short], np.zeros_like(poses[short]))[..., :3]
-            poses[short, :3] = np.where(np.isfinite(shown), shown, poses[short, :3])  # the search may end nowhere
-        return poses
+        return self.neck.solve(self._turned(motion[..., :_POSE].astype(np.float64), knobs)).shown
 
     def _pose(self, motion: Floats, knobs: Knobs | None) -> Doubles:
         first = self.neck_columns[0]

@@ -19,7 +19,7 @@ from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.log import RunLog
 
 EASE_S: Final = 1.0  # torque-on pose -> live face, and live face -> rest
-SETTLE_S: Final = 2.0  # a slow joint may need longer than EASE_S; after this the torque goes off all the same
+REST_LIMIT_S: Final = 60.0  # of the whole way to rest; twice what the slowest joint of a shipped head may need
 ARRIVED_RAD: Final = 1e-4  # of a goal
 STANDS_RAD: Final = 0.01  # of a servo: its gear and its load leave it a little short
 FOLLOW_S: Final = 0.3  # that servos are given after their goals have arrived
@@ -39,11 +39,12 @@ def smooth(u: T) -> T:
 def come_to_rest(
     bus: Bus, limiter: Limiter, state: Any, from_rad: Doubles, rest_rad: Doubles, ticks: Iterable[TickTime], log: RunLog
 ) -> None:
-    """Ease every joint to its rest angle under the limits; blocks for up to EASE_S + SETTLE_S.
+    """Ease every joint to its rest angle under the limits; blocks for at least `EASE_S` and at most `REST_LIMIT_S`.
 
-    Ends when goals and servos have arrived; servos that do not quite get there have `FOLLOW_S` for it. Takes as long in
-    seconds however many ticks that is. A tick that raises (a bus that fails, a goal that is refused)
-    is said once and left out; after `FAILURES` in a row it gives up. Never raises an Exception.
+    Takes as long as the limiter needs to bring its goals there, so that no joint loses its torque on the way. It needs
+    time of its own ticks, so a computer that is late for some takes longer. Once the goals have arrived, servos have
+    `FOLLOW_S` to follow, whether they move or not. A tick that raises (a bus that fails, a goal that is refused) is
+    said once and left out; after `FAILURES` in a row it gives up. Never raises an Exception.
     """
     span = rest_rad - from_rad
     began_s: float | None = None
@@ -68,7 +69,7 @@ def come_to_rest(
         except Exception as error:  # whatever it is, the other buses are still to be eased
             failed += 1
             logger.error("on the way to rest: %s", error)
-        if failed >= FAILURES or (arrived and since_s >= EASE_S) or since_s >= EASE_S + SETTLE_S:
+        if failed >= FAILURES or (arrived and since_s >= EASE_S) or since_s >= REST_LIMIT_S:
             return
 
 

@@ -23,10 +23,11 @@ class BusFamily:
 
     Attributes:
         title: the word for people.
-        bus: "module:class" of its `ports.Bus`.
+        bus: "module:class" of its `ports.Bus`, called with (name, servos, conversion, open_port, baud, read_deadline_s)
+            and `config`; servos also with `faults`, a board with `confirmed` and `rest_rad` (see `PulseBus`).
         maps: (family, protocol) of its firmware maps; the protocol is None for a board.
         link: "module:class" of the `RegisterLink` that its tools speak through; None for a board, whose servos have
-            no registers.
+            no registers, and for servos that the tools do not talk to.
         dialect: what that class is told beside port, baud and patience.
         bauds: bits per second that its servos may be set to, those met most often first.
         max_id: highest id of a servo.
@@ -45,7 +46,7 @@ class BusFamily:
     @property
     def board(self) -> bool:
         """Its servos report nothing, not even where they stand."""
-        return self.link is None
+        return self.maps[1] is None
 
     @property
     def protocol(self) -> int:
@@ -58,9 +59,10 @@ class BusFamily:
         return _resolved(self.bus)
 
     def link_class(self) -> Any:
-        """Raises ConfigError for a board."""
+        """Raises ConfigError for a board, and for a family without tools."""
         if self.link is None:
-            raise ConfigError(f"{self.title}: a board has no registers to read or write")
+            why = "a board has no registers to read or write" if self.board else "the servo tools do not speak to it"
+            raise ConfigError(f"{self.title}: {why}")
         return _resolved(self.link)
 
 
@@ -115,8 +117,8 @@ def families() -> Mapping[str, BusFamily]:
 
 
 def servo_families() -> Mapping[str, BusFamily]:
-    """Those whose servos have registers, by name: what the servo tools can talk to."""
-    return {name: family for name, family in families().items() if not family.board}
+    """Those that have a link, by name: what the servo tools can talk to."""
+    return {name: family for name, family in families().items() if family.link is not None}
 
 
 def family_named(name: str) -> BusFamily:

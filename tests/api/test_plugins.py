@@ -1,5 +1,6 @@
 """A package of somebody else's, with its dist-info, adds listeners, sources and buses by name."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,6 +8,8 @@ import sys
 import pytest
 
 import sfms_robot as sr
+from sfms_robot.data import data_dir
+from sfms_robot.servo.families import families
 
 PACKAGE = """
 import numpy as np
@@ -39,11 +42,16 @@ class Hum(sr.Source):
 """
 
 FAMILY = """
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.families import BusFamily
 
-FAMILY = BusFamily("Somebody's servos", "somebodys_servos:Bus", ("somebodys", None))
+FAMILY = BusFamily("Somebody's servos", "somebodys_servos:Bus", ("dynamixel", 2))
 
-class Bus: ...
+class Bus(Dynamixel2Bus):
+    '''Its statistics say whose they are.'''
+
+    def statistics(self):
+        return {**super().statistics(), "whose": "somebody's"}
 """
 
 
@@ -127,3 +135,37 @@ def test_a_robot_listens_to_a_source_of_another_package(installed, monkeypatch):
         robot.wait()
     assert robot.report()["frames"] == 10
     assert listener.heard and all((frame.audio == 0.25).all() for frame in listener.heard)
+
+
+@pytest.fixture
+def their_head(installed):
+    """The folder of a head on that bus."""
+    folder = installed / "their_head"
+    folder.mkdir()
+    text = (data_dir("configs") / "heads" / "op3_head" / "head.yaml").read_text()
+    assert "family: dynamixel2" in text
+    (folder / "head.yaml").write_text(text.replace("family: dynamixel2", "family: somebodys"))
+    return folder
+
+
+def test_a_head_on_a_bus_of_another_package_runs_on_emulated_servos(installed, their_head):
+    here = {**os.environ, "XDG_CONFIG_HOME": str(installed), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    arguments = ["run", "--head", str(their_head), "--listener", "nodder:0.15", "--audio", "none", "--face", "none"]
+    arguments += ["--fast", "--duration", "3", "--json"]
+    command = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert report["exit"] == "done" and report["limits"]["violations"] == 0
+    assert report["bus"]["whose"] == "somebody's"
+    assert report["joints"]["head_tilt"]["travel_rad"] > 0.1
+
+
+def test_a_robot_moves_a_head_on_a_bus_of_another_package(installed, their_head, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(installed))
+    families.cache_clear()
+    with sr.open_bus(str(their_head), port="sim") as bus:
+        bus.enable()
+        assert bus.move(bus.rest_rad + 0.1)
+    families.cache_clear()
+    assert bus.report()["exit"] == "interrupted"

@@ -13,9 +13,10 @@ from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame
+from sfms_robot.motion.limits import JointLimits
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
-from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, STANDS_RAD, Interrupt
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.recording import RecordedVoice
 
@@ -39,11 +40,11 @@ class Restless:
         return Plan(speaker.time_s, speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1), frames), memory
 
 
-def found_outside(head, whole, rng):
-    """The servos of `emulated`, each up to a radian outside the range of its joint, as far as its turn goes."""
+def found_outside(head, whole, rng, least_rad=0.002, most_rad=1.0):
+    """The servos of `emulated`, each that far outside the range of its joint, as far as its turn goes."""
     servos = emulated(head)
     for name, joint in head.joints.items():
-        out = rng.uniform(0.002, 1.0)
+        out = rng.uniform(least_rad, most_rad)
         angle = joint.min_rad - out if rng.random() < 0.5 else joint.max_rad + out
         calibration = calibration_of({name: whole.joints[name]})
         ticks = round(float(calibration.zero_ticks[0] + calibration.ticks_per_rad[0] * angle))
@@ -54,24 +55,60 @@ def found_outside(head, whole, rng):
     return servos
 
 
+def driven(head, servos, seconds, seed, fault=None):
+    """A run of that long: its log, its motion, the time it took in all, and where the servos stand after it, ticks."""
+    rate_hz, clock = max(bus.rate_hz for bus in head.buses.values()), VirtualClock()
+    with ExitStack() as stack:
+        opened = {bus: stack.enter_context(launch(servos[bus], True)) for bus in servos}
+        bus = build_bus(head, opened, clock)
+        stack.callback(bus.close)
+        bus.connect()
+        for chain in opened.values() if fault else ():
+            chain.inject(fault)
+        options = HeadOptions(head.name, fast=True)
+        silence = PairedSource(RecordedVoice(np.zeros(round(seconds * 16_000), np.float32)), duration_s=seconds)
+        motion = build_motion(head, rate_hz)
+        there = OpenHead(options, head, motion, bus, clock, rate_hz, opened)
+        began_s = clock.now_s()
+        programme = Programme(silence, InlineFeed(Restless(), seed, 0.01), seconds)
+        drove = drive_head(there, programme, Interrupt(), signals=False)
+        stand = {name: opened[joint.bus].state(joint.id) for name, joint in head.joints.items()}
+    assert (drove.outcome, drove.error) == ("done", None)
+    assert not any(state["torque"] for state in stand.values())
+    return drove.log, motion, clock.now_s() - began_s, {name: state["position"] for name, state in stand.items()}
+
+
 @pytest.mark.parametrize(("careful", "seed"), [(False, 0), (True, 1)])
 @pytest.mark.parametrize("name", HEADS)
 def test_a_head_found_outside_its_limits_runs_and_comes_to_rest(name, careful, seed):
     whole = load_head(name)
     head = held_back(whole) if careful else whole
-    rate_hz, clock = max(bus.rate_hz for bus in head.buses.values()), VirtualClock()
-    with ExitStack() as stack:
-        servos = found_outside(head, whole, np.random.default_rng(seed))
-        opened = {bus: stack.enter_context(launch(servos[bus], True)) for bus in servos}
-        bus = build_bus(head, opened, clock)
-        stack.callback(bus.close)
-        bus.connect()
-        options = HeadOptions(name, fast=True)
-        silence = PairedSource(RecordedVoice(np.zeros(round(SECONDS * 16_000), np.float32)), duration_s=SECONDS)
-        motion = build_motion(head, rate_hz)
-        there = OpenHead(options, head, motion, bus, clock, rate_hz, opened)
-        programme = Programme(silence, InlineFeed(Restless(), seed, 0.01), SECONDS)
-        drove = drive_head(there, programme, Interrupt(), signals=False)
-    assert (drove.outcome, drove.error) == ("done", None)
-    assert drove.log.audited.violations == 0 and drove.log.eased >= rate_hz
-    assert motion.limiter.start(drove.log.audited.recent_rad[-1]).way_in is None  # all are inside
+    log, motion, _, _ = driven(head, found_outside(head, whole, np.random.default_rng(seed)), SECONDS, seed)
+    assert log.audited.violations == 0
+    assert motion.limiter.start(log.audited.recent_rad[-1]).way_in is None  # all are inside
+
+
+@pytest.mark.parametrize("name", ["op3_head", "reachy_mini", "face28"])
+def test_torque_stays_on_until_the_slowest_joint_has_come_to_rest(name):
+    """Asked to end while joints are far outside: at 0.3 of their pace they need longer than the face's own easing."""
+    whole = load_head(name)
+    head = held_back(whole)
+    servos = found_outside(head, whole, np.random.default_rng(2), 2.0, 3.0)
+    log, motion, took_s, stand = driven(head, servos, 0.1, 2)
+    assert log.audited.violations == 0
+    assert np.abs(log.audited.recent_rad[-1] - motion.rest_rad).max() < ARRIVED_RAD
+    assert took_s > 3.0
+    for key, joint in head.joints.items():
+        here = calibration_of({key: whole.joints[key]})
+        angle = (stand[key] - here.zero_ticks[0]) / here.ticks_per_rad[0]
+        assert abs(angle - joint.rest_rad) < 2 * STANDS_RAD, key
+
+
+def test_servos_that_do_not_move_get_as_long_as_their_goals_need_and_no_longer():
+    whole = load_head("op3_head")
+    head = held_back(whole)
+    servos = found_outside(head, whole, np.random.default_rng(2), 2.0, 3.0)
+    log, motion, took_s, stand = driven(head, servos, 0.1, 2, "stuck")
+    assert np.abs(log.audited.recent_rad[-1] - motion.rest_rad).max() < ARRIVED_RAD
+    assert took_s < EASE_S + np.pi / JointLimits.of(head).speed.min() + FOLLOW_S + 1.0
+    assert list(stand.values()) == [servo.start_ticks for servo in servos["main"]]

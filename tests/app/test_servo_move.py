@@ -8,6 +8,8 @@ from sfms_robot.app.servo.single_servo import field_named, read
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import ConfigError, ServoError
+from sfms_robot.servo.registers import Table
+from sfms_robot.servo.stored_settings import limit_names
 
 MODELS = {"xl330-m288": "dynamixel2", "xl-320": "dynamixel2", "ax-12a": "dynamixel1", "sts3215": "feetech"}
 
@@ -82,6 +84,67 @@ def test_its_own_limits_hold():
     with wire_on(at("xl330-m288", registers=registers)) as (wire, _):
         with pytest.raises(ConfigError, match="2000..2100"):
             move(wire, wire.find(1), "2200", None)
+
+
+def outside(model, degrees=-12.0):
+    """A servo that stands that far below limits which somebody has stored in it."""
+    table = Table.of(load_firmware_map(model))
+    low, high = limit_names(table)
+    first = table.center_ticks - round(20 / 360 * table.ticks_per_revolution)
+    start = first + round(degrees / 360 * table.ticks_per_revolution)
+    registers = {low: first, high: table.center_ticks + 200}
+    return EmulatedServo(1, model, start_ticks=start, registers=registers), first, table
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_one_outside_its_own_limits_is_brought_in_slowly_and_moved_on(model, caplog):
+    servo, first, table = outside(model)
+    with wire_on(servo, family=MODELS[model]) as (wire, chain):
+        seen = wire.find(1)
+        speed, torque = table.role("moving_speed"), field_named(table, "torque_enable")
+        before = read(wire, seen, speed)
+        wire.clock = watched = Watched(wire, chain)
+        result = move(wire, seen, str(table.center_ticks), None)
+        assert abs(result["reached"] - table.center_ticks) <= table.ticks_per_revolution / 200
+        assert (read(wire, seen, torque), read(wire, seen, speed)) == (0, before)
+        degrees = 360.0 / table.ticks_per_revolution
+        steps = zip(watched.seen, watched.seen[1:], strict=False)
+        assert max(abs(b - a) * degrees / (t - s) for (s, a), (t, b) in steps if t > s) <= 2.5 * SPEED_DEG_S
+    assert f"stands at {servo.start_ticks}, outside its limits {first}.." in caplog.text
+    assert "moving it inside at 20 deg/s" in caplog.text
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("ends", ["stuck", "Ctrl-C"])
+def test_one_that_does_not_come_in_has_no_torque_before_its_usual_profile_is_back(model, ends):
+    servo, first, table = outside(model)
+
+    class Ended(Watched):
+        def wait_until(self, time_s):
+            super().wait_until(time_s)
+            if ends == "stuck":
+                self.chain.turn(1, servo.start_ticks)
+            elif self.seen[-1][1] > servo.start_ticks:
+                raise KeyboardInterrupt
+
+    with wire_on(servo, family=MODELS[model]) as (wire, chain):
+        seen = wire.find(1)
+        speed, clock = table.role("moving_speed"), wire.clock
+        before = read(wire, seen, speed)
+        wire.clock = Ended(wire, chain)
+        with pytest.raises((ServoError, KeyboardInterrupt)):
+            move(wire, seen, str(table.center_ticks), None)
+        wire.clock = clock
+        assert read(wire, seen, speed) == before and not chain.state(1)["torque"]
+        assert chain.state(1)["position"] < first
+
+
+def test_a_goal_outside_its_limits_brings_nobody_in():
+    servo, *_ = outside("xl330-m288")
+    with wire_on(servo) as (wire, chain):
+        with pytest.raises(ConfigError, match="outside its limits"):
+            move(wire, wire.find(1), None, "1")
+        assert not chain.state(1)["torque"] and chain.state(1)["position"] == servo.start_ticks
 
 
 def test_something_in_the_way_ends_it_without_torque():

@@ -20,10 +20,10 @@ def _own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", range(5))
 def test_a_block_of_the_page_runs(number):
     code = blocks("docs/api.md")
-    assert len(code) == 4
+    assert len(code) == 5
     exec(compile(code[number], f"docs/api.md, block {number}", "exec"), {})
 
 

@@ -12,6 +12,7 @@ from sfms_robot.motion.audit import Audit
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.chase import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
+from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
 from sfms_robot.servo.goals import Goals
 from sfms_robot.servo.policy import BusServo
 
@@ -172,3 +173,37 @@ def test_braking_stops_every_joint_where_no_limit_is_broken_and_nobody_goes_fart
     assert np.array_equal(law.last, before)
     law.restart(np.ones(law.count, bool), law.last)  # and it goes on from there
     law.tick(asked(np.random.default_rng(seed), limits, law.last, "anywhere"), np.arange(law.count))
+
+
+def rest_of(head: Head) -> np.ndarray:
+    return np.array([joint.rest_rad for joint in head.joints.values()])
+
+
+def needed_s(limits: JointLimits, way_rad) -> np.ndarray:
+    """As docs/safety.md states it (J,): stop first, then from rest to rest; `StopChase` takes a little longer."""
+    ramp_s = limits.speed / limits.acceleration + limits.acceleration / limits.jerk
+    return 1.05 * (way_rad / limits.speed + 3 * ramp_s) + 0.05
+
+
+@pytest.mark.parametrize("chase", CHASES)
+@pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
+@pytest.mark.parametrize("name", ["op3_head", "face28", "inmoov2_maestro"])
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), ticks=st.integers(0, 60))
+def test_whatever_a_joint_does_it_is_at_rest_in_the_stated_time_once_it_is_asked_to(name, size, chase, seed, ticks):
+    head = size(load_head(name))
+    law, rest_rad = Law(head, chase), rest_of(head)
+    tormented(law, seed, KINDS, ticks)
+    due_s = needed_s(law.limits, np.abs(law.last - rest_rad))
+    asked_rad = np.stack([rest_rad, 0 * rest_rad, 0 * rest_rad])
+    for tick in range(int(due_s.max() / DT_S) + 2):
+        late = tick * DT_S > due_s
+        assert (np.abs(law.last - rest_rad) < ARRIVED_RAD)[late].all()
+        law.tick(asked_rad, np.arange(law.count))
+    assert (np.abs(law.last - rest_rad) < ARRIVED_RAD).all()
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_the_way_to_rest_of_a_shipped_head_is_never_cut_short_wherever_its_joints_are_found(name):
+    for head in (load_head(name), held_back(load_head(name))):
+        assert needed_s(JointLimits.of(head), 2 * np.pi).max() + EASE_S + FOLLOW_S < REST_LIMIT_S

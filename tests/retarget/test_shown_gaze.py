@@ -2,46 +2,67 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.config.calibrate_first import held_back
+from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.eyes import directions
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 FULL_RAD = np.radians([30.0, 20.0])
-HEADS = {name: load_head(name) for name in ("face28", "inmoov2_ssc32", "reachy_mini", "op3_head")}
+HEADS = {name: load_head(name) for name in shipped_names(data_dir("configs") / "heads", "head.yaml")}
 HEADS |= {f"{name}, cautious": held_back(head) for name, head in list(HEADS.items())}
+RECENTRE_DEG = 400.0  # they never jump back to where the face has them
 RETARGETERS = {name: HeadRetargeter(head) for name, head in HEADS.items() if head.kinematics}
 
 
-@pytest.mark.parametrize("name", RETARGETERS)
-@settings(max_examples=6, deadline=None)
-@given(
-    intensity=st.floats(0, 2), style=st.floats(0, 2), yaw=st.floats(-0.5, 0.5), pitch=st.floats(-0.4, 0.4),
-    roll=st.floats(-0.4, 0.4), hz=st.floats(0.2, 2.0),
-)  # fmt: skip
-def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style, yaw, pitch, roll, hz):
+turns = st.tuples(st.floats(-1.2, 1.2), st.floats(-1.0, 1.0), st.floats(-2.0, 2.0))  # roll, pitch, yaw
+shifts = st.tuples(*[st.floats(-0.05, 0.05)] * 3)
+knobs = {"intensity": st.floats(0, 2), "style": st.floats(0, 2)}
+
+
+def turned(name, intensity, style):
     retargeter = RETARGETERS[name]
-    region = "neck" in HEADS[name].regions
-    knobs = retargeter.mapping.knobs({"neck": intensity} if region else {}, {"neck": style} if region else {})
-    alive = spontaneous.Life(Life(gaze=Gaze(recentre_deg=90.0)), seed=0)
+    if "neck" not in HEADS[name].regions:
+        return retargeter, retargeter.mapping.knobs()
+    return retargeter, retargeter.mapping.knobs({"neck": intensity}, {"neck": style})
+
+
+@pytest.mark.parametrize("name", RETARGETERS)
+@settings(max_examples=10, deadline=None)
+@given(**knobs, turn=turns, shift=shifts)
+@example(intensity=2.0, style=1.0, turn=(0.0, 0.5, 1.0), shift=(0.0, 0.0, 0.0))
+def test_the_pose_that_is_said_to_be_shown_is_the_one_that_the_joints_give(name, intensity, style, turn, shift):
+    retargeter, knobs = turned(name, intensity, style)
+    motion = np.zeros((1, MOTION_DIM), np.float32)
+    motion[0, :6] = [*turn, *shift]
+    shown = retargeter.shown_pose(motion, knobs)
+    given_rad = retargeter.angles(motion[0], knobs)[retargeter.neck_columns]
+    assert shown == pytest.approx(retargeter.neck.forward(given_rad[None], shown), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", RETARGETERS)
+@settings(max_examples=10, deadline=None)
+@given(**knobs, turn=turns, shift=shifts, hz=st.floats(0.2, 2.0))
+def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style, turn, shift, hz):
+    retargeter, knobs = turned(name, intensity, style)
+    alive = spontaneous.Life(Life(gaze=Gaze(recentre_deg=RECENTRE_DEG)), seed=0)
     state, rows = alive.start(), []
     for now_s in np.arange(0.0, 0.6, 0.03):
         times_s = now_s + np.array([0.0, 0.05])
         motion = np.zeros((2, MOTION_DIM), np.float32)
-        for channel, size in (("yaw", yaw), ("pitch", pitch), ("roll", roll)):
-            motion[:, CHANNEL_INDEX[channel]] = size * np.sin(2 * np.pi * hz * times_s)
+        motion[:, :6] = np.sin(2 * np.pi * hz * times_s)[:, None] * [*turn, *shift]
         motion, state = alive.step(motion, times_s, now_s, state, lambda face: retargeter.shown_pose(face, knobs))
         rows.append(motion[0])
     motion = np.array(rows)
-    poses = motion[:, :6].astype(float)
     solved = np.array([retargeter.angles(row, knobs)[retargeter.neck_columns] for row in motion])
-    shown = retargeter.neck.forward(solved, 0 * poses)[:, [2, 1]]
+    shown = retargeter.neck.forward(solved, retargeter.shown_pose(motion, knobs))[:, [2, 1]]
     eyes = directions(motion, FULL_RAD).mean(axis=1)
+    assert np.isfinite(eyes).all()
     free = (np.abs(eyes) < 0.99 * FULL_RAD).all(axis=1)  # the eyes can turn so far
     assert not free.any() or np.ptp((eyes + shown)[free], axis=0).max() < 1e-3
 

@@ -20,7 +20,7 @@ from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.runtime.safety import Interrupt, Released
+from sfms_robot.runtime.safety import REST_LIMIT_S, Interrupt, Released
 from sfms_robot.sources.paired import PairedSource
 
 HEAD = load_head("interbotix_wxxms")
@@ -99,7 +99,7 @@ class Watcher:
 
 def driven(
     chain: Chain, clock: VirtualClock, place: str = "", error: type[BaseException] = ValueError, first: int = 1,
-    times: int = 1, observer: Watcher | None = None, interrupted: Any = lambda: False,
+    times: int = 1, observer: Watcher | None = None, interrupted: Any = lambda: False, limiter: Any = None,
 ) -> tuple[str, RunLog]:  # fmt: skip
     """One run on a fresh bus, in which `place` raises."""
     motion = build_motion(HEAD, RATE_HZ)
@@ -110,6 +110,8 @@ def driven(
         "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Turner(), 0, 0.01), "timeline": motion.timeline,
         "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus, "life": Life(HEAD.life, 0),
     }  # fmt: skip
+    if limiter:
+        parts["limiter"] = limiter(parts["limiter"])
     if place:
         name, method = place.split(".")
         parts[name] = Raising(parts[name], method, error, first, times)
@@ -201,14 +203,37 @@ def test_before_torque_the_first_request_ends_whatever_goes_on():
         Interrupt().on_signal(2, None)
 
 
-def test_coming_to_rest_takes_seconds_not_ticks(chain):
-    """A computer that is late for most of its ticks takes no longer than one that is not."""
+class Late(VirtualClock):
+    """Of a computer that makes one tick in eight."""
 
-    class Slow(VirtualClock):
-        def wait_until(self, time_s: float) -> None:
-            super().wait_until(time_s + 0.07)
+    def wait_until(self, time_s: float) -> None:
+        super().wait_until(time_s + 0.07)
 
-    clock = Slow()
+
+def test_a_computer_that_is_late_still_comes_to_rest(chain):
+    """Its goals take eight times as long; torque stays on until they have arrived."""
+    clock = Late()
     driven(chain, clock)
-    assert clock.now_s() < SECONDS + 3.0 + 1.0
+    assert clock.now_s() < SECONDS + REST_LIMIT_S
+    assert_at_rest(chain)
+
+
+def test_a_limiter_that_never_brings_its_goals_there_holds_nobody_for_longer_than_the_limit(chain):
+    class Lame:
+        """Lets goals move in its first ticks only."""
+
+        def __init__(self, limiter: Any) -> None:
+            self._limiter, self._ticks = limiter, 0
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._limiter, name)
+
+        def step(self, reference_rad: Any, state: Any) -> Any:
+            self._ticks += 1
+            goals, after = self._limiter.step(reference_rad, state)
+            return (goals, after) if self._ticks < 10 else (state.motion[0], state)
+
+    clock = Late()
+    _, log = driven(chain, clock, limiter=Lame)
+    assert clock.now_s() == pytest.approx(SECONDS + REST_LIMIT_S, abs=1.0)
     assert_limp(chain)

@@ -150,7 +150,8 @@ class Robot:
     def stop(self) -> None:
         """Come to rest, torque off. Blocks until then, 4 s at most once it has started; idempotent.
 
-        Raises once, as RobotError, what ended the run before.
+        A joint that was found far outside its range takes what its limits need, up to a minute. Raises once,
+        as RobotError, what ended the run before.
         """
         if self._run is not None:
             try:

@@ -134,7 +134,10 @@ class Servos:
         return {} if seen is None else seen.readings
 
     def stop(self) -> None:
-        """Ease to rest and torque off; blocks until then, 3.5 s at most. Raises once what went wrong meanwhile."""
+        """Ease to rest and torque off; blocks until then. Raises once what went wrong meanwhile.
+
+        4 s at most from inside the joints' ranges; one found far outside takes what its limits need, up to a minute.
+        """
         if self._run is not None:
             self._run.stop()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Iterator
@@ -11,13 +12,18 @@ from typing import Any, Final
 from sfms_robot.app.servo.serial_line import Seen, Wire
 from sfms_robot.app.servo.single_servo import field_named, put, read
 from sfms_robot.errors import ConfigError, ServoError
+from sfms_robot.servo.chain.slow_profile import WayInside, slow_profile, way_inside
 from sfms_robot.servo.registers import Field, Table
 from sfms_robot.servo.stored_settings import limit_names
+
+log = logging.getLogger(__name__)
 
 SPEED_DEG_S: Final = 20.0
 STEP_S: Final = 0.02
 BEHIND_DEG: Final = 8.0  # farther behind its goal than this, something is in the way
 SETTLE_S: Final = 1.0
+LOOK_S: Final = 0.05  # between two looks at a servo that comes inside its limits
+STILL_TICKS: Final = 1  # between two looks: it stands
 CLOSE_DEG: Final = 1.5  # a loaded servo without integral gain stops that short
 
 
@@ -25,7 +31,9 @@ def move(wire: Wire, seen: Seen, to: str | None, by: str | None) -> dict[str, An
     """Move a servo to a place or by a way: raw ticks, or degrees of its shaft as `-5deg`.
 
     Its own profile is limited and its goal goes in steps of at most `SPEED_DEG_S`; torque comes on where it stands.
-    Torque and profile are put back afterwards, also after Ctrl-C. Blocks for as long as the way takes, and `SETTLE_S`.
+    One that stands outside its own limits cannot hold there: its own profile moves it inside first, as slowly, which
+    the log says. Torque and profile are put back afterwards, also after Ctrl-C. Blocks for as long as the way takes,
+    and `SETTLE_S`.
 
     Raises ConfigError for a goal outside its limits, ServoError for one that is not in position mode, refuses, or does
     not get there; it then stops where it is.
@@ -34,33 +42,40 @@ def move(wire: Wire, seen: Seen, to: str | None, by: str | None) -> dict[str, An
     goal_field, present_field = field_named(table, "goal_position"), field_named(table, "present_position")
     _in_position_mode(wire, seen)
     start = read(wire, seen, present_field)
-    target = _target(wire, seen, table, start, to, by)
+    limits = _limits(wire, seen, table)
+    target = _target(seen, table, limits, start, to, by)
     step = max(1, math.floor(_ticks(table, SPEED_DEG_S) * STEP_S))
-    with _gently(wire, seen, start):
-        goal, due_s = start, wire.clock.now_s()
-        while goal != target:
-            goal += max(-step, min(step, target - goal))
-            put(wire, seen, goal_field, goal)
-            due_s += STEP_S
-            wire.clock.wait_until(due_s)
-            _in_the_way(wire, seen, goal, read(wire, seen, present_field))
-        reached = _settled(wire, seen, present_field, target)
+    with _torque_as_found(wire, seen):
+        goal = start if limits[0] <= start <= limits[1] else _brought_in(wire, seen, start, limits)
+        with _gently(wire, seen, goal):
+            due_s = wire.clock.now_s()
+            while goal != target:
+                goal += max(-step, min(step, target - goal))
+                put(wire, seen, goal_field, goal)
+                due_s += STEP_S
+                wire.clock.wait_until(due_s)
+                _in_the_way(wire, seen, goal, read(wire, seen, present_field))
+            reached = _settled(wire, seen, present_field, target)
     return {"id": seen.id, "from": start, "to": target, "reached": reached}
 
 
-def _target(wire: Wire, seen: Seen, table: Table, start: int, to: str | None, by: str | None) -> int:
+def _limits(wire: Wire, seen: Seen, table: Table) -> tuple[int, int]:
+    """Those that it has stored, or a turn where it has none or they are the same."""
+    turn = 0, math.ceil(table.ticks_per_revolution) - 1
+    names = limit_names(table)
+    if names is None:
+        return turn
+    low, high = (read(wire, seen, table[name]) for name in names)
+    return (low, high) if low < high else turn
+
+
+def _target(seen: Seen, table: Table, limits: tuple[int, int], start: int, to: str | None, by: str | None) -> int:
     if (to is None) == (by is None):
         raise ConfigError("servo move: say --to TICKS or --by TICKS, one of them (or degrees: --by -5deg)")
     target = _parsed(table, to) if to is not None else start + _parsed(table, by or "")
-    low, high = 0, math.ceil(table.ticks_per_revolution) - 1
-    names = limit_names(table)
-    if names is not None:
-        own = tuple(read(wire, seen, table[name]) for name in names)
-        low, high = own if own[0] < own[1] else (low, high)
+    low, high = limits
     if not low <= target <= high:
         raise ConfigError.at(f"id {seen.id}", "goal", target, "is outside its limits", [f"{low}..{high}"])
-    if not low <= start <= high:
-        raise ServoError(f"id {seen.id} stands at {start}, outside its limits {low}..{high}: turn it in by hand")
     return target
 
 
@@ -84,24 +99,80 @@ def _in_position_mode(wire: Wire, seen: Seen) -> None:
 
 
 @contextmanager
-def _gently(wire: Wire, seen: Seen, start: int) -> Iterator[None]:
-    """Torque on at `start` with a slow profile; afterwards both are as before."""
-    table = seen.registers()
-    torque, goal = field_named(table, "torque_enable"), field_named(table, "goal_position")
-    speed = table.role("moving_speed")
-    was_on, was_fast = read(wire, seen, torque), None if speed is None else read(wire, seen, speed)
+def _torque_as_found(wire: Wire, seen: Seen) -> Iterator[None]:
+    """Torque goes off again afterwards where it was off."""
+    torque = field_named(seen.registers(), "torque_enable")
+    was_on = read(wire, seen, torque)
     try:
-        if speed is not None:
-            put(wire, seen, speed, _slow(speed))
-        if not was_on:
-            put(wire, seen, goal, start)
-            put(wire, seen, torque, 1)
         yield
     finally:
         if not was_on:
             put(wire, seen, torque, 0)
+
+
+@contextmanager
+def _gently(wire: Wire, seen: Seen, start: int) -> Iterator[None]:
+    """Torque on at `start` with a slow profile, which is as before afterwards."""
+    table = seen.registers()
+    torque, goal = field_named(table, "torque_enable"), field_named(table, "goal_position")
+    speed = table.role("moving_speed")
+    was_fast = None if speed is None else read(wire, seen, speed)
+    try:
+        if speed is not None:
+            put(wire, seen, speed, _slow(speed))
+        if not read(wire, seen, torque):
+            put(wire, seen, goal, start)
+            put(wire, seen, torque, 1)
+        yield
+    finally:
         if speed is not None and was_fast is not None:
             put(wire, seen, speed, was_fast)
+
+
+def _brought_in(wire: Wire, seen: Seen, start: int, limits: tuple[int, int]) -> int:
+    """Move a servo inside its limits by its own slow profile; where it stands then, with torque.
+
+    Raises ServoError, torque off, where it does not come in twice the time that the way should take.
+    """
+    table = seen.registers()
+    way = way_inside(start, limits, table.ticks_per_revolution)
+    mode = read(wire, seen, table["drive_mode"]) if "drive_mode" in table.fields else 0
+    profile = {} if way is None else slow_profile(table, mode, way.distance_deg)
+    where = f"id {seen.id} stands at {start}, outside its limits {limits[0]}..{limits[1]}"
+    if way is None or not profile:
+        raise ServoError(f"{where}: turn it in by hand")
+    log.warning("%s: moving it inside at %g deg/s", where, SPEED_DEG_S)
+    torque, goal = field_named(table, "torque_enable"), field_named(table, "goal_position")
+    usual = {name: read(wire, seen, table[name]) for name in profile}
+    try:
+        for name, value in profile.items():
+            put(wire, seen, table[name], value)
+        put(wire, seen, goal, way.goal_ticks)
+        put(wire, seen, torque, 1)
+        here = _arrived_inside(wire, seen, way, limits)
+        if here is None:
+            raise ServoError(f"{where}, and does not come inside in {way.bound_s:.1f} s: torque is off")
+        put(wire, seen, goal, here)
+    except BaseException:  # before its usual profile is back, with which it would jump
+        put(wire, seen, torque, 0)
+        raise
+    finally:
+        for name, value in usual.items():
+            put(wire, seen, table[name], value)
+    return here
+
+
+def _arrived_inside(wire: Wire, seen: Seen, way: WayInside, limits: tuple[int, int]) -> int | None:
+    """Where it stands still inside `limits`; None where it does not in time."""
+    present, end_s = field_named(seen.registers(), "present_position"), wire.clock.now_s() + way.bound_s
+    before = None
+    while wire.clock.now_s() < end_s:
+        wire.clock.wait_until(wire.clock.now_s() + LOOK_S)
+        now = read(wire, seen, present)
+        if before is not None and abs(now - before) <= STILL_TICKS and limits[0] <= now <= limits[1]:
+            return now
+        before = now
+    return None
 
 
 def _slow(speed: Field) -> int:

@@ -23,12 +23,15 @@ class Solved:
         reached: (...) whether these joints give the very pose that was asked.
         residual_rad: (...) the turn that is missing.
         residual_m: (...) the shift that is missing.
+        shown: (..., 6) the pose that these joints give, always finite; a turn that is reached is the one that was
+            asked, to the bit.
     """
 
     angles_rad: Doubles
     reached: NDArray[np.bool_]
     residual_rad: Doubles
     residual_m: Doubles
+    shown: Doubles
 
 
 class Neck(Protocol):

@@ -107,4 +107,6 @@ class Stewart:
             angles = np.concatenate([np.broadcast_to(body, shape)[..., None], angles], axis=-1)
         missing_rad = rotations.angle_between(rotations.rotation(wanted[:, :3]), rotations.rotation(given[:, :3]))
         missing_m = np.asarray(np.linalg.norm(wanted[:, 3:] - given[:, 3:], axis=-1))
-        return Solved(angles, reached.reshape(shape), missing_rad.reshape(shape), missing_m.reshape(shape))
+        reached = reached.reshape(shape)
+        shown = np.where(reached[..., None], poses, rotations.seen_from(-body, given.reshape(poses.shape)))
+        return Solved(angles, reached, missing_rad.reshape(shape), missing_m.reshape(shape), shown)

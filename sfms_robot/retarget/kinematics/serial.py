@@ -80,10 +80,13 @@ class Serial:
 
     def _solved(self, poses: Doubles, angles: Doubles, slow: Doubles) -> Solved:
         joints = self._joint_angles(angles, slow)
-        missing_rad = rotations.angle_between(rotations.rotation(poses[..., :3]), self._rotation(joints))
+        rotation, shown = self._rotation(joints), np.zeros_like(poses)
+        missing_rad = rotations.angle_between(rotations.rotation(poses[..., :3]), rotation)
         missing_m = np.asarray(np.linalg.norm(poses[..., 3:], axis=-1))
         reached = (missing_rad <= EXACT_RAD) & (missing_m <= EXACT_M)
-        return Solved(joints, np.asarray(reached), missing_rad, missing_m)
+        exact = np.asarray(missing_rad <= EXACT_RAD)[..., None]
+        shown[..., :3] = np.where(exact, poses[..., :3], rotations.euler(rotation, (2, 1, 0))[..., ::-1])
+        return Solved(joints, np.asarray(reached), missing_rad, missing_m, shown)
 
     def _joint_angles(self, angles: Doubles, slow: Doubles) -> Doubles:
         """Axis angles and their low-passed ones (..., k) -> joints (..., J) inside their ranges."""
