@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sfms_robot.frames import Doubles, Floats, Plan, Reading, Sighting, SpeakerFrame
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
+STOP_S: Final = 0.5  # that `Bus.stop` takes at most
 
 
 class Voice(Protocol):
@@ -174,11 +175,11 @@ class Bus(Protocol):
         happens.
         """
 
-    def stop(self, policy: StopPolicy) -> None:
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """Torque off on all buses first, then confirmed and repeated, as far as servos answer; joints whose safety or
         `policy` says hold keep theirs. Goals are refused from now on.
 
-        Never raises; takes 0.5 s at most, whatever is dead; idempotent.
+        Never raises; takes `within_s` at most, whatever is dead; idempotent.
         """
 
     def close(self) -> None:

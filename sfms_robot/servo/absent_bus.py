@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import StopPolicy
+from sfms_robot.ports import STOP_S, StopPolicy
 from sfms_robot.servo.policy import BusServo
 
 LEFT_OUT: Final = "left out"
@@ -48,7 +48,7 @@ class AbsentBus:
     def torque_off(self, policy: StopPolicy) -> None:
         """There is no torque."""
 
-    def stop(self, policy: StopPolicy) -> None:
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """There is no torque."""
 
     def close(self) -> None:

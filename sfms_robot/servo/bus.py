@@ -15,7 +15,7 @@ from typing import Final, Generic, Protocol, TypeVar
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.errors import BusError, PacketError, PortError, RobotError, ServoError
 from sfms_robot.frames import Reading
-from sfms_robot.ports import StopPolicy, TickConversion
+from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.goals import Goals
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -99,7 +99,7 @@ class WireBus(ABC, Generic[L]):
     def _readings(self, now_s: float) -> Mapping[str, Reading]: ...
 
     @abstractmethod
-    def stop(self, policy: StopPolicy) -> None: ...
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None: ...
 
     # --- what all do --------------------------------------------------------------------------------------------
 

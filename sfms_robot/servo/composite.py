@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError, RobotError
 from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import Bus, StopPolicy
+from sfms_robot.ports import STOP_S, Bus, StopPolicy
 from sfms_robot.servo.writer import Writer
 
 log = logging.getLogger(__name__)
 
-STOP_S: Final = 0.5  # that `stop` takes at most where each bus has a thread
-_TICK_S: Final = 0.1  # that a writer is given for the tick it is in
+_TICK_S: Final = 0.1  # of `stop`, for the tick that a writer is in, and for saying torque off
 FAILED: Final = "bus failed"
 
 
@@ -123,9 +122,10 @@ class CompositeBus:
         for bus in self._buses.values():
             bus.torque_off(policy)
 
-    def stop(self, policy: StopPolicy) -> None:
-        """Torque off on all buses first, whatever their writers are doing; then each bus confirms, all at once where
-        they have threads. Never raises; `STOP_S` at most, for a bus that hangs in a system call too.
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
+        """Torque off on all buses first, whatever their writers are doing; then each bus confirms: all at once where
+        they have threads, else one after the other, each in its share of the time. Never raises; `within_s` at most,
+        with threads for a bus that hangs in a system call too.
         """
         began_s = time.monotonic()
         for writer in self._writers.values():
@@ -134,11 +134,11 @@ class CompositeBus:
         free = {name: self._buses[name] for name in self._buses if self._ended(name, began_s + _TICK_S)}
         if self._rates_hz is None or not self._writers:
             for bus in free.values():
-                bus.stop(policy)
+                bus.stop(policy, (within_s - _TICK_S) / len(free))
             return
         threads = [_begin(bus.stop, policy) for bus in free.values()]
         for name, thread in zip(free, threads, strict=True):
-            thread.join(max(0.0, began_s + STOP_S - time.monotonic()))
+            thread.join(max(0.0, began_s + within_s - time.monotonic()))
             if thread.is_alive():
                 log.warning("bus %r: does not confirm in time that its torque is off", name)
 

@@ -8,6 +8,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import Reading
+from sfms_robot.ports import STOP_S
 from sfms_robot.servo.absent_bus import AbsentBus
 from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
 from sfms_robot.servo.composite import CompositeBus
@@ -83,7 +84,7 @@ class Gate:
 
     def torque_off(self, policy): ...
 
-    def stop(self, policy): ...
+    def stop(self, policy, within_s=STOP_S): ...
 
     def close(self): ...
 
@@ -185,7 +186,7 @@ class Steady:
     def torque_off(self, policy):
         self.calls.append(("torque_off", policy))
 
-    def stop(self, policy):
+    def stop(self, policy, within_s=STOP_S):
         self.calls.append(("stop", policy))
 
     def close(self): ...

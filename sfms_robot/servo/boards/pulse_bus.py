@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import StopPolicy, TickConversion
+from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.boards.board_protocol import BoardProtocol, BoardStatus, board_of, pulses_beyond
 from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
@@ -248,17 +248,17 @@ class PulseBus(WireBus[RateLimitedPort]):
         finally:
             wire.port.close()
 
-    def stop(self, policy: StopPolicy) -> None:
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """As `torque_off`, then ask the board whether its pulses are off, and repeat it; refuse goals. Never raises.
 
-        Blocks for 0.5 s at most; what was sent before may take part of that to leave. Only one thread at a time.
+        Blocks for `within_s` at most; what was sent before may take part of that to leave. Only one thread at a time.
         """
         self.torque_off(policy)
         self._enabled, self._switched_off, self._pending = [], [], False
         if policy == "hold" or not self._off or (self._link is None and self._lost_s is None):
             return
         wire = self._link or self._open_again()
-        until_s = wire.port.now_s() + _STOP_S if wire is not None else 0.0
+        until_s = wire.port.now_s() + min(_STOP_S, within_s) if wire is not None else 0.0
         for _ in range(_TRIES):
             if wire is None:
                 break

@@ -31,30 +31,30 @@ from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import Faults
 from sfms_robot.errors import BusError, PacketError
 from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import StopPolicy, TickConversion
+from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.member import FaultReporter, Member, State, members_of
+from sfms_robot.servo.chain.member import ONLINE, REDUCED, REJOINING, FaultReporter, Member, members_of
 from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
-from sfms_robot.servo.chain.schedule import TURN_S
+from sfms_robot.servo.chain.schedule import TURN_S, read_bytes
+from sfms_robot.servo.chain.settings import Settings
 from sfms_robot.servo.chain.startup import PATIENCE_S, Startup
 from sfms_robot.servo.chain.status_poll import StatusPoll
 from sfms_robot.servo.chain.telemetry import Telemetry
 from sfms_robot.servo.chain.verified_write import finish
-from sfms_robot.servo.policy import BusServo, torque_register
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field, Table
 
 log = logging.getLogger(__name__)
 
 READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
-STOP_S: Final = 0.2  # that `stop` waits for servos to confirm
+_CONFIRM_S: Final = 0.2  # that `stop` waits for servos to confirm, at most
 _STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
 _EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
 _EXCHANGE_BYTES: Final = 160  # of the longest of them: a whole control table
-_COMPARE_S: Final = 1.0  # between two looks at the settings of one servo
-_COMPARED: Final = 40  # bytes read at once for that
 _SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
+BUS_WATCHDOG: Final = "bus_watchdog"
 _NOBODY: Final = np.zeros(0, np.intp)
 
 L = TypeVar("L", bound=RegisterLink)
@@ -97,13 +97,11 @@ class ChainBus(WireBus[L], Generic[L]):
         self._members = members_of(servos, self._tables, faults or Faults(), self._reporter)
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts)
         self._writes = RepeatedWrites(list(self._index))
-        self._startup: Startup[L] | None = None
+        self._settings = Settings(self._members, self._tables, self._writes)
         self._enabled = False
         self._places: NDArray[np.intp] = np.zeros(0, np.intp)  # who gets goals
         self._rejoining: list[Member] = []  # who waits for goals that begin where it stands
-        self._own: dict[int, dict[str, int]] = {}  # registers by index that hold something else than startup wanted
-        self._compared = 0
-        self._compare_s = 0.0
+        self._arrived: list[Member] = []  # who came to hold a position in this poll
         self._stamp_s = 0.0
         self._peak_mA = 0.0
         self._release_packet = b""
@@ -173,15 +171,15 @@ class ChainBus(WireBus[L], Generic[L]):
             link.port.close()
             raise
         self._forget_silence()
-        self._writes.clear()
-        self._own.clear()
+        self._settings.clear()
         self._enabled, self._link = False, link
 
     def _attach(self, link: L) -> None:
         self._now_s = link.port.now_s
-        self._startup = self._begin(link, tries=1)
+        startup = self._begin(link, tries=1)
+        self._settings.attach(startup)
         for member in self._members:
-            member.attach(self._startup)
+            member.attach(startup)
 
     def _present(self) -> list[int]:
         """Ids of those who are listed."""
@@ -211,7 +209,7 @@ class ChainBus(WireBus[L], Generic[L]):
                 held.append(min(max(0.0, servo.min_rad), servo.max_rad))
                 log.warning("%s (id %d) does not answer; it comes in when it does", joint, servo.id)
                 continue
-            self._forget_member(index)
+            self._forget(index)
             with link.patient(PATIENCE_S):
                 steps = startup.torque_on(index) if member.identified else startup.bring_back(index, reboot=False)
                 self._telemetry.ticks[index] = finish(steps, partial(self._wait_enabling, link, joint))
@@ -223,16 +221,16 @@ class ChainBus(WireBus[L], Generic[L]):
         self._update_places()
         return np.array(held)
 
+    def _forget(self, index: int) -> None:
+        """A servo is, or was, prepared anew."""
+        self._settings.forget(index)
+
     def _wait_enabling(self, link: L, joint: str, duration_s: float) -> None:
         """Raises BusError, with torque off, when `torque_off` has come."""
         link.wait(duration_s)
         if self._released:
             self.torque_off("release")
             raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
-
-    def _forget_member(self, index: int) -> None:
-        self._writes.drop(index)
-        self._own.pop(index, None)
 
     def torque_off(self, policy: StopPolicy) -> None:
         """As `ports.Bus`: one sync write to the servos whose joints are to be released.
@@ -253,15 +251,14 @@ class ChainBus(WireBus[L], Generic[L]):
             if alone:
                 self._sending.release()
 
-    def stop(self, policy: StopPolicy) -> None:
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """As `ports.Bus`: torque off first, in one packet, then watchdogs off, in another; then both are read back and
-        written again, for `STOP_S` at most. Waits for nobody before the torque is off."""
+        written again, while there is time. Waits for nobody before the torque is off."""
         self._enabled = False
-        armed = self._armed()
+        armed = self._settings.changed(BUS_WATCHDOG)
         for member in self._members:
             member.stopped()
-        self._writes.clear()
-        self._own.clear()
+        self._settings.clear()
         self._update_places()
         link = self._link
         if link is None and self._lost_s is not None:
@@ -271,32 +268,32 @@ class ChainBus(WireBus[L], Generic[L]):
         if link is None:
             return
         limp = [i for i, servo in enumerate(self._servos) if policy == "release" and servo.safety.stop == "release"]
-        torque, watchdog = self._telemetry.torque, self._tables[0].role("bus_watchdog")
+        torque, watchdog = self._telemetry.torque, self._tables[0].role(BUS_WATCHDOG)
         self._say_off(link, torque, limp)
         if watchdog is not None:
             self._say_off(link, watchdog, armed)
-        until_s = link.port.now_s() + STOP_S
-        with link.patient(min(_STOP_PATIENCE_S, STOP_S)):
-            self._confirm_off(link, torque, limp, until_s)
+        budget_s = min(_CONFIRM_S, within_s)
+        with link.patient(_STOP_PATIENCE_S), link.within(budget_s, budget_s):
+            self._confirm_off(link, torque, limp)
             if watchdog is not None:
-                self._confirm_off(link, watchdog, [i for i in armed if i not in limp], until_s)
+                self._confirm_off(link, watchdog, [i for i in armed if i not in limp])
 
     def _say_off(self, link: L, field: Field, indices: Iterable[int]) -> None:
         values = {self._servos[i].id: field.to_bytes(0) for i in indices}
         if values:
             self._attempt(lambda: link.sync_write(field.address, values))
 
-    def _confirm_off(self, link: L, field: Field, indices: Sequence[int], until_s: float) -> None:
+    def _confirm_off(self, link: L, field: Field, indices: Sequence[int]) -> None:
         """Read a register of all back, and write 0 again to those that do not say 0.
 
         Whoever is asked first in one round is asked last in the next: behind a dead servo the others are silent.
         """
         rest = list(indices)
         for _ in range(len(indices) + 2):
-            if not rest or link.port.now_s() >= until_s:
+            if not rest or not link.affords(read_bytes(1, field.size, False)):
                 break
             ids = [self._servos[i].id for i in rest]
-            got = self._attempt(partial(self._poll.read_all, link, (field.address, field.size), ids, until_s))
+            got = self._attempt(partial(self._poll.read_some, link, (field.address, field.size), ids))
             if got is None:
                 break  # the port is gone
             off = field.to_bytes(0)
@@ -314,17 +311,12 @@ class ChainBus(WireBus[L], Generic[L]):
         released = {self._servos[i].id: 0 for i in indices if self._servos[i].safety.stop == "release"}
         return self._sync_write_packet(self._telemetry.torque, released) if released else b""
 
-    def _armed(self) -> list[int]:
-        """Who has a watchdog running, or was told to."""
-        return [index for index, own in self._own.items() if own.get("bus_watchdog")]
-
     def close(self) -> None:
         """Give the port back; watchdogs that are still on are switched off, so that a held pose stays held."""
-        link, watchdog = self._link, self._tables[0].role("bus_watchdog")
+        link, watchdog = self._link, self._tables[0].role(BUS_WATCHDOG)
         if link is not None and watchdog is not None:
-            self._say_off(link, watchdog, self._armed())
-        self._own.clear()
-        self._writes.clear()
+            self._say_off(link, watchdog, self._settings.changed(BUS_WATCHDOG))
+        self._settings.clear()
         self._enabled = False
         for member in self._members:
             member.stopped()
@@ -378,7 +370,7 @@ class ChainBus(WireBus[L], Generic[L]):
 
     def _update_places(self) -> None:
         """Who gets goals; the array stays the same object while it has the same content."""
-        self._rejoining = [member for member in self._members if member.state is State.REJOINING]
+        self._rejoining = [member for member in self._members if member.state is REJOINING]
         places = [member.index for member in self._members if member.gets_goals]
         if self._places.tolist() != places:
             self._places = np.array(places, np.intp)
@@ -398,8 +390,9 @@ class ChainBus(WireBus[L], Generic[L]):
         Blocks for `StatusPoll.budget_s` at most. Raises BusError when nobody has answered for so long that the bus
         has failed.
         """
-        for member in self._members:
+        for member in self._arrived:
             member.rejoined = False
+        self._arrived.clear()
         return super().poll(now_s)
 
     def _ask(self, link: L, now_s: float) -> bool:
@@ -411,7 +404,8 @@ class ChainBus(WireBus[L], Generic[L]):
             heard = self._poll.step(link, stamp_s)
             self._command(link, stamp_s)
             self._bring_back(link, stamp_s)
-            self._compare(link, stamp_s)
+            self._settings.compare(link, self._poll, stamp_s)
+            self._poll.blocks(link, stamp_s)
         self._peak_mA = max(self._peak_mA, self._telemetry.supply_mA())
         self._update_places()
         return heard
@@ -419,7 +413,7 @@ class ChainBus(WireBus[L], Generic[L]):
     def _readings(self, now_s: float) -> Mapping[str, Reading]:
         """Ages are told by the port's clock, whatever `now_s` counts from."""
         stamp_s = self._stamp_s if self._link is not None else self._now_s()
-        rejoined = {member.index for member in self._members if member.rejoined}
+        rejoined = {member.index for member in self._arrived}
         for index in rejoined:
             self._hold(index)
         faults = [member.fault for member in self._members]
@@ -430,15 +424,14 @@ class ChainBus(WireBus[L], Generic[L]):
     def _command(self, link: L, now_s: float) -> None:
         """Torque off, less force: said first, then read back; again in the next poll where nobody confirms it."""
         torque = self._telemetry.torque
-        released = [member for member in self._members if member.to_release]
-        for member in self._members if self._writes else ():
-            if (member.index, torque.name) in self._writes:
-                self._writes.drop(member.index, torque.name)
+        troubled = [member for member in self._members if member.state is not ONLINE]
+        released = [member for member in troubled if member.to_release]
+        self._writes.drop_all(torque.name)
         for member in released:
             self._writes.want(member.index, torque, 0)
-        for member in self._members:
-            if member.state is State.REDUCED and not self._is_reduced(member.index):
-                self._reduce(member.index)
+        for member in troubled:
+            if member.state is REDUCED:
+                self._settings.reduce(member.index)
         if not self._writes:
             return
         self._writes.step(
@@ -454,33 +447,10 @@ class ChainBus(WireBus[L], Generic[L]):
         if field.name == self._telemetry.torque.name:
             self._members[index].take_torque(bool(value), now_s)
 
-    def _strength(self, index: int) -> str | None:
-        """The register that bounds the force of a servo."""
-        current = self._servos[index].safety.current_limit_mA is not None
-        if current and "goal_current" in self._tables[index].fields:
-            return "goal_current"
-        return torque_register(self._servos[index].map)
-
-    def _is_reduced(self, index: int) -> bool:
-        return (name := self._strength(index)) is None or name in self._own.get(index, ())
-
-    def _reduce(self, index: int) -> None:
-        """Half of what startup gave it: one value, however often it is written."""
-        name = self._strength(index)
-        if name is None or name not in self._tables[index].fields:
-            return
-        field = self._tables[index][name]
-        full = self._wanted(index).get(name, field.high)
-        self._own.setdefault(index, {})[name] = full // 2
-        self._writes.want(index, field, full // 2)
-
-    def _wanted(self, index: int) -> Mapping[str, int]:
-        return self._startup.wanted(index) if self._startup is not None else {}
-
     def _bring_back(self, link: L, now_s: float) -> None:
         """A poll's share of the jobs of members on their way back; a silence ends it."""
         left = _EXCHANGES
-        for member in self._members:
+        for member in [member for member in self._members if member.state is not ONLINE]:
             while left and member.waits and member.due(now_s):
                 if not link.affords(_EXCHANGE_BYTES, alone=True):
                     return
@@ -493,39 +463,10 @@ class ChainBus(WireBus[L], Generic[L]):
 
     def _back(self, member: Member) -> None:
         self._counts["reconnects"] += 1
-        self._forget_member(member.index)
+        self._arrived.append(member)
+        self._forget(member.index)
         self._telemetry.ticks[member.index] = member.stands_ticks
         self._telemetry.seen_s[member.index] = member.stands_s
-
-    def _compare(self, link: L, now_s: float) -> None:
-        """Once a second, one servo after the other: do its registers hold what was asked of them?"""
-        if now_s < self._compare_s:
-            return
-        self._compare_s = now_s + _COMPARE_S / len(self._members)
-        member = self._members[self._compared % len(self._members)]
-        self._compared += 1
-        if not (member.gets_goals and member.presence.listed):
-            return
-        fields = self._tables[member.index].fields
-        wanted = {**self._wanted(member.index), **self._own.get(member.index, {})}
-        differing: dict[str, tuple[int, int]] = {}
-        for group in _groups([fields[name] for name in wanted if name in fields]):
-            first, end = group[0].address, max(each.address + each.size for each in group)
-            answer = self._poll.read_some(link, (first, end - first), [member.id]).get(member.id)
-            if answer is None or len(answer.data) != end - first:
-                return  # another time
-            for each in group:
-                seen = each.from_bytes(answer.data[each.address - first :])
-                if seen != wanted[each.name] and (member.index, each.name) not in self._writes:
-                    differing[each.name] = seen, wanted[each.name]
-        self._judge(member, differing, now_s)
-
-    def _judge(self, member: Member, differing: Mapping[str, tuple[int, int]], now_s: float) -> None:
-        """Settings of a member, compared: what it was told again and again is told once more."""
-        member.take_registers(differing)
-        for name in differing:
-            if name in self._own.get(member.index, ()):
-                self._writes.want(member.index, self._tables[member.index][name], self._own[member.index][name])
 
     # --- the port -----------------------------------------------------------------------------------------------
 
@@ -540,14 +481,3 @@ class ChainBus(WireBus[L], Generic[L]):
         self._found_again(link)
         for member in self._members:
             member.suspect(link.port.now_s(), pause_s=0.0)
-
-
-def _groups(fields: Sequence[Field]) -> list[list[Field]]:
-    """Registers that lie close enough together to be read at once, in the order of their addresses."""
-    groups: list[list[Field]] = []
-    for field in sorted(fields, key=lambda each: each.address):
-        if groups and field.address + field.size - groups[-1][0].address <= _COMPARED:
-            groups[-1].append(field)
-        else:
-            groups.append([field])
-    return groups

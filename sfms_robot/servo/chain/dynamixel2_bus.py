@@ -18,7 +18,7 @@ from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import Faults
 from sfms_robot.errors import ConfigError
 from sfms_robot.ports import TickConversion
-from sfms_robot.servo.chain.chain_bus import READ_DEADLINE_S, ChainBus
+from sfms_robot.servo.chain.chain_bus import BUS_WATCHDOG, READ_DEADLINE_S, ChainBus
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
 from sfms_robot.servo.codecs import dxl2
@@ -26,7 +26,6 @@ from sfms_robot.servo.policy import BusServo as BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field
 
-_WATCHDOG: Final = "bus_watchdog"
 _WATCHDOG_TICK_S: Final = 0.02
 _STALL: Final = 0.8  # of the watchdog's time without a goal: it may have tripped
 
@@ -57,6 +56,7 @@ class Dynamixel2Bus(ChainBus[Dynamixel2Link]):
         self._streamed: tuple[NDArray[np.intp], tuple[int, ...]] = (self._places, ())
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
+        self._fed: NDArray[np.intp] | None = None  # whose watchdogs were looked at last
 
     def _open(self) -> Dynamixel2Link:
         return Dynamixel2Link(self._open_port(), self._baud, self._read_deadline_s)
@@ -100,25 +100,22 @@ class Dynamixel2Bus(ChainBus[Dynamixel2Link]):
     def _arm(self, places: NDArray[np.intp]) -> None:
         """After the first goal: from now on every packet on the wire feeds it."""
         self._fed = places
+        armed = self._settings.changed(BUS_WATCHDOG)
         for index in places.tolist():
-            own = self._own.setdefault(index, {})
-            if _WATCHDOG not in own and self._tables[index].watchdog == "stops":
-                own[_WATCHDOG] = self._watchdog
-                self._writes.want(index, self._tables[index][_WATCHDOG], self._watchdog)
+            if index not in armed and self._tables[index].watchdog == "stops":
+                self._settings.change(index, BUS_WATCHDOG, self._watchdog)
 
-    def _forget_member(self, index: int) -> None:
-        super()._forget_member(index)
+    def _forget(self, index: int) -> None:
+        super()._forget(index)
         self._fed = None  # it was prepared anew, its watchdog is off
-
-    _fed: NDArray[np.intp] | None = None  # whose watchdogs were looked at last
 
     def _look_for_trips(self) -> None:
         """We were late: a servo whose watchdog has tripped ignores goals until it is brought back."""
-        for index in self._armed():
-            self._writes.want(index, self._tables[index][_WATCHDOG], self._watchdog, read_first=True)
+        for index in self._settings.changed(BUS_WATCHDOG):
+            self._writes.want(index, self._tables[index][BUS_WATCHDOG], self._watchdog, read_first=True)
 
     def _told(self, index: int, field: Field, value: int, now_s: float) -> None:
         super()._told(index, field, value, now_s)
-        if field.name == _WATCHDOG and value < 0:
-            self._writes.drop(index, _WATCHDOG)
+        if field.name == BUS_WATCHDOG and value < 0:
+            self._writes.drop(index, BUS_WATCHDOG)
             self._members[index].distrust("watchdog", now_s)

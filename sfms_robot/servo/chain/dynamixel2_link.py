@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
-from numpy.typing import NDArray
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
@@ -24,10 +23,11 @@ from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, maybe_packet
 from sfms_robot.servo.port import Port
 
 _REQUESTS_KEPT: Final = 512
-_WRITES_KEPT: Final = 16  # each has a table of 0.5 KiB per byte of data
+_WRITES_KEPT: Final = 16
 _PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
 _LENGTHS: Final = 4  # of a read of several servos, one byte apart
 _HEADER: Final = b"\xff\xff\xfd"
+_BODY: Final = 7  # where the instruction of a packet stands
 _SYNC_DATA: Final = 12  # where the first id of a sync write stands
 
 
@@ -240,47 +240,20 @@ class Dynamixel2Link(RegisterLink):
 
 
 class _SyncWrite:
-    """A sync write as the SDK built it, with data and crc to be filled in.
-
-    A crc is linear: that of the packet is that of the packet with zeros, xored with what each byte adds on its own.
-    So one table per place and byte, looked up all at once, replaces the walk along the packet.
-    """
+    """A sync write as the SDK built it, with data and crc to be filled in."""
 
     def __init__(self, blank: bytes, length: int) -> None:
-        count = (len(blank) - _SYNC_DATA - 2) // (length + 1)
-        starts = _SYNC_DATA + 1 + (length + 1) * np.arange(count)
-        self._at = (starts[:, None] + np.arange(length)).ravel()
-        self._length = length
         self._packet = np.frombuffer(blank, np.uint8).copy()
-        self._blank_crc = dxl2.crc16(blank[:-2])
-        self._adds = _additions(len(blank) - 2, self._at)
-        self._rows = np.arange(len(self._at))
+        self._data = self._packet[_SYNC_DATA:-2].reshape(-1, length + 1)[:, 1:]  # behind each id
 
     def packet(self, data: bytes) -> bytes:
         """With the values `data`, one behind the other."""
-        values = np.frombuffer(data, np.uint8)
-        if len(values) != len(self._at):
-            raise ValueError(f"{len(data)} bytes of data for {len(self._at)}")
-        packet = self._packet
-        packet[self._at] = values
-        crc = self._blank_crc ^ int(np.bitwise_xor.reduce(self._adds[self._rows, values]))
-        packet[-2], packet[-1] = crc & 0xFF, crc >> 8
-        out = packet.tobytes()
-        if out.find(_HEADER, 7, len(out) - 2) < 0:
-            return out
+        self._data[:] = np.frombuffer(data, np.uint8).reshape(self._data.shape)
+        body = self._packet[:-2].tobytes()
+        if body.find(_HEADER, _BODY) < 0:
+            return body + dxl2.crc16(body).to_bytes(2, "little")
         # Data that look like a header have to be stuffed: the SDK's own stuffing (4.1.0) works on a copy it drops.
-        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, out[8:-2])
-
-
-def _additions(size: int, places: NDArray[np.intp]) -> NDArray[np.uint16]:
-    """(places, 256): what each byte at each place adds to the crc of a packet of `size` bytes before the crc."""
-    table = np.array([dxl2.crc16(bytes([byte])) for byte in range(256)], np.uint16)
-    adds = np.zeros((size, 256), np.uint16)
-    adds[size - 1] = table
-    for at in range(size - 2, -1, -1):  # one more zero byte behind it
-        crc = adds[at + 1]
-        adds[at] = (crc << 8) ^ table[crc >> 8]
-    return adds[places]
+        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, body[_BODY + 1 :])
 
 
 def _found(answer: Answer) -> Found:

@@ -64,7 +64,10 @@ class State(Enum):
     GIVEN_UP = "given up"
 
 
-_DRIVEN: Final = frozenset({State.ONLINE, State.REDUCED})  # get goals
+ONLINE: Final = State.ONLINE  # by way of the class each is a call, for every servo in every tick
+REDUCED: Final = State.REDUCED
+REJOINING: Final = State.REJOINING
+_DRIVEN: Final = frozenset({ONLINE, REDUCED})  # get goals
 _POWERED: Final = _DRIVEN | {State.FAULTY, State.REJOINING}  # torque is wanted, and was seen
 _RELEASED: Final = frozenset({State.LIMP, State.GIVEN_UP})  # torque off is wanted
 _COMING: Final = frozenset({State.RETURNING, State.REBOOTING})
@@ -164,6 +167,7 @@ class Member:
 
     def __init__(self, index: int, servo: BusServo, table: Table, faults: Faults, reporter: FaultReporter) -> None:
         self.index = index
+        self.id = servo.id
         self.servo = servo
         self.table = table
         self.presence = Presence()
@@ -190,10 +194,6 @@ class Member:
         self.lowest_mA = min((rule.current_mA for _, rule in self._rules), default=math.inf)
 
     # --- what it wants ------------------------------------------------------------------------------------------
-
-    @property
-    def id(self) -> int:
-        return self.servo.id
 
     @property
     def gets_goals(self) -> bool:

@@ -67,4 +67,5 @@ class Protocol1Bus(ChainBus[Protocol1Link]):
 
     def _send(self, link: Protocol1Link, places: NDArray[np.intp], ticks: NDArray[np.int64], now_s: float) -> None:
         goal = self._telemetry.goal
-        link.sync_write(goal.address, {self._servos[i].id: goal.to_bytes(int(ticks[i])) for i in places})
+        each = zip(places.tolist(), ticks[places].tolist(), strict=True)
+        link.sync_write(goal.address, {self._servos[i].id: goal.to_bytes(value) for i, value in each})

@@ -47,6 +47,10 @@ class RepeatedWrites:
         for each in [name] if name is not None else list(self._pending):
             self._pending.get(each, {}).pop(index, None)
 
+    def drop_all(self, name: str) -> None:
+        """No longer: of nobody."""
+        self._pending.pop(name, None)
+
     def clear(self) -> None:
         self._pending.clear()
         self._read_first.clear()

@@ -78,6 +78,7 @@ class StatusPoll:
         self._telemetry = telemetry
         self._config = config
         self._counts = counts
+        self._tells = {each.id for each in members if telemetry.currents[each.index] is not None}
         self._error_bits = [ALERT if telemetry.error is not None else _status_bits(member) for member in members]
         self._restart(None, None)
 
@@ -90,6 +91,7 @@ class StatusPoll:
         self._turn = 0
         self._flagged: set[int] = set()  # whose status says that something is wrong
         self._missing = {member.id for member in self._members}  # who has to be told that it has answered
+        self._answered: list[int] = []  # in this poll, and may be asked for more
         self._plan()
 
     def restart(self, group: GroupRead | None, fast: GroupRead | None = None, proven: bool = True) -> None:
@@ -149,22 +151,38 @@ class StatusPoll:
         self._missing -= answers.keys()
         fresh = self._take(link, where, answers, now_s)
         self._blame(outcome, now_s)
-        if not whole and answers:
-            chosen = self._rotation.take([servo for servo in listed if servo in answers], self._blocks)
-            fresh += self._take(link, telemetry.block, self.read_some(link, telemetry.block, chosen), now_s)
         self._look(link, list(answers), now_s)
         self._look_at_alerts(link, fresh, now_s)
+        self._answered = [] if whole else list(answers)
         return self._probe(link, now_s) or bool(answers)
+
+    def blocks(self, link: RegisterLink, now_s: float) -> None:
+        """What is left of the poll, where it has no time for everything of everybody: everything of some."""
+        where = self._telemetry.block
+        count = self.fitting(link, where[1], self._blocks) if self._answered else 0
+        if count:
+            chosen = self._rotation.take(self._answered, count)
+            fresh = self._take(link, where, self.read_some(link, where, chosen), now_s)
+            self._look_at_alerts(link, fresh, now_s)
 
     # --- requests -----------------------------------------------------------------------------------------------
 
     def _listed(self) -> list[int]:
         return [member.id for member in self._members if member.presence.listed]
 
+    def fitting(self, link: RegisterLink, length: int, most: int) -> int:
+        """How many servos, `most` at most, can be asked for `length` bytes in what is left of the poll."""
+        if self._group is None:
+            return int(link.affords(read_bytes(1, length, False), alone=True))
+        while most and not link.affords(read_bytes(most, length, False)):
+            most -= 1
+        return most
+
     def read_some(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
-        """Answers of a few, by one request where the wire has one; nothing when there is no time for it."""
+        """Answers of a few, of as many as there is time for: by one request where the wire has one."""
         if self._group is not None:
-            if not ids or not link.affords(read_bytes(len(ids), where[1], False)):
+            ids = ids[: self.fitting(link, where[1], len(ids))]
+            if not ids:
                 return {}
             self._counts["reads"] += 1
             fast = self._fast if len(ids) > 1 and where == self._telemetry.block else None
@@ -174,18 +192,6 @@ class StatusPoll:
             if not link.affords(read_bytes(1, where[1], False), alone=True):
                 break
             self._counts["reads"] += 1
-            if (answer := link.read(servo, *where)) is not None:
-                answers[servo] = answer
-        return answers
-
-    def read_all(self, link: RegisterLink, where: Block, ids: Sequence[int], until_s: float) -> dict[int, Answer]:
-        """Answers of all who are there, outside of a poll: as long as it takes, but not beyond `until_s`."""
-        if self._group is not None:
-            return dict(self._group(*where, ids))
-        answers: dict[int, Answer] = {}
-        for servo in ids:
-            if link.port.now_s() >= until_s:
-                break
             if (answer := link.read(servo, *where)) is not None:
                 answers[servo] = answer
         return answers
@@ -311,19 +317,19 @@ class StatusPoll:
     def _take(self, link: RegisterLink, where: Block, answers: Mapping[int, Answer], now_s: float) -> list[int]:
         """Values and status of those who told; ids whose alert has just come on."""
         telemetry, length, alert = self._telemetry, where[1], self._telemetry.error is not None
+        members, flagged = self._by_id, self._flagged
         good: list[int] = []
         data: list[bytes] = []
         fresh: list[int] = []
-        for servo, answer in answers.items():
-            member = self._by_id[servo]
-            status = answer.error & self._error_bits[member.index]
-            if len(answer.data) != length or (alert and answer.error & ~ALERT):
+        for servo, (error, told) in answers.items():
+            member = members[servo]
+            if len(told) != length or (alert and error & ~ALERT):
                 self._counts["errors"] += 1  # it refuses to say
             else:
                 good.append(member.index)
-                data.append(answer.data)
-            if status or servo in self._flagged:
-                fresh += self._take_status(member, status, alert, now_s)
+                data.append(told)
+            if error or servo in flagged:
+                fresh += self._take_status(member, error & self._error_bits[member.index], alert, now_s)
         if good:
             telemetry.take(where, good, data, now_s)
             if where == telemetry.block:
@@ -333,6 +339,8 @@ class StatusPoll:
     def _take_status(self, member: Member, status: int, alert: bool, now_s: float) -> list[int]:
         """What the error byte of an answer says of the servo; its id when it has to be asked what is wrong."""
         known = member.id in self._flagged
+        if not status and not known:
+            return []
         (self._flagged.add if status else self._flagged.discard)(member.id)
         if alert and status:
             return [] if known else [member.id]
@@ -352,16 +360,14 @@ class StatusPoll:
         if not ids:
             return
         self._polls += 1
-        tells = [servo for servo in ids if self._telemetry.currents[self._by_id[servo].index] is not None]
+        tells = [servo for servo in ids if servo in self._tells] if self._tells else []
         if tells and (self._group is not None or self._polls % 2):
             self._look_at_current(link, self._currents.take(tells, 1)[0], now_s)
-        if self._group is not None and self._polls % _HEALTH_POLLS == 0:
-            chosen = self._looks.take(ids, _HEALTH_SHARE)
-        elif self._group is None and not (tells and self._polls % 2):
-            chosen = self._looks.take(ids, 1)
-        else:
-            return
-        self._take_health(self.read_some(link, self._telemetry.health, chosen), now_s)
+        due = self._polls % _HEALTH_POLLS == 0 if self._group is not None else not (tells and self._polls % 2)
+        count = self.fitting(link, self._telemetry.health[1], _HEALTH_SHARE) if due else 0
+        if count:
+            chosen = self._looks.take(ids, count)
+            self._take_health(self.read_some(link, self._telemetry.health, chosen), now_s)
 
     def _look_at_current(self, link: RegisterLink, servo: int, now_s: float) -> None:
         index = self._by_id[servo].index

@@ -24,6 +24,7 @@ Block = tuple[int, int]  # address, length
 
 _NEEDED: Final = ("present_position", "goal_position", "torque_enable")
 _TOLD: Final = {"velocity": "present_speed", "voltage": "voltage", "temperature": "temperature"}
+_REACH: Final = 8  # bytes by which a block grows for the present current: fewer than a request for it takes
 _EXTRA: Final = ("current_mA", "load_percent", "velocity_rad_s", "voltage_V", "temperature_C")
 
 
@@ -70,10 +71,16 @@ class Telemetry:
                 self._fields[key] = first
         self.position: Block = (present.address, present.size)
         self.block = _span(self._fields.values())
+        self.currents = [_apart(table, self._fields.get("load")) for table in tables]
+        current = self.currents[0]
+        if current is not None and all(_alike(each, current) for each in self.currents):
+            wider = _span([*self._fields.values(), current])
+            if wider[1] - self.block[1] <= _REACH:
+                self._fields["current"], self.block = current, wider
+                self.currents = [None] * len(tables)
         self.health = _span([self.torque] if self.error is None else [self.torque, self.error])
         self._layouts = {where: self._layout(where) for where in (self.position, self.block)}
         in_block = "load" in self._fields
-        self.currents = [_apart(table, self._fields.get("load")) for table in tables]
         self._mA = np.array([load.scale if load and in_block and load.unit == "mA" else math.nan for load in loads])
         percent = [load.scale if load and in_block and load.unit == "percent" else math.nan for load in loads]
         self._percent = np.array(percent)
@@ -95,7 +102,7 @@ class Telemetry:
             values[:] = np.nan
 
     def capabilities(self, index: int) -> frozenset[str]:
-        told = {"position", "torque"} | (set(self._fields) & set(_TOLD))
+        told = {"position", "torque"} | (set(self._fields) & {*_TOLD, "current"})
         current = math.isfinite(self._mA[index]) or self.currents[index] is not None
         return frozenset(told | ({"current"} if current else set()))
 
@@ -109,10 +116,11 @@ class Telemetry:
         if "velocity" in values:
             self.velocity_rad_s[at] = values["velocity"] * self._rad_s[at]
         if "load" in values:
-            in_mA = values["load"] * self._mA[at]
-            if self.currents.count(None) == len(self.currents):
-                self.current_mA[at] = in_mA
+            if "current" not in values and self.currents.count(None) == len(self.currents):
+                self.current_mA[at] = values["load"] * self._mA[at]
             self.load_percent[at] = values["load"] * self._percent[at]
+        if "current" in values:
+            self.current_mA[at] = values["current"] * self._fields["current"].scale
         if "voltage" in values:
             self.voltage_V[at] = values["voltage"] * self._fields["voltage"].scale
         if "temperature" in values:
@@ -136,7 +144,8 @@ class Telemetry:
 
     def supply_mA(self) -> float:
         """Sum of the motor currents that are known: an upper bound of what the servos take from the supply."""
-        return float(np.nansum(np.abs(self.current_mA)))
+        currents: list[float] = self.current_mA.tolist()
+        return sum(abs(current) for current in currents if current == current)
 
     def readings(
         self, joints: Sequence[str], faults: Sequence[str | None], rejoined: set[int], now_s: float
