@@ -1,6 +1,7 @@
 """The bus beside the vendor SDK's own calls, on the same emulated servos, in real time.
 
     write, tick     host CPU of a sync write; of a write and a read of everybody
+    tick_FAMILY     the same of a head of 12 servos of each bus family
     cpu_share       of a core, at 100 ticks a second
     wire_use        bytes x 10 / baud over the time that the host spends in ticks one after the other, on a line that
                     takes its time; what the emulator itself delivered late does not count as the host's time
@@ -38,6 +39,26 @@ _BLOCK: Final = (126, 21)  # load to temperature, of X servos
 _GOAL: Final = (116, 4)
 _MIDDLE: Final = bytes([0, 8, 0, 0])
 _BITS: Final = 10
+_SERVOS: Final = 12  # of the heads that each protocol is measured with
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A model of a protocol, which has `zero_ticks` in its middle, and (address, length) of its registers."""
+
+    protocol: float
+    model: str
+    zero_ticks: int
+    goal: tuple[int, int]
+    position: tuple[int, int]
+
+
+_XL330: Final = Kind(2.0, "xl330-m288", 2048, _GOAL, _POSITION)
+_KINDS: Final = {  # by bus family
+    "dynamixel2": _XL330,
+    "dynamixel1": Kind(1.0, "mx-28-1.0", 2048, (30, 2), (36, 2)),
+    "feetech": Kind(1.0, "sts3215", 2048, (42, 2), (56, 2)),  # the frame is the same, and so is a sync write
+}
 
 
 @dataclass(frozen=True)
@@ -53,6 +74,7 @@ def bus() -> dict[str, Row]:
     head = _changed(load_head(HEAD), read_deadline_ms=DEADLINE_MS)
     return {
         **_cpu(head),
+        **{f"bus.tick_{family}": _tick(family, kind) for family, kind in _KINDS.items()},
         "bus.wire_use_1M": _wire_use(head, 1_000_000, _POSITION),
         "bus.wire_use_4M": _wire_use(head, 4_000_000, _BLOCK),
         "bus.one_silent_chain_break": _one_silent(head, "chain_break"),
@@ -74,6 +96,21 @@ def _cpu(head: Head) -> dict[str, Row]:
         "bus.tick": row(ours[1], peers[1], "ms CPU", f"{vendor} + GroupSyncRead"),
         "bus.cpu_share": row(share, peer_share, "of a core at 100 Hz", f"{vendor} + GroupSyncRead"),
     }
+
+
+def _tick(family: str, kind: Kind) -> Row:
+    """Write and read of everybody, by what hangs on the wire."""
+    head = _changed(load_head(HEAD), family=family, baud=1_000_000, read_deadline_ms=DEADLINE_MS)
+    some = list(head.joints.items())[:_SERVOS]
+    model = {"model": kind.model, "zero_ticks": kind.zero_ticks}
+    head = head.model_copy(update={"joints": {name: joint.model_copy(update=model) for name, joint in some}})
+    with launch(_plugged(head)) as chain:
+        with _ours(head, chain.device) as host:
+            ours = times(host.tick, _CALLS, time.process_time)
+        with _vendor(head, chain.device, kind.position, kind) as host:
+            peers = times(host.tick, _CALLS, time.process_time)
+    reads = "GroupSyncRead" if kind.protocol == 2.0 else "a read of each"
+    return row(ours, peers, f"ms CPU, {_SERVOS} servos", f"dynamixel-sdk GroupSyncWrite + {reads}")
 
 
 def _one_silent(head: Head, behind: Literal["chain_break", "skip"]) -> Row:
@@ -194,29 +231,33 @@ def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
 
 
 @contextmanager
-def _vendor(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
-    """The calls of the vendor's SDK, as its examples make them."""
+def _vendor(head: Head, device: str, where: tuple[int, int], kind: Kind = _XL330) -> Iterator[Host]:
+    """The calls of the vendor's SDK, as its examples make them. Its bulk read of Protocol 1.0 (4.1.0) fails."""
     import dynamixel_sdk as sdk
 
     config = next(iter(head.buses.values()))
-    port, protocol = sdk.PortHandler(device), sdk.PacketHandler(2.0)
+    port, protocol = sdk.PortHandler(device), sdk.PacketHandler(kind.protocol)
     port.openPort()
     port.setBaudRate(config.baud)
-    writer = sdk.GroupSyncWrite(port, protocol, *_GOAL)
+    writer = sdk.GroupSyncWrite(port, protocol, *kind.goal)
     reader = sdk.GroupSyncRead(port, protocol, *where)
-    ids = _ids(head)
+    ids, middle = _ids(head), list(_MIDDLE[: kind.goal[1]])
     for servo in ids:
-        writer.addParam(servo, list(_MIDDLE))
+        writer.addParam(servo, middle)
         reader.addParam(servo)
 
     def write() -> None:
         for servo in ids:
-            writer.changeParam(servo, list(_MIDDLE))
+            writer.changeParam(servo, middle)
         writer.txPacket()
 
     def tick() -> None:
         write()
-        reader.txRxPacket()
+        if kind.protocol == 2.0:
+            reader.txRxPacket()
+        else:
+            for servo in ids:
+                protocol.readTxRx(port, servo, *where)
 
     try:
         yield Host(write, tick)

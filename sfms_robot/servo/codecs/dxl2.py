@@ -86,9 +86,7 @@ class Packet(NamedTuple):
     error: int = 0
 
 
-def crc16(data: bytes | bytearray, crc: int = 0) -> int:
-    """CRC-16/BUYPASS: polynomial 0x8005, start 0, not reflected. `crc` continues an earlier call."""
-    return umts(data, crc)  # the other name of the same crc
+crc16: Final = umts  # CRC-16/BUYPASS: 0x8005, start 0, not reflected. A second argument continues an earlier call
 
 
 def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> bytes:
@@ -123,18 +121,21 @@ def split_fast_status(data: bytes | bytearray, length: int) -> list[tuple[int, i
     `data` begins with the header. Where a device fell silent the packet stops short: those in front of the gap are
     given, each proved by the crc it sent, and nothing of what is behind.
     """
-    out: list[tuple[int, int, bytes]] = []
     if not data.startswith(_HEADER + bytes([BROADCAST])) or data[7:8] != bytes([STATUS]):
-        return out
-    crc, at, size = crc16(data[:8]), 8, length + 2
-    while at + size + 2 <= len(data):
-        crc = crc16(data[at : at + size], crc)
-        if crc != data[at + size] | data[at + size + 1] << 8:
+        return []
+    data, size = bytes(data), length + 4
+    ends = range(8 + size, len(data) + 1, size)
+    whole = bool(ends) and _proved(data[: ends[-1]])  # the last crc is over everything
+    out = []
+    for end in ends:
+        if not whole and not _proved(data[:end]):
             break
-        out.append((data[at + 1], data[at], bytes(data[at + 2 : at + size])))
-        crc = crc16(data[at + size : at + size + 2], crc)
-        at += size + 2
+        out.append((data[end - size + 1], data[end - size], data[end - size + 2 : end - 2]))
     return out
+
+
+def _proved(data: bytes) -> bool:
+    return crc16(data[:-2]) == data[-2] | data[-1] << 8
 
 
 def _encode(servo: int, body: bytes) -> bytes:
