@@ -187,7 +187,7 @@ def test_who_is_gone_is_not_answered_and_who_comes_is_answered_within_half_a_sec
 
 def test_a_hot_servo_moves_less_and_then_rests(chain):
     jaw = HEAD.joints["jaw"]
-    chain.ask(f"register {jaw.id} present_temperature 70")
+    chain.heat(jaw.id, 69.0)
     ran = run(chain, seconds=6.0)
     goals = np.array([tick.goals_rad[JOINTS.index("jaw")] for tick in ran.ticks])
     assert np.abs(goals[-100:] - jaw.rest_rad).max() < 1e-6
