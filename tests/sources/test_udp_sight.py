@@ -2,12 +2,13 @@
 
 import logging
 import socket
+import sys
 
 import numpy as np
 import pytest
 
 from sfms_robot.errors import PacketError
-from sfms_robot.frames import MOTION_DIM
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.sources.face_argument import FaceArgument
 from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.udp_sight import (
@@ -122,9 +123,53 @@ def test_a_flood_is_read_in_parts(sight):
     assert sight.statistics()["packets"] == 2 * PACKETS_PER_CALL
 
 
-def test_faces_nobody_asks_for_cost_no_memory(sight):
+def test_of_faces_nobody_asks_for_the_newest_are_kept(sight):
     feed(sight, FIRST, *np.arange(1000) * 0.02)
-    assert len(sight._face._waiting) == 256
+    assert sight.at((999 - 256) * 0.02) is None
+    assert sight.at((999 - 255) * 0.02) is not None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells when a datagram came in")
+def test_a_datagram_has_the_time_it_came_in_not_the_time_it_was_read():
+    opened = DatagramSocket("test", "127.0.0.1", 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for _ in range(3):
+            out.sendto(b"\x01", opened.address)
+        times_s = [packet.time_s for packet in opened.waiting()]
+        assert times_s == sorted(set(times_s)) and len(times_s) == 3
+    opened.close()
+
+
+def test_the_strongest_blink_since_the_last_question_is_seen():
+    face = LiveFace(FaceArgument("").signs)
+    for i, blink in enumerate((0.0, 0.0, 1.0, 0.2)):
+        motion = np.zeros(MOTION_DIM, np.float32)
+        motion[CHANNEL_INDEX["eyeBlinkLeft"]] = blink
+        face.put(i / 60, motion)
+        if i == 0:
+            face.at(0.0)
+    assert face.at(1.0).face.motion[CHANNEL_INDEX["eyeBlinkLeft"]] == 1.0
+    assert face.at(1.0).face.time_s == pytest.approx(3 / 60)
+
+
+def test_attention_is_asked_of_what_the_person_does_and_keeps_its_state():
+    def attention(face, state):
+        faces = [*(state or []), face]
+        return 1.0 / len(faces), faces
+
+    face = LiveFace(FaceArgument("").signs, attention)
+    seen = []
+    for time_s in (0.0, 0.04):
+        face.put(time_s, np.full(MOTION_DIM, 0.3, np.float32))
+        seen.append(face.at(time_s))
+    assert [each.attention for each in seen] == [1.0, 0.5]
+    assert np.abs(seen[1].face.pose).max() < 1e-6  # their rest is off by then
+
+
+def test_attention_is_not_told_where_nobody_asks_for_it():
+    face = LiveFace(FaceArgument("").signs)
+    face.put(0.0, np.zeros(MOTION_DIM, np.float32))
+    assert face.at(0.0).attention is None
 
 
 def test_this_machines_addresses_are_no_loopback():
