@@ -150,15 +150,16 @@ class LiveLinkDecoder:
 
     def restart(self) -> None:
         self._number: int | None = None
+        self._data = b""
         self._time_s = 0.0
         self._step: int | None = None
 
     def decode(self, data: bytes, time_s: float) -> Floats | None:
         packet = parse_packet(data)
         self._subject = packet.subject
-        if not self._is_next(packet, time_s):
+        if not self._is_next(packet, data, time_s):
             return None
-        self._number, self._time_s = packet.number, time_s
+        self._number, self._data, self._time_s = packet.number, data, time_s
         if packet.values is None:
             self._counts["no_face"] += 1
             return None
@@ -168,18 +169,22 @@ class LiveLinkDecoder:
         """Frames lost on the way, doubled, late, without a face; how often the phone's count began anew; its name."""
         return {**self._counts, "subject": self._subject}
 
-    def _is_next(self, packet: LiveLinkPacket, time_s: float) -> bool:
+    def _is_next(self, packet: LiveLinkPacket, data: bytes, time_s: float) -> bool:
         if self._number is None:
             return True
+        if data == self._data:
+            self._counts["doubled"] += 1
+            return False
         forward = packet.number - self._number
         if time_s - self._time_s > LATE_S or abs(forward) > LATE_S * packet.rate_hz:
             self._counts["recounted"] += forward < 0
             return True
-        if forward <= 0:
-            self._counts["late" if forward else "doubled"] += 1
+        if forward < 0:
+            self._counts["late"] += 1
             return False
-        self._step = forward if self._step is None else min(self._step, forward)
-        self._counts["lost"] += forward // self._step - 1
+        if forward > 0:  # not every program that sends these packets counts
+            self._step = forward if self._step is None else min(self._step, forward)
+            self._counts["lost"] += forward // self._step - 1
         return True
 
 
@@ -192,5 +197,6 @@ def open_live_link(argument: str, attention: Attention | None = None) -> UdpSigh
     host, port = parse_endpoint("live-link", given.place, "0.0.0.0", PORT)
     opened = DatagramSocket("live-link", host, port)
     own = addresses_of_this_machine() if host in ("0.0.0.0", "::") else [host]
-    hint = f"in the app's settings enter the target {' or '.join(own) or 'this machine'}, port {opened.address[1]}"
+    target = f"{' or '.join(own) or 'this machine'}, port {opened.address[1]}"
+    hint = f"in the app, capture mode Live Link (ARKit), enter the target {target}"
     return UdpSight("live-link", opened, LiveLinkDecoder(), LiveFace(given.signs, attention), hint)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
@@ -113,6 +113,7 @@ def test_what_is_no_packet_is_refused_in_one_line(data, reason):
     assert "\n" not in str(told.value)
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_packet_or_refused(data):
     try:
@@ -121,6 +122,7 @@ def test_any_bytes_are_a_packet_or_refused(data):
         pass
 
 
+@settings(deadline=None)
 @given(st.integers(0, 179), st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20))
 def test_a_damaged_packet_is_refused_or_finite(which, damage):
     data = bytearray(PACKETS[which])
@@ -169,10 +171,18 @@ def test_after_a_silence_any_number_will_do():
     assert decode([95, 96], decoder, start_s=1.0) == ([95, 96], {"recounted": 1})
 
 
+@settings(deadline=None)
 @given(st.permutations(range(12)))
 def test_faces_are_always_in_order_whatever_the_network_does(numbers):
     seen, _ = decode(numbers)
     assert seen == sorted(seen) and seen[-1] == 11
+
+
+def test_who_does_not_count_is_seen_all_the_same():
+    decoder = LiveLinkDecoder()
+    for number, value in enumerate((0.1, 0.2, 0.3)):
+        assert decoder.decode(packet(0, (value,) * 61), number / 60) is not None
+    assert decoder.statistics()["doubled"] == decoder.statistics()["lost"] == 0
 
 
 def test_a_packet_without_a_face_is_counted_and_shows_none():
