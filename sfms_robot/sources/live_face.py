@@ -42,6 +42,10 @@ class LiveFace:
         """Loop time 0 is `origin_s` of `time.monotonic`. What was learned of the person stays."""
         self._origin_s, self._sighting = origin_s, None
 
+    def forget(self) -> None:
+        """Another camera, or another person: what was learned of the last one does not hold."""
+        self._neutral, self._attention_state = None, None
+
     def put(self, time_s: float, motion: Floats) -> None:
         """A face (58,) of `time_s` of `time.monotonic`, in order of time."""
         self._waiting.append((time_s, motion))

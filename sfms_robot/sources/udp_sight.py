@@ -187,6 +187,7 @@ class UdpSight:
         if self._sender is None:
             logger.info("%s: %s is listened to", self._kind, _name(packet.sender))
             self._refusal_said = False
+            self._face.forget()
         self._sender, self._heard_s, self._hint = packet.sender, time_s, None
         if motion is not None:
             self._counts["faces"] += 1

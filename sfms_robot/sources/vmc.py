@@ -231,7 +231,8 @@ class VmcDecoder:
                 self._counts["wrong_messages"] += 1
 
     def _blend(self, name: bytes, value: float) -> None:
-        place = _PLACES.get(name.rstrip(b"\0").lower())
+        name = name.rstrip(b"\0").lower()
+        place = _PLACES.get(name)
         if place is None:
             if len(self._unknown) < _MOST_UNKNOWN:
                 self._unknown.add(name)

@@ -78,6 +78,14 @@ def test_a_second_sender_takes_over_when_the_first_is_silent(sight):
     assert sight.statistics()["sender"] == "192.0.2.2:2"
 
 
+def test_of_another_sender_rest_is_learned_anew(sight):
+    for i in range(20):
+        feed(sight, FIRST, i / 10)
+        sight.at(i / 10)
+    feed(sight, SECOND, 5.0, data=b"\x1e")
+    assert sight.at(5.0).face.pose[0] == pytest.approx(0, abs=1e-6)
+
+
 def test_noise_takes_no_senders_place(sight):
     feed(sight, SECOND, 0.0, 0.1, data=b"\xff")
     feed(sight, FIRST, 0.2)
