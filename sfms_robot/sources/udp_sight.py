@@ -1,7 +1,7 @@
 """A face that comes as UDP datagrams, whatever protocol they speak.
 
-The socket is read without blocking inside `at`, a bounded number of packets each time: no thread, and a flood costs the
-loop a bounded time. What cannot be used is counted, never raised. One sender is listened to: another is refused until
+The socket is read without blocking inside `at`, for a bounded time: no thread, and a flood costs the loop 2 ms a call
+and one packet. What cannot be used is counted, never raised. One sender is listened to: another is refused until
 the first has been silent for 2 s.
 """
 
@@ -23,7 +23,7 @@ from sfms_robot.sources.live_face import LiveFace
 logger = logging.getLogger(__name__)
 
 PACKETS_PER_CALL: Final = 64
-BYTES_PER_CALL: Final = 32_768
+LONGEST_CALL_S: Final = 0.002
 LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
 SILENT_S: Final = 2.0  # after so long another sender may take over
 UNHEARD_S: Final = 5.0  # so long into a run without a sender, what to type there is said
@@ -77,10 +77,7 @@ class DatagramSocket:
     def waiting(self) -> Iterator[Datagram]:
         """What has come in, oldest first, no more than a call may take. Never blocks, never raises."""
         wall_s, now_s = time.time(), time.monotonic()
-        taken = 0
         for _ in range(PACKETS_PER_CALL):
-            if taken >= BYTES_PER_CALL:
-                return
             try:
                 if sys.platform == "win32":
                     data, sender = self._socket.recvfrom(LONGEST_PACKET)
@@ -93,8 +90,9 @@ class DatagramSocket:
             except OSError:  # a network that went down: the next call tries again
                 self.errors += 1
                 return
-            taken += len(data)
             yield Datagram(data, sender, now_s - age_s)
+            if time.monotonic() - now_s > LONGEST_CALL_S:
+                return
 
     def close(self) -> None:
         self._socket.close()

@@ -64,7 +64,8 @@ _AS_ARKIT: Final = np.array(
     [[preset.get(name, 0.0) for name in BLENDSHAPES] for preset in _PRESETS.values()], np.float32
 )
 
-_MOST_ELEMENTS: Final = 1024  # of a packet
+_MOST_ELEMENTS: Final = 512  # of a packet
+_MOST_UNUSUAL: Final = 64  # messages of a packet that are not of the usual types
 _DEEPEST: Final = 4  # bundles in bundles
 _LONGEST_ODD: Final = 512  # bytes of an element of unusual types
 _MOST_UNKNOWN: Final = 64  # names that are counted apart
@@ -180,9 +181,10 @@ class VmcDecoder:
         self._bones: dict[bytes, Quaternion] = {b"neck": (0.0, 0.0, 0.0, 1.0), b"head": (0.0, 0.0, 0.0, 1.0)}
         self._tracking = True
         self._changed = False
+        self._unusual = 0  # messages of the packet at hand
 
     def decode(self, data: bytes, time_s: float) -> Floats | None:
-        ours = False
+        ours, self._unusual = False, 0
         for number, element in enumerate(elements(data)):
             if number == _MOST_ELEMENTS:
                 raise PacketError("an OSC bundle without end")
@@ -208,7 +210,8 @@ class VmcDecoder:
                 self._turn(name, _QUATERNION.unpack_from(element, len(element) - 16))
         elif element.startswith(_APPLY):
             self._apply()
-        elif element.startswith(_READ_FROM):
+        elif element.startswith(_READ_FROM) and self._unusual < _MOST_UNUSUAL:
+            self._unusual += 1
             self._take_unusual(element)
 
     def _take_unusual(self, element: bytes) -> None:

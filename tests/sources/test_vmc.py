@@ -213,6 +213,12 @@ def test_what_is_no_packet_is_refused(data, reason):
         VmcDecoder().decode(data, 0.0)
 
 
+def test_of_messages_of_other_types_a_packet_has_so_many_and_no_more():
+    decoder = VmcDecoder()
+    motion = shown(*(blend("jawOpen", 1) for _ in range(64)), blend("eyeBlinkLeft", 1), APPLY, decoder=decoder)
+    assert {name for name in BLENDSHAPES if motion[CHANNEL_INDEX[name]]} == {"jawOpen"}
+
+
 def test_bundles_in_bundles_end_somewhere():
     data = APPLY.dgram
     for depth in range(2000):
