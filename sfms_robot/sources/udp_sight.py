@@ -60,8 +60,8 @@ class DatagramSocket:
         try:
             family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        except OSError as error:
-            raise PortError(f"{where}: {error.strerror or error}") from error
+        except (OSError, UnicodeError) as error:  # a name that is none is the latter
+            raise PortError(f"{where}: {getattr(error, 'strerror', None) or error}") from error
         try:
             self._socket.bind(address)
             self._socket.setblocking(False)
