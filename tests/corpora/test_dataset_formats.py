@@ -19,7 +19,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.learning.sfms.features import gather
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.l2l import l2l_bilateral
+from sfms_robot.signals.learning2listen import l2l_bilateral
 from sfms_robot.signals.spaces import rest_of
 
 

@@ -23,8 +23,8 @@ STARTS_RAD = (-0.2, 0.0, 0.4, 0.1)
 
 @dataclass(frozen=True)
 class Family:
-    """`bus`: its name in `servo.families`. `other`: a model that is not `model`, and says so when it is asked; None where
-    nobody can tell.
+    """`bus`: its name in `servo.families`. `other`: a model that is not `model`, and says so when it is asked; None
+    where nobody can tell.
     """
 
     bus: str
