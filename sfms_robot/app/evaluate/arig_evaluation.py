@@ -76,7 +76,7 @@ def _states(played: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips:
     said = np.concatenate([said for said, _, _ in labelled])
     truth = np.concatenate([states for _, _, states in labelled])
     truth = np.where(said < 0, UNKNOWN, truth).astype(np.int8)  # the first frame of a stream is given
-    voices = np.concatenate([scores.heard_voices(dyad) for _, dyad, _ in labelled])
+    voices = np.concatenate([scores.voice_tracks(dyad) for _, dyad, _ in labelled])
     tables_of = {"state": scores.confusion(said, truth)}
     tables_of |= {name: scores.confusion(answers, truth) for name, answers in _by_rule(voices, data, clips).items()}
     found: dict[str, Any] = {}
@@ -93,7 +93,7 @@ def _by_rule(voices: scores.Bools, data: Path, clips: int | None) -> dict[str, s
     if not (states >= 0).any():
         return {}
     majority = np.full(len(voices), np.bincount(states[states >= 0]).argmax(), np.int8)
-    rule = scores.VoiceRule.of(np.concatenate([scores.heard_voices(dyad) for dyad in learned]), states)
+    rule = scores.VoiceRule.of(np.concatenate([scores.voice_tracks(dyad) for dyad in learned]), states)
     return {"majority": majority, "voice_rule": rule(voices)}
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from sfms_robot.app.servo.serial_line import Seen, Wire
+from sfms_robot.app.servo.serial_line import FoundServo, Wire
 from sfms_robot.app.servo.single_servo import field_named, put, read
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.registers import Field, Table
@@ -21,7 +21,7 @@ SETTLE_S: Final = 1.0
 CLOSE_DEG: Final = 1.5  # a loaded servo without integral gain stops that short
 
 
-def move(wire: Wire, seen: Seen, to: str | None, by: str | None) -> dict[str, Any]:
+def move(wire: Wire, seen: FoundServo, to: str | None, by: str | None) -> dict[str, Any]:
     """Move a servo to a place or by a way: raw ticks, or degrees of its shaft as `-5deg`.
 
     Its own profile is limited and its goal goes in steps of at most `SPEED_DEG_S`; torque comes on where it stands.
@@ -48,7 +48,7 @@ def move(wire: Wire, seen: Seen, to: str | None, by: str | None) -> dict[str, An
     return {"id": seen.id, "from": start, "to": target, "reached": reached}
 
 
-def _target(wire: Wire, seen: Seen, table: Table, start: int, to: str | None, by: str | None) -> int:
+def _target(wire: Wire, seen: FoundServo, table: Table, start: int, to: str | None, by: str | None) -> int:
     if (to is None) == (by is None):
         raise ConfigError("servo move: say --to TICKS or --by TICKS, one of them (or degrees: --by -5deg)")
     target = _parsed(table, to) if to is not None else start + _parsed(table, by or "")
@@ -71,7 +71,7 @@ def _parsed(table: Table, text: str) -> int:
     return round(_ticks(table, float(match[1]))) if match[2] else int(match[1])
 
 
-def _in_position_mode(wire: Wire, seen: Seen) -> None:
+def _in_position_mode(wire: Wire, seen: FoundServo) -> None:
     table = seen.registers()
     mode = table.role("operating_mode")
     if mode is None or table.position_mode is None:
@@ -84,7 +84,7 @@ def _in_position_mode(wire: Wire, seen: Seen) -> None:
 
 
 @contextmanager
-def _gently(wire: Wire, seen: Seen, start: int) -> Iterator[None]:
+def _gently(wire: Wire, seen: FoundServo, start: int) -> Iterator[None]:
     """Torque on at `start` with a slow profile; afterwards both are as before."""
     table = seen.registers()
     torque, goal = field_named(table, "torque_enable"), field_named(table, "goal_position")
@@ -110,14 +110,14 @@ def _slow(speed: Field) -> int:
     return min(speed.high, max(1, round(2.0 * SPEED_DEG_S / per_unit / speed.scale)))
 
 
-def _in_the_way(wire: Wire, seen: Seen, goal: int, present: int) -> None:
+def _in_the_way(wire: Wire, seen: FoundServo, goal: int, present: int) -> None:
     table = seen.registers()
     if abs(goal - present) > _ticks(table, BEHIND_DEG):
         put(wire, seen, field_named(table, "goal_position"), present)
         raise ServoError(f"id {seen.id} stays at {present} while its goal is {goal}: something is in the way")
 
 
-def _settled(wire: Wire, seen: Seen, present: Field, target: int) -> int:
+def _settled(wire: Wire, seen: FoundServo, present: Field, target: int) -> int:
     """Where it stands once it is close. Raises ServoError."""
     end_s = wire.clock.now_s() + SETTLE_S
     while True:
