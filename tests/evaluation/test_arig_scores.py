@@ -179,8 +179,3 @@ def test_ablations_stand_beside_the_papers(number):
     assert by_name["ARIG"]["paper RPCC"] == 0.125 and by_name["ARIG"]["source"] == "here"
     assert set(tables.ABLATIONS[number]) <= set(by_name)
     assert len({tuple(row) for row in rows}) == 1
-
-
-def test_motion_shorter_than_a_clip_is_refused():
-    with pytest.raises(ValueError, match="as long as a clip of 250 frames"):
-        tables.cut([np.zeros((249, 58))])
