@@ -181,14 +181,6 @@ def render_sheet(
     return instants
 
 
-def render_head(file: Path | str, motion: Floats, size_px: tuple[int, int] = (640, 640)) -> None:
-    """Draw one face, motion (58,), as a PNG. Raises MissingExtra without vtk."""
-    vtk = _vtk()
-    window = _window(vtk, size_px)
-    _add_head(vtk, _renderer(vtk, window, (0, 0, 1, 1), _BACKGROUND), load_human(), motion)
-    _save(vtk, window, file)
-
-
 def _vtk() -> Any:
     """The parts of vtk that are used. Importing the whole takes a second more."""
     try:

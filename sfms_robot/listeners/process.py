@@ -76,22 +76,14 @@ class ListenerProcess:
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
         """Block until the listener is loaded. Raises ModelError with its own message when it cannot be."""
-        self._wait("loaded", "building", ("starting",), limit_s)
-
-    def wait_ready(self, limit_s: float = START_LIMIT_S) -> None:
-        """Block until the listener listens. Raises ModelError with its own message when it cannot."""
-        self.wait_loaded(limit_s)
-        self._wait("ready", "listening", ("building",), limit_s)
-
-    def _wait(self, wanted: str, then: str, states: Sequence[str], limit_s: float) -> None:
-        if self._state not in states:
+        if self._state != "starting":
             return
         kind, value, _ = self._child.next(limit_s)
-        if kind == wanted:
-            self._state = then
+        if kind == "loaded":
+            self._state = "building"
             return
         self.close()
-        raise ModelError(value or f"the listener process was not {wanted} after {limit_s:g} s")
+        raise ModelError(value or f"the listener process was not loaded after {limit_s:g} s")
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Never blocks; what a child that does not listen leaves behind is dropped, oldest first, and counted."""

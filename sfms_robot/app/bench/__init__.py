@@ -19,13 +19,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from sfms_robot.app.bench.adversary import adversarial
-from sfms_robot.app.bench.bus import bus
+from sfms_robot.app.bench.bus_bench import bus
 from sfms_robot.app.bench.lead import lead
-from sfms_robot.app.bench.listener import listener
+from sfms_robot.app.bench.listener_bench import listener
 from sfms_robot.app.bench.measure import HEAD, Row, beside
-from sfms_robot.app.bench.memory import HOURS, memory
-from sfms_robot.app.bench.retarget import retarget
-from sfms_robot.app.bench.startup import startup
+from sfms_robot.app.bench.memory_bench import HOURS, memory
+from sfms_robot.app.bench.retarget_bench import retarget
+from sfms_robot.app.bench.startup_bench import startup
 from sfms_robot.errors import ConfigError
 
 PARTS: Mapping[str, Callable[[], dict[str, Row]]] = {

@@ -107,6 +107,10 @@ class ChainBus(WireBus[L], Generic[L]):
         self._release_packet = b""
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
         self._sending = RLock()
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """What a family keeps besides, at the end of the constructor. Raises ConfigError for servos it cannot drive."""
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:

@@ -15,7 +15,7 @@ from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
-    from sfms_robot.app.servo.serial_line import Seen, Wire
+    from sfms_robot.app.servo.serial_line import FoundServo, Wire
 
 app = typer.Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
 
@@ -82,7 +82,7 @@ def read(
     """Registers by name: raw and in their unit."""
     from sfms_robot.app.servo.single_servo import read_registers
 
-    def look(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
+    def look(wire: Wire, seen: FoundServo) -> list[dict[str, Any]]:
         return [{"id": seen.id, **value.row()} for value in read_registers(wire, seen, registers)]
 
     _each(ids, on, look, "registers")
@@ -102,7 +102,7 @@ def write(
 
     confirm = confirmation(yes, ids)
 
-    def change(wire: Wire, seen: Seen) -> list[dict[str, Any]]:
+    def change(wire: Wire, seen: FoundServo) -> list[dict[str, Any]]:
         before, after = write_register(wire, seen, register, value, confirm)
         row = after.row()
         return [{"id": seen.id, "register": row["register"], "before": before.raw if before else None,
@@ -324,7 +324,7 @@ def _parsed(ids: str) -> list[int]:
 def _each(
     ids: str,
     on: Wiring,
-    work: Callable[[Wire, Seen], list[dict[str, Any]]],
+    work: Callable[[Wire, FoundServo], list[dict[str, Any]]],
     key: str,
 ) -> None:
     """Do `work` for every id; what was done is shown even when a later one fails."""

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import typer
 
-from sfms_robot.cli.data import Order
-from sfms_robot.cli.run import MAX_SEED
-from sfms_robot.cli.train import ORDER, interruptible
+from sfms_robot.cli.data_command import Order
+from sfms_robot.cli.run_command import MAX_SEED
+from sfms_robot.cli.train_command import ORDER, interruptible
 
 app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 

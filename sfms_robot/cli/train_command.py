@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from sfms_robot.cli.data import Order
+from sfms_robot.cli.data_command import Order
 
 INTERRUPTED = 130
 

@@ -41,8 +41,8 @@ def check(
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
-    from sfms_robot.app.evaluate.plot_style import checked_png
     from sfms_robot.app.head.head_check import check as check_head
+    from sfms_robot.app.plot_style import checked_png
 
     if plot is not None:
         checked_png(plot, "--plot")

@@ -35,7 +35,7 @@ _CHUNK: Final = 4096
 
 
 @dataclass
-class Seen:
+class WireTimes:
     """What a run did on the wire, in seconds of the monotonic clock, and its peak resident memory."""
 
     began_s: float
@@ -84,7 +84,7 @@ def startup(against: Path | None = None) -> dict[str, Row]:
     return rows
 
 
-def _figure(seen: Seen, key: str) -> float:
+def _figure(seen: WireTimes, key: str) -> float:
     if key == "resident":
         return seen.resident_mb
     if seen.first_goal_s is None:
@@ -104,12 +104,12 @@ def _bare_mb() -> float:
     return int(done.stdout) / 1024
 
 
-def _run(env: Mapping[str, str] | None) -> Seen:
+def _run(env: Mapping[str, str] | None) -> WireTimes:
     """One second of listening on emulated servos, in real time."""
     head = load_head(HEAD)
     with launch(emulated(head)["main"]) as chain, _relay(chain.device, head.buses["main"].baud) as (port, hosts):
         words = ["run", "--head", HEAD, "--port", port, "--duration", str(RUN_S), "--seed", "1", "--json"]
-        seen = Seen(time.monotonic())
+        seen = WireTimes(time.monotonic())
         hosts.append(seen)
         process = subprocess.Popen(
             [sys.executable, *MAIN, *words], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -130,7 +130,7 @@ def _peak_mb(pid: int) -> float:
 
 
 @contextmanager
-def _relay(device: str, baud: int) -> Iterator[tuple[str, list[Seen]]]:
+def _relay(device: str, baud: int) -> Iterator[tuple[str, list[WireTimes]]]:
     """A pseudo terminal in front of another one: its name, and who is told of the host's bytes."""
     import termios
     import tty
@@ -141,7 +141,7 @@ def _relay(device: str, baud: int) -> Iterator[tuple[str, list[Seen]]]:
     tty.setraw(far, termios.TCSANOW)
     line = serial.Serial(device, baud)  # an emulated servo hears its own baud rate only
     servos = line.fileno()
-    told: list[Seen] = []
+    told: list[WireTimes] = []
     over = threading.Event()
 
     def carry() -> None:

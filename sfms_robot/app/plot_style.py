@@ -1,9 +1,9 @@
-"""How the pictures of the tables look, and how pictures reach a file."""
+"""How pictures of tables and heads look, and how they reach a file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from sfms_robot.errors import ConfigError, MissingExtra
 
@@ -27,13 +27,13 @@ def checked_png(png: Path, option: str) -> Path:
     return png
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
+def new_figure(width_in: float, height_in: float, dpi: int = _DPI) -> Figure:
     """An empty figure. Raises MissingExtra without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingExtra.of("--plots", "pictures") from error
-    return Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
+        raise MissingExtra.of("a plot", "pictures") from error
+    return Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
 
 
 def save(figure: Figure, png: Path) -> None:
@@ -41,14 +41,14 @@ def save(figure: Figure, png: Path) -> None:
     try:
         png.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(png)
-    except OSError as error:
-        raise ConfigError(f"--plots: {png} cannot be written: {error}") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{png}: cannot be written: {error}") from error
 
 
-def plain(axes: Axes, size: float = 8) -> None:
+def plain(axes: Axes, size: float = 8, grid: Literal["both", "x"] = "both") -> None:
     """No box, faint grid."""
     axes.tick_params(labelsize=size, colors=INK, length=2, which="both")
-    axes.grid(color=RULE, linewidth=0.6)
+    axes.grid(axis=grid, color=RULE, linewidth=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
