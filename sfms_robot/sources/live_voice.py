@@ -50,6 +50,7 @@ class LiveVoice:
         self._clock: SampleClock | None = None  # None: the next piece begins a stretch
         self._skew = 0.0  # of the card, kept over its gaps
         self._received = 0  # samples of the stretch
+        self._settled_s = 0.0  # when enough is known of the stretch
         self._stream: Any = None  # None: the next piece is placed
         self._position = 0.0  # samples of the stretch that went into what came out of the stream
         self._next = 0  # sample of the loop, at 16 kHz, that the stream gives next
@@ -123,14 +124,14 @@ class LiveVoice:
             self._end_stretch()
         if self._clock is None:
             self._clock = SampleClock(rate_hz, self._skew if rate_hz == self._rate_hz else 0.0)
-            self._rate_hz, self._received = rate_hz, 0
+            self._rate_hz, self._received, self._settled_s = rate_hz, 0, captured_s + SETTLE_S
         self._received += n
         self._clock.observe(self._received, captured_s)
         self._skew = self._clock.skew
 
     def _resample(self, samples: Floats, captured_s: float) -> None:
         first = self._received - len(samples)
-        settled = self._received > SETTLE_S * self._rate_hz
+        settled = captured_s > self._settled_s
         if self._stream is not None and abs(self._behind()) > (GAP_S if settled else UNSETTLED_S) * self._rate_hz:
             self._end_stream()
         if self._stream is None:
