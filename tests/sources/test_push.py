@@ -51,6 +51,7 @@ def test_pieces_of_any_length_are_heard_whole_and_in_order(rate_hz, piece_s, jit
     steps = (heard(sound)[640:] - heard(sound)[:-640]) * 10 * 25
     assert 0.97 < steps.min() and steps.max() < 1.03
     assert person.source.statistics()["voice"]["delay_ms"] == pytest.approx(1e3 * n / rate_hz, abs=0.1)
+    assert person.voice.latency_s < 0.08
 
 
 @given(st.lists(st.one_of(st.floats(0, 0.5), st.integers(1, 4000), st.none()), max_size=40))
