@@ -87,7 +87,7 @@ class LiveVoice:
             return
         with self._lock:
             self._counts["not_finite"] += not_finite
-            self._observe(len(mono), rate_hz, float(captured_s))
+            self._observe(len(mono), rate_hz, captured_s)
             if self._origin_s is not None:
                 self._resample(mono, captured_s, captured_s if arrived_s is None else arrived_s)
 
@@ -193,7 +193,7 @@ class LiveVoice:
 
     def _measure(self, end_s: float, arrived_s: float) -> None:
         assert self._origin_s is not None
-        late_s = arrived_s - self._origin_s - end_s
+        late_s = float(arrived_s) - self._origin_s - end_s
         self._latency_s = max(late_s, self._latency_s - _LATENCY_FALLS_S, 0.0)
 
 
