@@ -23,7 +23,8 @@ import numpy as np
 
 from sfms_robot.config import Gaze
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
-from sfms_robot.retarget.eyes import Jump, directions, turn
+from sfms_robot.retarget.eyes import Jump
+from sfms_robot.signals.eye_angles import directions, turn
 
 ShownPose = Callable[[Floats], Doubles]  # motion (N, 58) -> the pose (N, 6) that the neck will show
 _HEAD = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
