@@ -94,7 +94,9 @@ class HeadTurn:
         off, slope, bend = self._lags()
         off, slope, bend = off + (slope + bend * t) * t, slope + 2 * bend * t, 2 * bend
         faded = [off, slope - self.rate * off, bend - 2 * self.rate * slope + self.rate**2 * off]
-        return np.array(faded) * math.exp(-self.rate * t) + np.array([self.end_rad, _nowhere(), _nowhere()])
+        state: Doubles = np.array(faded) * math.exp(-self.rate * t)
+        state[0] += self.end_rad
+        return state
 
     def _lags(self) -> tuple[Doubles, Doubles, Doubles]:
         """The way to the end is (off + slope t + bend t^2) exp(-rate t): a cubic pole, its three constants (2,)."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, FaceFrame, Floats, SpeakerFrame
 from sfms_robot.ports import Source
+from sfms_robot.signals.attention import AttentionState, attend
 
 logger = logging.getLogger(__name__)
 
@@ -23,12 +24,14 @@ _NONE: Final = np.zeros(0, dtype=np.float32)
 class ValidatedSource:
     """`ports.Source` around another: what cannot be used is left out, counted, and named once in the log.
 
-    Frame i carries time (i + 1) x 40 ms whatever the inner source says.
+    Frame i carries time (i + 1) x 40 ms whatever the inner source says. Where it does not tell the person's attention,
+    their face does.
     """
 
     def __init__(self, inner: Source) -> None:
         self._inner = inner
         self._given = 0
+        self._attention = AttentionState()
         self._left_out: dict[str, int] = {}
 
     @property
@@ -51,7 +54,23 @@ class ValidatedSource:
         time_s = self._given / FRAME_HZ
         audio = self._samples("voice", frame.audio)
         says = None if frame.agent_audio is None else self._samples("robot's voice", frame.agent_audio)
-        return SpeakerFrame(time_s, audio, self._face(time_s, frame.face), says)
+        face = self._face(time_s, frame.face)
+        if face is None:
+            return SpeakerFrame(time_s, audio, None, says)
+        place_m = self._place(frame.place_m)
+        attention = frame.attention
+        if attention is None:
+            attention, self._attention = attend(face, place_m, self._attention)
+        return SpeakerFrame(time_s, audio, face, says, attention, place_m)
+
+    def _place(self, given: Floats | None) -> Floats | None:
+        if given is None:
+            return None
+        place_m = np.asarray(given, dtype=np.float32)
+        if place_m.shape != (3,) or not np.isfinite(place_m).all():
+            self._leave_out("place", f"{place_m} is no point in metres")
+            return None
+        return place_m
 
     def _samples(self, what: str, given: Floats) -> Floats:
         samples = np.asarray(given, dtype=np.float32)

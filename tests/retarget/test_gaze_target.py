@@ -20,13 +20,14 @@ HEAD = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
 BASE = CameraMount(on="base")
 HERE = (1.2, 0.0, 0.0)
 STEADY = Person(look_away=0)
+EYES = Gaze()
 
 
 def still(t):
     return np.zeros(MOTION_DIM, np.float32)
 
 
-def lived(watched, seconds, person=STEADY, gaze=Gaze(), camera=BASE, seed=0, listener=still) -> np.ndarray:
+def lived(watched, seconds, person=STEADY, gaze=EYES, camera=BASE, seed=0, listener=still) -> np.ndarray:
     """What is shown, (T, N, 58), of `watched(t, shown so far)`; N instants with leads a tick."""
     alive = spontaneous.Life(Life(gaze=gaze, person=person), seed, camera)
     state, shown = alive.start(), []

@@ -52,6 +52,24 @@ def test_only_whole_finite_frames_on_the_grid_get_through(given_frames):
     assert source.statistics()["frames"] == len(given_frames)
 
 
+def test_a_face_tells_attention_where_the_source_does_not():
+    seen = FaceFrame.of(0.0, np.full(58, 0.01))
+    place_m = np.array([1.0, 0.0, 0.0])
+    given_frames = [
+        SpeakerFrame(0.0, np.zeros(0, np.float32)),
+        SpeakerFrame(0.0, np.zeros(0, np.float32), seen),
+        SpeakerFrame(0.0, np.zeros(0, np.float32), seen, attention=0.25, place_m=place_m),
+        SpeakerFrame(0.0, np.zeros(0, np.float32), seen, attention=0.25, place_m=np.full(3, np.nan)),
+        SpeakerFrame(0.0, np.zeros(0, np.float32), None, attention=0.25, place_m=place_m),
+    ]
+    source = ValidatedSource(Own(*given_frames))
+    blind, told, given, nowhere, lost = (source.read(0.0)[0] for _ in given_frames)
+    assert blind.attention is None and lost.attention is None and lost.place_m is None
+    assert told.attention is not None and told.attention > 0.9 and told.place_m is None
+    assert given.attention == nowhere.attention == 0.25 and nowhere.place_m is None
+    assert np.array_equal(given.place_m, [1, 0, 0]) and source.statistics() == {"frames": 5, "place": 1}
+
+
 def test_what_is_left_out_is_said_once_and_counted(caplog):
     wrong = [SpeakerFrame(0.0, np.full(FRAME_SAMPLES, np.nan, dtype=np.float32)) for _ in range(3)]
     source = ValidatedSource(Own(*wrong, SpeakerFrame(0.0, np.zeros(100, dtype=np.float32))))
