@@ -414,7 +414,7 @@ def run(
             stack.callback(observer.close)
         programme = Programme(
             source, feed, duration_s,
-            life=Life(opened.config.life, options.seed),
+            life=Life(opened.config.life, options.seed, opened.config.camera),
             knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
             overlay=overlay,
             observers=[*observers, *own],

@@ -30,11 +30,13 @@ from sfms_robot.ports import (
     StopPolicy,
     Tick,
     Timeline,
+    Watched,
 )
 from sfms_robot.runtime.clock import tick_times
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
 from sfms_robot.runtime.safety import EASE_S, come_to_rest, smooth
+from sfms_robot.runtime.watching import turned_by_hand, watch
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class State:
     here_rad: Doubles
     life: Any = None
     retargeter: Any = None
+    watched: Watched = Watched()
 
 
 def drive(
@@ -133,7 +136,9 @@ def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> Stat
 
 def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state: State) -> State:
     """Frames of the person go to the listener, plans that are ready join the timeline."""
+    watched = state.watched
     for frame in parts.source.read(now_s):
+        watched = watch(frame, watched)
         parts.feed.push(frame, now_s)
         log.heard(frame)
         observers.heard(frame)
@@ -145,7 +150,7 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
         timeline = parts.timeline.accept(plan, timeline)
         log.planned(plan)
         observers.planned(plan)
-    return replace(state, timeline=timeline)
+    return replace(state, timeline=timeline, watched=watched)
 
 
 @dataclass(frozen=True)
@@ -166,18 +171,23 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     ahead_s = np.minimum(parts.leads_s + period_s, parts.timeline.lead_limit_s(state.timeline))
     times_s = np.concatenate([[now_s], now_s + ahead_s])
     motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
+    planned = motion
     if parts.overlay:
         motion = parts.overlay(motion, times_s)
     life, knobs = state.life, parts.knobs() if parts.knobs else None
     if parts.life:
         shown_pose = partial(parts.retargeter.shown_pose, knobs=knobs)
-        motion, life = parts.life.step(motion, times_s, now_s, life, shown_pose)
+        watched = replace(state.watched, by_hand=turned_by_hand(planned, motion))
+        motion, life = parts.life.step(motion, times_s, now_s, life, shown_pose, watched)
     angles_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
     eased = smooth((now_s + period_s - state.since_s) / EASE_S)
     ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)
-    state = State(timeline, limiter, state.held_rad, state.since_s, state.here_rad, ahead_rad, life, retargeter)
+    state = replace(
+        state, timeline=timeline, limiter=limiter, before_rad=state.here_rad, here_rad=ahead_rad, life=life,
+        retargeter=retargeter,
+    )  # fmt: skip
     return state, Command(goals_rad, reference[0], motion[0], float(times_s.max()))
 
 

@@ -5,8 +5,8 @@ value is dropped and counted, never waited for - except in virtual time, where w
 be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
 goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
-Topics: /speaker (25 Hz: sound, level, face), /plan (per plan), /face (per tick: the 58 channels asked for),
-/joints (per tick and joint: goal, present, age, fault).
+Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /face (per tick: the 58 channels asked
+for), /joints (per tick and joint: goal, present, age, fault).
 """
 
 from __future__ import annotations
@@ -62,6 +62,8 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "audio_hz": _NUMBER,
         "energy_db": _NUMBER,
         "face": {"type": ["object", "null"], "properties": _CHANNELS},
+        "attention": _NUMBER_OR_NULL,
+        "place_m": {"type": ["array", "null"], "items": _NUMBER},
     },
     "/plan": {
         "made_at_s": _NUMBER,
@@ -250,6 +252,8 @@ def _speaker_body(frame: SpeakerFrame) -> dict[str, Any]:
         "audio_hz": AUDIO_HZ,
         "energy_db": round(energy_db(frame.audio), 2),
         "face": None if frame.face is None else _by_channel(frame.face.motion),
+        "attention": None if frame.attention is None else _number(frame.attention),
+        "place_m": None if frame.place_m is None else _numbers(frame.place_m),
     }
 
 

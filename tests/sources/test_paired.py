@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, FaceFrame, Sighting, SpeakerFrame
 from sfms_robot.ports import Source
-from sfms_robot.sources.paired import ALLOWANCE_S, FACE_S, LONGEST_WAIT_S, JudgedSource, PairedSource
+from sfms_robot.sources.paired import ALLOWANCE_S, FACE_S, LONGEST_WAIT_S, FrameJudge, JudgedSource, PairedSource
 
 # --- what is handed over ---
 
@@ -197,3 +197,24 @@ def test_all_parts_start_and_close_together():
 def test_latency_is_that_of_the_voice():
     source, _, _ = played(Scripted([0.02] * 9, latency_s=0.03), until_s=0.3)
     assert source.latency_s == 0.03 and source.statistics()["wait_ms"]["p50"] <= 20.0
+
+
+def test_a_face_tells_attention_where_the_source_does_not() -> None:
+    judge, silence = FrameJudge(), np.zeros(0, np.float32)
+    seen = FaceFrame.of(0.0, np.full(58, 0.01))
+    place_m = np.array([1.0, 0.0, 0.0], np.float32)
+    blind = judge.frame(0, silence, None, None)
+    told = judge.frame(1, silence, Sighting(seen), None)
+    given = judge.frame(2, silence, Sighting(seen, 0.25, place_m), None)
+    nowhere = judge.frame(3, silence, Sighting(seen, 0.25, np.full(3, np.nan, np.float32)), None)
+    assert blind.attention is None and blind.place_m is None
+    assert told.attention is not None and told.attention > 0.9 and told.place_m is None
+    assert given.attention == nowhere.attention == 0.25 and nowhere.place_m is None
+    assert given.place_m is not None and np.array_equal(given.place_m, place_m)
+
+
+@pytest.mark.parametrize(("seen_s", "kept_s"), [(0.93, 0.93), (1.0, 1.0), (0.5, 1.0), (1.2, 1.0), (float("nan"), 1.0)])
+def test_a_face_keeps_the_time_that_it_was_seen_where_that_can_be(seen_s: float, kept_s: float) -> None:
+    face = FaceFrame.of(seen_s, np.full(58, 0.01))
+    frame = FrameJudge().frame(24, np.zeros(0, np.float32), Sighting(face), None)
+    assert frame.face is not None and frame.face.time_s == pytest.approx(kept_s)
