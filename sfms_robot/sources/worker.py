@@ -1,0 +1,232 @@
+"""A source in a process of its own: neither pictures nor drivers may hold up the servo loop.
+
+What runs there is a generator function of a module that can be imported; it is sent to the child by its name:
+
+    def work(argument: Any) -> Iterator[Any]: ...
+
+What it yields is sent to the parent; `None` says only that it is alive. It stamps what it yields with `time.monotonic`,
+which is one clock for all processes. When it returns it is finished, and is not started again. When it raises, dies or
+sends nothing for `silent_s`, that is said once, and it is started again after a pause that grows, until it is back.
+It ends with its parent, whatever killed that, and whatever it is in the middle of.
+
+    parent -> child    pickle: (work, argument)
+    child -> parent    pickle: (kind, time.monotonic, value)
+        value          it yielded `value`
+        failed         it raised, and value is the RobotError that says why
+        finished       it returned
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from typing import IO, Any, Final
+
+from sfms_robot.child_process import end_child, start_child, take_pipes
+from sfms_robot.errors import PortError, RobotError
+
+SILENT_S: Final = 3.0
+START_LIMIT_S: Final = 60.0  # importing on a small board with a cold disk, and a driver that opens a device
+CLOSE_LIMIT_S: Final = 0.2
+FIRST_PAUSE_S: Final = 0.5  # before a restart; twice as long before each of those that follow
+LONGEST_PAUSE_S: Final = 8.0
+STEADY_S: Final = 10.0  # one that has run for so long begins with `FIRST_PAUSE_S` again
+MOST_WAITING: Final = 256  # messages
+
+Work = Callable[[Any], Iterator[Any]]
+
+log = logging.getLogger(__name__)
+
+
+class SourceWorker:
+    """One generator in a child process that starts at once; see the module. Only `wait` and `close` block.
+
+    Args:
+        name: how the log calls it, "webcam 0".
+        work, argument: what runs, and what it is told; both are pickled.
+        silent_s: a worker that has sent nothing for so long hangs.
+        most_waiting: messages kept for the parent; the oldest are dropped, and counted.
+    """
+
+    def __init__(
+        self, name: str, work: Work, argument: Any, silent_s: float = SILENT_S, most_waiting: int = MOST_WAITING
+    ) -> None:
+        self._name, self._order = name, (work, argument)
+        self._silent_s, self._most_waiting = silent_s, most_waiting
+        self._state = "starting"
+        self._restarts = self._failures = self._dropped = 0
+        self._begins_s = self._heard_s = time.monotonic()  # of the child in force; the last that came of it
+        self._child = self._start()
+
+    def wait(self, limit_s: float = START_LIMIT_S) -> None:
+        """Block until the worker has sent something. Raises the RobotError that it raised instead, or a PortError."""
+        if self._state != "starting":
+            return
+        if not self._child.arrived.wait(limit_s):
+            self.close()
+            raise PortError(f"{self._name}: nothing came for {limit_s:g} s")
+        kind, _, value = self._child.messages[0]
+        if kind == "failed":
+            self.close()
+            raise value
+
+    def messages(self, now_s: float) -> list[Any]:
+        """What came, oldest first, `most_waiting` at most; a worker that died or hangs is looked after.
+
+        `now_s` is that of `time.monotonic`. Never blocks, never raises.
+        """
+        values = []
+        for _ in range(min(self._most_waiting, len(self._child.messages))):
+            kind, sent_s, value = self._child.messages.popleft()
+            if kind == "value":
+                self._hear(sent_s)
+                values.append(value)
+            elif kind == "finished":
+                self._state = "finished"
+            elif self._state in ("starting", "running"):
+                self._lose(str(value), now_s)
+        self._supervise(now_s)
+        return [value for value in values if value is not None]
+
+    def statistics(self) -> Mapping[str, Any]:
+        """`state` (starting, running, lost, finished, closed), `restarts`, `dropped` (messages)."""
+        return {"state": self._state, "restarts": self._restarts, "dropped": self._dropped + self._child.dropped}
+
+    def close(self) -> None:
+        """End the worker; blocks for twice `CLOSE_LIMIT_S` at most. Idempotent."""
+        self._state = "closed"
+        self._child.close()
+
+    def _start(self) -> _Child:
+        return _Child(self._order, self._most_waiting)
+
+    def _hear(self, sent_s: float) -> None:
+        self._heard_s = sent_s
+        if self._state == "starting":
+            self._state = "running"
+            if self._failures:
+                log.warning("%s is back", self._name)
+        elif self._state == "running" and sent_s - self._begins_s > STEADY_S:
+            self._failures = 0
+
+    def _supervise(self, now_s: float) -> None:
+        if self._state == "lost" and now_s >= self._begins_s:
+            self._restart(now_s)
+        limit_s = {"starting": START_LIMIT_S, "running": self._silent_s}.get(self._state)
+        silent_s = now_s - max(self._begins_s, self._heard_s)
+        if limit_s is not None and silent_s > limit_s and not self._child.messages:
+            self._lose(f"nothing came for {silent_s:.1f} s", now_s)
+
+    def _lose(self, why: str, now_s: float) -> None:
+        if self._state == "running" or not self._failures:
+            log.warning("%s: %s; it is tried again until it is back", self._name, why)
+        self._child.kill()
+        self._begins_s = now_s + min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**self._failures)
+        self._state, self._failures = "lost", self._failures + 1
+
+    def _restart(self, now_s: float) -> None:
+        self._restarts += 1
+        self._dropped += self._child.dropped
+        try:
+            self._child = self._start()
+        except OSError as error:  # no more processes, no more memory
+            self._lose(str(error), now_s)
+            return
+        self._state, self._begins_s = "starting", now_s
+
+
+class _Child:
+    """One interpreter, and the thread that reads what it sends.
+
+    Attributes:
+        messages: what came and was not taken yet; the last is "failed" or "finished".
+        arrived: set when there is one.
+        dropped: messages that were too many.
+    """
+
+    def __init__(self, order: tuple[Work, Any], most_waiting: int) -> None:
+        self.messages: deque[tuple[str, float, Any]] = deque(maxlen=most_waiting)
+        self.arrived = threading.Event()
+        self.dropped = 0
+        told = pickle.dumps(order)
+        self.process = start_child("sfms_robot.sources.worker:main", quiet=True)
+        assert self.process.stdin is not None and self.process.stdout is not None
+        with suppress(BrokenPipeError):  # it died: the reader sees that too, and says so
+            self.process.stdin.write(told)
+            self.process.stdin.flush()
+        self._reader = threading.Thread(target=self._read, args=(self.process.stdout,), name="source", daemon=True)
+        self._reader.start()
+
+    def kill(self) -> None:
+        """Returns at once; the reader sees to the rest."""
+        self.process.kill()
+        self._hang_up()
+
+    def close(self) -> None:
+        self._hang_up()
+        end_child(self.process, CLOSE_LIMIT_S)
+
+    def _hang_up(self) -> None:
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):
+            self.process.stdin.close()
+
+    def _read(self, pipe: IO[bytes]) -> None:
+        ended = False
+        with pipe:
+            try:
+                while not ended:
+                    message = pickle.load(pipe)
+                    ended = message[0] != "value"
+                    self._put(message)
+            except (EOFError, OSError, pickle.UnpicklingError):
+                why = f"its process died (exit code {self.process.wait()})"
+                self._put(("failed", time.monotonic(), PortError(why)))
+        self.process.wait()
+
+    def _put(self, message: tuple[str, float, Any]) -> None:
+        self.dropped += len(self.messages) == self.messages.maxlen
+        self.messages.append(message)
+        self.arrived.set()
+
+
+# --- the child ------------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Do the work that the first message names until it ends, or the pipe does."""
+    incoming, outgoing = take_pipes()
+    try:
+        work, argument = pickle.load(incoming)
+    except (EOFError, pickle.UnpicklingError):
+        return  # the parent ended before it said what to do
+    threading.Thread(target=_end_with, args=(incoming,), daemon=True).start()
+    send(work(argument), outgoing)
+
+
+def _end_with(pipe: IO[bytes]) -> None:
+    pipe.read()
+    os._exit(0)
+
+
+def send(values: Iterator[Any], pipe: IO[bytes]) -> None:
+    """Every value as it comes, then how it ended."""
+
+    def say(kind: str, value: Any = None) -> None:
+        pickle.dump((kind, time.monotonic(), value), pipe, protocol=5)
+        pipe.flush()
+
+    try:
+        for value in values:
+            say("value", value)
+        say("finished")
+    except RobotError as error:
+        say("failed", error)
+    except Exception as error:  # of a library or a driver: said by the parent, which starts the work again
+        say("failed", PortError(f"{type(error).__name__}: {error}"))
