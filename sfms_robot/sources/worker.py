@@ -2,14 +2,16 @@
 
 What runs there is a generator function of a module that can be imported; it is sent to the child by its name:
 
-    def work(argument: Any) -> Iterator[Any]: ...
+    def work(argument: Any) -> Generator[Any, Any, None]: ...
 
 What it yields is sent to the parent; `None` says only that it is alive. It stamps what it yields with `time.monotonic`,
-which is one clock for all processes. When it returns it is finished, and is not started again. When it raises, dies or
-sends nothing for `silent_s`, that is said once, and it is started again after a pause that grows, until it is back.
-It ends with its parent, whatever killed that, and whatever it is in the middle of.
+which is one clock for all processes. The result of a `yield` is what the parent told it last, or None.
 
-    parent -> child    pickle: (work, argument)
+When it returns it is finished, and is not started again. When it raises, dies or sends nothing for `silent_s`, that is
+said once, and it is started again after a pause that grows, until it is back. It ends with its parent, whatever killed
+that, and whatever it is in the middle of.
+
+    parent -> child    pickle: (work, argument), then whatever it is told
     child -> parent    pickle: (kind, time.monotonic, value)
         value          it yielded `value`
         failed         it raised, and value is the RobotError that says why
@@ -24,7 +26,7 @@ import pickle
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import suppress
 from typing import IO, Any, Final
 
@@ -39,7 +41,7 @@ LONGEST_PAUSE_S: Final = 8.0
 STEADY_S: Final = 10.0  # one that has run for so long begins with `FIRST_PAUSE_S` again
 MOST_WAITING: Final = 256  # messages
 
-Work = Callable[[Any], Iterator[Any]]
+Work = Callable[[Any], Generator[Any, Any, None]]
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +61,7 @@ class SourceWorker:
     ) -> None:
         self._name, self._order = name, (work, argument)
         self._silent_s, self._most_waiting = silent_s, most_waiting
+        self._told: Any = None
         self._state = "starting"
         self._restarts = self._failures = self._dropped = 0
         self._begins_s = self._heard_s = time.monotonic()  # of the child in force; the last that came of it
@@ -75,6 +78,11 @@ class SourceWorker:
         if kind == "failed":
             self.close()
             raise value
+
+    def tell(self, value: Any) -> None:
+        """The worker finds it at its next `yield`, and one that is started anew from the first on. Keep it small."""
+        self._told = value
+        self._child.tell(value)
 
     def messages(self, now_s: float) -> list[Any]:
         """What came, oldest first, `most_waiting` at most; a worker that died or hangs is looked after.
@@ -139,6 +147,7 @@ class SourceWorker:
             self._lose(str(error), now_s)
             return
         self._state, self._begins_s = "starting", now_s
+        self._child.tell(self._told)
 
 
 class _Child:
@@ -154,14 +163,17 @@ class _Child:
         self.messages: deque[tuple[str, float, Any]] = deque(maxlen=most_waiting)
         self.arrived = threading.Event()
         self.dropped = 0
-        told = pickle.dumps(order)
         self.process = start_child("sfms_robot.sources.worker:main", quiet=True)
         assert self.process.stdin is not None and self.process.stdout is not None
-        with suppress(BrokenPipeError):  # it died: the reader sees that too, and says so
-            self.process.stdin.write(told)
-            self.process.stdin.flush()
+        self.tell(order)
         self._reader = threading.Thread(target=self._read, args=(self.process.stdout,), name="source", daemon=True)
         self._reader.start()
+
+    def tell(self, value: Any) -> None:
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError, ValueError):  # it died: the reader sees that too, and says so
+            pickle.dump(value, self.process.stdin, protocol=5)
+            self.process.stdin.flush()
 
     def kill(self) -> None:
         """Returns at once; the reader sees to the rest."""
@@ -199,6 +211,22 @@ class _Child:
 # --- the child ------------------------------------------------------------------------------------------------------
 
 
+class _Told:
+    """The newest that the parent told, read by a thread of its own. The end of the pipe is the end of this process."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self._pipe = pipe
+        self.value: Any = None
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        try:
+            while True:
+                self.value = pickle.load(self._pipe)
+        except (EOFError, OSError, pickle.UnpicklingError):
+            os._exit(0)
+
+
 def main() -> None:
     """Do the work that the first message names until it ends, or the pipe does."""
     incoming, outgoing = take_pipes()
@@ -206,25 +234,19 @@ def main() -> None:
         work, argument = pickle.load(incoming)
     except (EOFError, pickle.UnpicklingError):
         return  # the parent ended before it said what to do
-    threading.Thread(target=_end_with, args=(incoming,), daemon=True).start()
-    send(work(argument), outgoing)
-
-
-def _end_with(pipe: IO[bytes]) -> None:
-    pipe.read()
-    os._exit(0)
-
-
-def send(values: Iterator[Any], pipe: IO[bytes]) -> None:
-    """Every value as it comes, then how it ended."""
+    told = _Told(incoming)
 
     def say(kind: str, value: Any = None) -> None:
-        pickle.dump((kind, time.monotonic(), value), pipe, protocol=5)
-        pipe.flush()
+        pickle.dump((kind, time.monotonic(), value), outgoing, protocol=5)
+        outgoing.flush()
 
     try:
-        for value in values:
-            say("value", value)
+        values = work(argument)
+        with suppress(StopIteration):
+            value = next(values)
+            while True:
+                say("value", value)
+                value = values.send(told.value)
         say("finished")
     except RobotError as error:
         say("failed", error)

@@ -52,6 +52,13 @@ def tells_what_ctrl_c_does(_):
     yield signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
+def answers(told=None):
+    while told is None:
+        told = yield
+    yield told + 1
+    threading.Event().wait()
+
+
 @pytest.fixture
 def start():
     """How to start a worker; all of them are closed afterwards."""
@@ -72,6 +79,12 @@ def next_of(worker, now_s=NEVER_S):
     assert worker._child.arrived.wait(60.0)
     worker._child.arrived.clear()
     return worker.messages(now_s)
+
+
+def first_of(worker):
+    while not (values := next_of(worker)):
+        pass
+    return values[0]
 
 
 def until(worker, state, now_s=NEVER_S):
@@ -158,6 +171,16 @@ def test_one_that_does_not_start_counts_as_silent_after_a_minute(start):
     worker = start(says_and_hangs)
     worker.messages(worker._begins_s + 1.1 * START_LIMIT_S)
     assert worker.statistics()["state"] == "lost"
+
+
+def test_what_a_worker_is_told_comes_to_it_and_to_the_one_started_in_its_place(start):
+    worker = start(answers)
+    worker.tell(41)
+    assert first_of(worker) == 42
+    worker.messages(worker._heard_s + 1.1 * SILENT_S)
+    worker.messages(worker._begins_s)
+    assert worker.statistics()["restarts"] == 1
+    assert first_of(worker) == 42
 
 
 def test_a_stopped_worker_is_ended_too(start):
