@@ -64,7 +64,7 @@ class SourceWorker:
         self._told: Any = None
         self._state = "starting"
         self._restarts = self._failures = self._dropped = 0
-        self._begins_s = self._heard_s = time.monotonic()  # of the child in force; the last that came of it
+        self._begins_s = time.monotonic()  # of the child in force, or of the next one
         self._child = self._start()
 
     def wait(self, limit_s: float = START_LIMIT_S) -> None:
@@ -74,10 +74,9 @@ class SourceWorker:
         if not self._child.arrived.wait(limit_s):
             self.close()
             raise PortError(f"{self._name}: nothing came for {limit_s:g} s")
-        kind, _, value = self._child.messages[0]
-        if kind == "failed":
+        if self._child.messages and self._child.messages[0][0] == "failed":
             self.close()
-            raise value
+            raise self._child.messages[0][1]
 
     def tell(self, value: Any) -> None:
         """The worker finds it at its next `yield`, and one that is started anew from the first on. Keep it small."""
@@ -91,16 +90,15 @@ class SourceWorker:
         """
         values = []
         for _ in range(min(self._most_waiting, len(self._child.messages))):
-            kind, sent_s, value = self._child.messages.popleft()
+            kind, value = self._child.messages.popleft()
             if kind == "value":
-                self._hear(sent_s)
                 values.append(value)
             elif kind == "finished":
                 self._state = "finished"
             elif self._state in ("starting", "running"):
                 self._lose(str(value), now_s)
         self._supervise(now_s)
-        return [value for value in values if value is not None]
+        return values
 
     def statistics(self) -> Mapping[str, Any]:
         """`state` (starting, running, lost, finished, closed), `restarts`, `dropped` (messages)."""
@@ -114,21 +112,19 @@ class SourceWorker:
     def _start(self) -> _Child:
         return _Child(self._order, self._most_waiting)
 
-    def _hear(self, sent_s: float) -> None:
-        self._heard_s = sent_s
-        if self._state == "starting":
+    def _supervise(self, now_s: float) -> None:
+        heard_s = self._child.heard_s
+        if self._state == "starting" and heard_s is not None:
             self._state = "running"
             if self._failures:
                 log.warning("%s is back", self._name)
-        elif self._state == "running" and sent_s - self._begins_s > STEADY_S:
+        if self._state == "running" and heard_s is not None and heard_s - self._begins_s > STEADY_S:
             self._failures = 0
-
-    def _supervise(self, now_s: float) -> None:
         if self._state == "lost" and now_s >= self._begins_s:
             self._restart(now_s)
         limit_s = {"starting": START_LIMIT_S, "running": self._silent_s}.get(self._state)
-        silent_s = now_s - max(self._begins_s, self._heard_s)
-        if limit_s is not None and silent_s > limit_s and not self._child.messages:
+        silent_s = now_s - (self._begins_s if heard_s is None else heard_s)
+        if limit_s is not None and silent_s > limit_s:
             self._lose(f"nothing came for {silent_s:.1f} s", now_s)
 
     def _lose(self, why: str, now_s: float) -> None:
@@ -155,12 +151,14 @@ class _Child:
 
     Attributes:
         messages: what came and was not taken yet; the last is "failed" or "finished".
-        arrived: set when there is one.
+        heard_s: when the newest was sent, signs of life included; None before the first.
+        arrived: set when something came.
         dropped: messages that were too many.
     """
 
     def __init__(self, order: tuple[Work, Any], most_waiting: int) -> None:
-        self.messages: deque[tuple[str, float, Any]] = deque(maxlen=most_waiting)
+        self.messages: deque[tuple[str, Any]] = deque(maxlen=most_waiting)
+        self.heard_s: float | None = None
         self.arrived = threading.Event()
         self.dropped = 0
         self.process = start_child("sfms_robot.sources.worker:main", quiet=True)
@@ -190,22 +188,24 @@ class _Child:
             self.process.stdin.close()
 
     def _read(self, pipe: IO[bytes]) -> None:
-        ended = False
+        kind = "value"
         with pipe:
             try:
-                while not ended:
-                    message = pickle.load(pipe)
-                    ended = message[0] != "value"
-                    self._put(message)
+                while kind == "value":
+                    kind, sent_s, value = pickle.load(pipe)
+                    if kind != "failed":
+                        self.heard_s = sent_s
+                    if kind != "value" or value is not None:
+                        self._put(kind, value)
+                    self.arrived.set()
             except (EOFError, OSError, pickle.UnpicklingError):
-                why = f"its process died (exit code {self.process.wait()})"
-                self._put(("failed", time.monotonic(), PortError(why)))
+                self._put("failed", PortError(f"its process died (exit code {self.process.wait()})"))
+                self.arrived.set()
         self.process.wait()
 
-    def _put(self, message: tuple[str, float, Any]) -> None:
+    def _put(self, kind: str, value: Any) -> None:
         self.dropped += len(self.messages) == self.messages.maxlen
-        self.messages.append(message)
-        self.arrived.set()
+        self.messages.append((kind, value))
 
 
 # --- the child ------------------------------------------------------------------------------------------------------
