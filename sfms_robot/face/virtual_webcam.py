@@ -22,7 +22,7 @@ class VirtualWebcam:
 
     def __init__(self, size_px: tuple[int, int] = SIZE_PX, angle_deg: float = ANGLE_DEG) -> None:
         self._vtk = load_vtk()
-        self._size_px, self._angle_deg = size_px, angle_deg
+        self._window, self._angle_deg = open_window(self._vtk, size_px), angle_deg
         self._human = load_human()
 
     def picture(self, motion: Floats, place_m: tuple[float, float, float] = PLACE_M) -> NDArray[np.uint8]:
@@ -32,19 +32,18 @@ class VirtualWebcam:
         the lens looks straight along its x, and the person along the same line towards it.
         """
         vtk = self._vtk
-        window = open_window(vtk, self._size_px)
-        renderer = add_renderer(vtk, window, (0, 0, 1, 1), BACKGROUND)
+        renderer = add_renderer(vtk, self._window, (0, 0, 1, 1), BACKGROUND)
         add_head(vtk, renderer, self._human, motion)
         # The person looks the other way: their left is the camera's right.
         away, left, up = place_m
         lens = (_EYES_M[0] + away, _EYES_M[1] + left, _EYES_M[2] - up)
         look(renderer, lens, (lens[0] - 1.0, lens[1], lens[2]), self._angle_deg)
-        window.Render()
+        self._window.Render()
         image = vtk.WindowToImageFilter()
-        image.SetInput(window)
+        image.SetInput(self._window)
         image.ReadFrontBufferOff()
         image.Update()
+        self._window.RemoveRenderer(renderer)
+        wide, high = self._window.GetSize()
         flat = vtk.arrays.vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
-        window.Finalize()
-        wide, high = self._size_px
         return np.ascontiguousarray(flat.reshape(high, wide, 3)[::-1])

@@ -11,6 +11,7 @@ import importlib.util
 import os
 import time
 from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -104,25 +105,25 @@ def watch(argument: str) -> Generator[Opened | Seen | None, float | None, None]:
     capture = open_video(argument) if video else open_camera(int(argument))
     if hasattr(os, "nice"):
         os.nice(NICE)
-    landmarker = Landmarker()
     taken = None if video else live(capture, argument)
-    begins_s = yield Opened(_duration_s(capture) if video else None)
-    while begins_s is None:
-        if taken is None:
-            time.sleep(_ALIVE_S)
-        else:
-            next(taken)
-        begins_s = yield None
-    before: Choice | None = None
-    for taken_s, picture in taken or played(capture, begins_s):
-        if picture is None:
-            yield None
-            continue
-        faces = landmarker.faces(picture, taken_s)
-        index, before = choose([face.place_m for face in faces], taken_s, before)
-        face = None if index is None else faces[index]
-        others = len(faces) - (face is not None)
-        yield Seen(taken_s, time.monotonic(), face, others, not faces and float(picture.mean()) < _DARK)
+    with closing(Landmarker()) as landmarker:
+        begins_s = yield Opened(_duration_s(capture) if video else None)
+        while begins_s is None:
+            if taken is None:
+                time.sleep(_ALIVE_S)
+            else:
+                next(taken)
+            begins_s = yield None
+        before: Choice | None = None
+        for taken_s, picture in taken or played(capture, begins_s):
+            if picture is None:
+                yield None
+                continue
+            faces = landmarker.faces(picture, taken_s)
+            index, before = choose([face.place_m for face in faces], taken_s, before)
+            face = None if index is None else faces[index]
+            dark = not faces and float(picture.mean()) < _DARK
+            yield Seen(taken_s, time.monotonic(), face, len(faces) - (face is not None), dark)
 
 
 def need_extra() -> None:
