@@ -17,6 +17,7 @@ from sfms_robot.signals.quantiles import Quantiles
 from sfms_robot.sources.webcam_worker import Opened, Seen, watch
 from sfms_robot.sources.worker import SourceWorker
 
+_NICE: Final = 5  # below the servo loop
 _REMEMBERED: Final = 64  # sightings newer than those asked for: two seconds
 
 
@@ -89,7 +90,7 @@ def open_webcam(argument: str) -> Webcam:
     if not argument.isdigit() and argument and not Path(argument).is_file():
         raise ConfigError(f"--face webcam:{argument}: no such file, nor the number of a camera (0, 1, ...)")
     source = str(Path(argument).absolute()) if argument and not argument.isdigit() else argument or "0"
-    worker = SourceWorker(f"webcam {argument or 0}", watch, source)
+    worker = SourceWorker(f"webcam {argument or 0}", watch, source, nice=_NICE)
     worker.wait()
     opened = worker.messages(0.0)[0]
     return Webcam(worker, opened.duration_s if isinstance(opened, Opened) else None)

@@ -25,7 +25,6 @@ from sfms_robot.sources.face_choice import Choice, choose
 from sfms_robot.sources.mediapipe_face import SeenFace, seen_face
 
 MOST_FACES: Final = 3
-NICE: Final = 5  # below the servo loop
 _PICTURE_PX: Final = (640, 480)  # asked of a camera; more shows nothing new of a face at arm's length
 _DARK: Final = 16  # mean of 0..255: a lens that is covered, a room without light
 _OLDEST_S: Final = 0.5  # a driver's time stamp that is further away is of another clock
@@ -103,8 +102,6 @@ def watch(argument: str) -> Generator[Opened | Seen | None, float | None, None]:
     need_extra()
     video = None if argument.isdigit() else argument
     capture = open_video(argument) if video else open_camera(int(argument))
-    if hasattr(os, "nice"):
-        os.nice(NICE)
     taken = None if video else live(capture, argument)
     with closing(Landmarker()) as landmarker:
         begins_s = yield Opened(_duration_s(capture) if video else None)

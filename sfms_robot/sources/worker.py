@@ -11,7 +11,7 @@ When it returns it is finished, and is not started again. When it raises, dies o
 said once, and it is started again after a pause that grows, until it is back. It ends with its parent, whatever killed
 that, and whatever it is in the middle of.
 
-    parent -> child    pickle: (work, argument), then whatever it is told
+    parent -> child    pickle: (work, argument, nice), then whatever it is told
     child -> parent    pickle: (kind, time.monotonic, value)
         value          it yielded `value`
         failed         it raised, and value is the RobotError that says why
@@ -54,12 +54,19 @@ class SourceWorker:
         work, argument: what runs, and what it is told; both are pickled.
         silent_s: a worker that has sent nothing for so long hangs.
         most_waiting: messages kept for the parent; the oldest are dropped, and counted.
+        nice: how far its process gives way to others, 0 to 19, where the system has that.
     """
 
     def __init__(
-        self, name: str, work: Work, argument: Any, silent_s: float = SILENT_S, most_waiting: int = MOST_WAITING
+        self,
+        name: str,
+        work: Work,
+        argument: Any,
+        silent_s: float = SILENT_S,
+        most_waiting: int = MOST_WAITING,
+        nice: int = 0,
     ) -> None:
-        self._name, self._order = name, (work, argument)
+        self._name, self._order = name, (work, argument, nice)
         self._silent_s, self._most_waiting = silent_s, most_waiting
         self._told: Any = None
         self._state = "starting"
@@ -156,7 +163,7 @@ class _Child:
         dropped: messages that were too many.
     """
 
-    def __init__(self, order: tuple[Work, Any], most_waiting: int) -> None:
+    def __init__(self, order: tuple[Work, Any, int], most_waiting: int) -> None:
         self.messages: deque[tuple[str, Any]] = deque(maxlen=most_waiting)
         self.heard_s: float | None = None
         self.arrived = threading.Event()
@@ -231,10 +238,12 @@ def main() -> None:
     """Do the work that the first message names until it ends, or the pipe does."""
     incoming, outgoing = take_pipes()
     try:
-        work, argument = pickle.load(incoming)
+        work, argument, nice = pickle.load(incoming)
     except (EOFError, pickle.UnpicklingError):
         return  # the parent ended before it said what to do
     told = _Told(incoming)
+    if hasattr(os, "nice"):
+        os.nice(nice)
 
     def say(kind: str, value: Any = None) -> None:
         pickle.dump((kind, time.monotonic(), value), outgoing, protocol=5)

@@ -22,6 +22,10 @@ def counts(count):
         yield number
 
 
+def tells_its_niceness(_):
+    yield os.nice(0)
+
+
 def says_and_hangs(value):
     yield value
     threading.Event().wait()
@@ -189,6 +193,10 @@ def test_a_stopped_worker_is_ended_too(start):
     os.kill(worker._child.process.pid, signal.SIGSTOP)
     worker.close()
     assert worker._child.process.poll() is not None
+
+
+def test_a_worker_gives_way_as_far_as_it_is_told(start):
+    assert until(start(tells_its_niceness, nice=3), "finished") == [os.nice(0) + 3]
 
 
 def test_ctrl_c_is_the_parents_and_prints_do_not_reach_the_pipe(start):
