@@ -15,6 +15,7 @@ that, and whatever it is in the middle of.
     child -> parent    pickle: (kind, time.monotonic, value)
         value          it yielded `value`
         failed         it raised, and value is the RobotError that says why
+        broke          something else was raised, and value says what
         finished       it returned
 """
 
@@ -75,15 +76,21 @@ class SourceWorker:
         self._child = self._start()
 
     def wait(self, limit_s: float = START_LIMIT_S) -> None:
-        """Block until the worker has sent something. Raises the RobotError that it raised instead, or a PortError."""
+        """Block until the worker has sent something.
+
+        Raises the RobotError that it raised instead; PortError when it broke, or sent nothing for `limit_s`.
+        """
         if self._state != "starting":
             return
         if not self._child.arrived.wait(limit_s):
             self.close()
             raise PortError(f"{self._name}: nothing came for {limit_s:g} s")
-        if self._child.messages and self._child.messages[0][0] == "failed":
+        kind, value = next(iter(self._child.messages), ("value", None))
+        if kind == "broke":
+            value = PortError(f"{self._name}: {value}")
+        if isinstance(value, RobotError):
             self.close()
-            raise self._child.messages[0][1]
+            raise value
 
     def tell(self, value: Any) -> None:
         """The worker finds it at its next `yield`, and one that is started anew from the first on. Keep it small."""
@@ -157,7 +164,7 @@ class _Child:
     """One interpreter, and the thread that reads what it sends.
 
     Attributes:
-        messages: what came and was not taken yet; the last is "failed" or "finished".
+        messages: what came and was not taken yet; the last is of another kind than "value".
         heard_s: when the newest was sent, signs of life included; None before the first.
         arrived: set when something came.
         dropped: messages that were too many.
@@ -200,13 +207,13 @@ class _Child:
             try:
                 while kind == "value":
                     kind, sent_s, value = pickle.load(pipe)
-                    if kind != "failed":
+                    if kind in ("value", "finished"):
                         self.heard_s = sent_s
                     if kind != "value" or value is not None:
                         self._put(kind, value)
                     self.arrived.set()
             except (EOFError, OSError, pickle.UnpicklingError):
-                self._put("failed", PortError(f"its process died (exit code {self.process.wait()})"))
+                self._put("broke", f"its process died (exit code {self.process.wait()})")
                 self.arrived.set()
         self.process.wait()
 
@@ -260,4 +267,4 @@ def main() -> None:
     except RobotError as error:
         say("failed", error)
     except Exception as error:  # of a library or a driver: said by the parent, which starts the work again
-        say("failed", PortError(f"{type(error).__name__}: {error}"))
+        say("broke", f"{type(error).__name__}: {error}")

@@ -46,6 +46,11 @@ def breaks(value):
     raise ZeroDivisionError("of a library")
 
 
+def breaks_at_once(_):
+    raise ZeroDivisionError("of a library")
+    yield
+
+
 def dies(_):
     yield "born"
     os.kill(os.getpid(), signal.SIGKILL)
@@ -120,6 +125,11 @@ def test_what_is_not_fetched_is_dropped_oldest_first_and_counted(start):
 def test_what_is_wrong_at_the_start_is_raised_to_who_waits(start, work, error, text):
     with pytest.raises(error, match=text):
         start(work, "no such thing").wait()
+
+
+def test_what_breaks_at_the_start_is_said_with_whose_it_is(start):
+    with pytest.raises(PortError, match="^test: ZeroDivisionError: of a library$"):
+        start(breaks_at_once).wait()
 
 
 def test_a_worker_that_never_says_anything_is_waited_for_no_longer_than_asked(start):
