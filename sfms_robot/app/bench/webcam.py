@@ -84,7 +84,8 @@ def face_of(**channels: float) -> Floats:
 
 
 def webcam(names: Sequence[str] = CHANNELS) -> dict[str, Any]:
-    """`channels`: name -> correlation, slope, tremble, with, seen; `place`: the same of x, y, z; `timings_ms`.
+    """`channels`: name -> correlation, slope, tremble, seen, and with which other shape it moves most, and how far at its
+    largest; `place`: correlation and slope of x, y, z; `timings_ms`.
 
     Takes about two minutes. Raises MissingExtra without the extras `pictures` and `webcam`.
     """
@@ -151,12 +152,12 @@ def _row(name: str, asked: Doubles, came: Doubles, tremble: Doubles) -> Row:
     index = CHANNEL_INDEX[name]
     fit = _fit(asked, came[:, index])
     shapes = came[:, [CHANNEL_INDEX[each] for each in BLENDSHAPES]]
-    slopes = dict(zip(BLENDSHAPES, shapes.T @ asked / (asked @ asked), strict=True))
-    partner = _EYES.get(name)
-    others = {each: slope for each, slope in slopes.items() if each not in (name, partner)}
+    changes = shapes.T @ asked / (asked @ asked) * np.abs(asked).max()
+    own = (name, _EYES.get(name))
+    others = {each: float(by) for each, by in zip(BLENDSHAPES, changes, strict=True) if each not in own}
     most = max(others, key=lambda each: abs(others[each]))
     seen = fit["correlation"] >= SEEN_CORRELATION and fit["slope"] >= SEEN_SLOPE
-    return {**fit, "tremble": float(tremble[index]), "with": most, "with_slope": float(others[most]), "seen": seen}
+    return {**fit, "tremble": float(tremble[index]), "with": most, "with_change": others[most], "seen": seen}
 
 
 def _fit(asked: Doubles, came: Doubles) -> Row:
@@ -232,7 +233,7 @@ def table(result: Mapping[str, Any]) -> list[Row]:
     """A row per channel, for people."""
     rows = []
     for name, row in result["channels"].items():
-        beside = f"{row['with']} {row['with_slope']:+.2f}" if abs(row["with_slope"]) >= SEEN_SLOPE else "-"
+        beside = f"{row['with']} {row['with_change']:+.2f}" if abs(row["with_change"]) >= SEEN_SLOPE else "-"
         figures = {key: round(row[key], 3) for key in ("correlation", "slope", "tremble")}
         rows.append({"channel": name, **figures, "moves also": beside, "seen": "yes" if row["seen"] else "no"})
     return rows
