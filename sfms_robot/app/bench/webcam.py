@@ -84,10 +84,11 @@ def face_of(**channels: float) -> Floats:
 
 
 def webcam(names: Sequence[str] = CHANNELS) -> dict[str, Any]:
-    """`channels`: name -> correlation, slope, tremble, seen, and with which other shape it moves most, and how far at its
-    largest; `place`: correlation and slope of x, y, z; `timings_ms`.
+    """`channels`, `place` and `timings_ms`. Takes about two minutes of an idle core.
 
-    Takes about two minutes. Raises MissingExtra without the extras `pictures` and `webcam`.
+    A channel has correlation, slope, tremble, whether it is seen, and with which other blendshape it moves most and how
+    far at its largest; an axis of `place` correlation and slope. Raises MissingExtra without the extras `pictures` and
+    `webcam`.
     """
     with closing(_Trial()) as trial:
         channels, place = _followed(trial, names)
