@@ -11,6 +11,8 @@
 | retarget.stewart | inverse of a six-legged platform | a 6 x 3 matrix product |
 | lead | how late the joints are | the same joints with no lead |
 | listener.plan | one plan on one thread | the time it covers: hop x 40 ms |
+
+`bench webcam` (`webcam_bench.py`), `campaign` and `fuzz` have tables of their own.
 """
 
 from __future__ import annotations
