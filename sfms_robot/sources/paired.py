@@ -226,7 +226,7 @@ class FrameJudge:
             self._leave_out(index, "face", "values that are not finite")
             return None
         end_s = (index + 1) / FRAME_HZ
-        time_s = face.time_s if end_s - FACE_S <= face.time_s <= end_s else end_s
+        time_s = face.time_s if end_s - FACE_S - _EPS_S <= face.time_s <= end_s else end_s
         return FaceFrame(time_s, pose, np.clip(shapes, 0.0, 1.0), jaw)
 
     def _attention(self, index: int, attention: float | None) -> float | None:
