@@ -100,15 +100,13 @@ class Counts:
         }
 
 
-def own_voice(
-    folder: Path | None = None, conditions: Sequence[Condition] = CONDITIONS, seconds: float | None = None
-) -> dict[str, Any]:
+def own_voice(folder: Path | None = None, conditions: Sequence[Condition] = CONDITIONS) -> dict[str, Any]:
     """Every condition over the calls of `folder` (NAME_caller, NAME_agent), or over the two that ship.
 
-    Calls on which parameters were chosen are left out. `seconds` of each call. Raises ConfigError where none is left.
+    Calls on which parameters were chosen are left out. Raises ConfigError where none is left.
     """
     folder = data_dir("sim") / "conversations" if folder is None else folder
-    calls = [_cut(read_call(folder, name), seconds) for name in call_names(folder)]
+    calls = [read_call(folder, name) for name in call_names(folder)]
     rows = []
     for condition in conditions:
         counts = Counts()
@@ -171,12 +169,6 @@ def _listen(call: Call, condition: Condition, counts: Counts) -> None:
 
 def _frame(samples: Floats, k: int) -> Floats:
     return samples[k * FRAME_SAMPLES : (k + 1) * FRAME_SAMPLES]
-
-
-def _cut(call: Call, seconds: float | None) -> Call:
-    n = len(call.person_speaks) if seconds is None else round(seconds / FRAME_S)
-    samples = n * FRAME_SAMPLES
-    return Call(call.name, call.person[:samples], call.person_speaks[:n], call.own[:samples], call.own_speaks[:n])
 
 
 def _near_change(active: Bools) -> Bools:
