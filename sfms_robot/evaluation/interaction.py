@@ -50,7 +50,7 @@ class VoiceRule:
         return out
 
 
-def heard_voices(dyad: Dyad) -> Bools:
+def voice_tracks(dyad: Dyad) -> Bools:
     """(N, 2) speech of agent and user as the listener itself hears it: the agent's now, the user's a frame late."""
     silent = np.zeros(len(dyad.listener), bool)
     agent, user = (
