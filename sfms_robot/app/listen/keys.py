@@ -62,9 +62,9 @@ class Keyboard:
             yield
 
     def wait(self, over: int) -> str | None:
-        """Blocks until a key is pressed or `PERIOD_S` is over: the key, or "". None once `over` is readable.
+        """Blocks until keys are pressed or `PERIOD_S` is over: the keys, or "". None once `over` is readable.
 
-        A sequence of several bytes (an arrow, Alt with a key) counts as the Esc that it begins with.
+        A sequence of several bytes (an arrow, Alt with a key) counts as the Esc that it begins with, and as that alone.
         """
         ready, _, _ = select.select([over, self._fd] if self.take() else [over], [], [], PERIOD_S)
         if over in ready:
@@ -72,7 +72,7 @@ class Keyboard:
         if self._fd not in ready:
             return ""
         read = os.read(self._fd, 64).decode("ascii", "replace")
-        return None if not read else ESCAPE if ESCAPE in read else read[0]
+        return None if not read else ESCAPE if ESCAPE in read else read
 
 
 def in_background(fd: int) -> bool:
@@ -97,8 +97,8 @@ def reading_keys(found: Keyboard, pressed: Callable[[str], object]) -> Iterator[
 
     def work() -> None:
         try:
-            while (key := found.wait(ours)) is not None:
-                if key:
+            while (keys := found.wait(ours)) is not None:
+                for key in keys:
                     pressed(key)
         except (OSError, termios.error):  # the terminal was closed
             return
