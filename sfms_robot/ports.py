@@ -5,6 +5,7 @@ Concrete parts are put together in `app`; everything that runs in time takes `no
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
@@ -289,6 +290,24 @@ class Timeline(Protocol):
         """How far after a tick [s] `sample` may be asked for; inf where the whole future is known."""
 
 
+@dataclass(frozen=True)
+class Watched:
+    """Whom the head listens to, as far as the loop knows at a tick.
+
+    Attributes:
+        seen_s: when their face was last seen, in loop time; None: never.
+        place_m, attention: of that sighting, see `Sighting`.
+        said_s: when the robot itself was last heard; -inf: never.
+        by_hand: somebody asks right now where head or eyes are to turn.
+    """
+
+    seen_s: float | None = None
+    place_m: Floats | None = None
+    attention: float | None = None
+    said_s: float = -math.inf
+    by_hand: bool = False
+
+
 class Life(Protocol):
     """What the head does of itself, on top of the face that was asked for. State is a value."""
 
@@ -301,10 +320,12 @@ class Life(Protocol):
         now_s: float,
         state: Any,
         shown_pose: Callable[[Floats], Doubles] | None = None,
+        watched: Watched | None = None,
     ) -> tuple[Floats, Any]:
         """Motion (N, 58) at (N,) instants, row 0 at `now_s`; never changes its input.
 
         `shown_pose`: see `Retargeter`, with the knobs of this tick; None: the neck shows the pose that is asked.
+        `watched` None: nobody is looked at, nor away from.
         """
 
 

@@ -352,6 +352,7 @@ def drive_head(
             if not isinstance(failure, RobotError):
                 logger.exception("the run ends by an error that nobody expected")
         elapsed_s = time.monotonic() - began_s if real else None
+        log.ended(opened.clock.now_s(), error)
     return Drove(outcome, log, elapsed_s, priority, error)
 
 
@@ -465,7 +466,7 @@ def run(
             logger.warning("status: http://127.0.0.1:%d/", port)
         programme = Programme(
             source, feed, duration_s,
-            life=Life(opened.config.life, options.seed),
+            life=Life(opened.config.life, options.seed, opened.config.camera),
             knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
             overlay=overlay,
             answers=True,

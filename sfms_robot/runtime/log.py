@@ -24,6 +24,7 @@ from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.quantiles import Quantiles
 
 LATE_SHARE: Final = 0.5  # a tick is late when it starts more than this share of a period behind its deadline
+ATTENTIVE: Final = 0.5  # a person with more attention looks at the head
 SPEECH_RMS: Final = 0.01  # a frame louder than this counts as speech when latency is measured
 STATES: Final = 200  # the newest changes of state, for the report
 _REMEMBERED: Final = 250  # frames of speech and plans that wait to be measured: ten seconds
@@ -110,6 +111,8 @@ class RunLog:
     late: int = 0
     skipped: int = 0
     frames: int = 0
+    judged_frames: int = 0  # whose attention is known
+    attentive_frames: int = 0
     refused_plans: int = 0
     late_ms: Quantiles = field(default_factory=Quantiles)
     frame_to_wire_ms: Quantiles = field(default_factory=Quantiles)
@@ -145,6 +148,9 @@ class RunLog:
 
     def heard(self, frame: SpeakerFrame) -> None:
         self.frames += 1
+        if frame.attention is not None:
+            self.judged_frames += 1
+            self.attentive_frames += frame.attention > ATTENTIVE
         if len(frame.audio) and float(np.sqrt(np.mean(frame.audio**2))) > SPEECH_RMS:
             self._speech_s.append(frame.time_s)
 
@@ -156,6 +162,11 @@ class RunLog:
         self.states.append((now_s, state))
         level = logging.WARNING if state.why else logging.INFO
         logger.log(level, "%s%s", state.name, f": {', '.join(state.why)}" if state.why else "")
+
+    def ended(self, now_s: float, error: Exception | None) -> None:
+        """Torque is off."""
+        before = self.states[-1][1] if self.states else RunState("stopping")
+        self.entered(before.ended(now_s, None if error is None else str(error)), now_s)
 
     def state_report(self) -> dict[str, Any]:
         """`states` of the report: seconds in each, and the newest changes with what was said of them."""
@@ -207,6 +218,11 @@ class RunLog:
             self.max_rad = np.maximum(self.max_rad, goals_rad)
             self.travel_rad = self.travel_rad + np.abs(goals_rad - self._last_rad)
         self._last_rad = goals_rad
+
+    def attention_report(self) -> dict[str, float | int | None]:
+        """`attention` of the report: of the frames that tell, the share in which the person looks at the head."""
+        share = round(self.attentive_frames / self.judged_frames, 4) if self.judged_frames else None
+        return {"share": share, "frames": self.judged_frames}
 
     def motion_report(self) -> dict[str, int]:
         """`motion` of the report."""

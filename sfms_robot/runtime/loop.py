@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import MOTION_DIM, Doubles, Floats, Reading
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
 from sfms_robot.ports import (
     Bus,
     Clock,
@@ -47,6 +47,7 @@ LOOK_S: Final = 0.1  # between two looks at what is lost
 WARMTH_S: Final = 1.0  # and at how warm servos are
 AWAY_S: Final = 1.0  # a position older than this: the servo is away
 PINCH: Final = "pinch"  # a fault that begins so
+_TURNING: Final = [CHANNEL_INDEX[name] for name in CHANNELS if name in ("yaw", "pitch") or name.startswith("eyeLook")]
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,7 @@ def drive(
                     Tick(tick.time_s, command.motion, command.goals_rad, readings, state.run.name, state.run.why)
                 )
         finally:
+            state = _ending(log, clock.now_s() - start_s, state)
             if parts.halt.by is None:  # a head that was halted moves no more
                 way = tick_times(clock, rate_hz, start_s)
                 come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log)
@@ -218,6 +220,17 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
     return replace(state, run=run)
 
 
+def _ending(log: RunLog, now_s: float, state: State) -> State:
+    run = following(state.run, Situation(ending=True), now_s)
+    log.entered(run, now_s)
+    return replace(state, run=run)
+
+
+def turned_by_hand(planned: Floats, asked: Floats) -> bool:
+    """Whether what is asked (N, 58) turns head or eyes otherwise than what was planned (N, 58)."""
+    return asked is not planned and not np.array_equal(asked[:, _TURNING], planned[:, _TURNING])
+
+
 @dataclass(frozen=True)
 class Command:
     """What a tick asks of the servos: goals (J,), what the limiter was asked for (J,), the face (58,) behind it.
@@ -240,12 +253,14 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     if parts.answers:
         answer = answer.toward(float(state.presence.answered(now_s)), times_s)
         motion = motion * answer.at(times_s)[:, None].astype(np.float32)
+    planned = motion
     if parts.overlay:
         motion = parts.overlay(motion, times_s)
     life, knobs = state.life, parts.knobs() if parts.knobs else None
     if parts.life:
         shown_pose = partial(parts.retargeter.shown_pose, knobs=knobs)
-        motion, life = parts.life.step(motion, times_s, now_s, life, shown_pose)
+        watched = replace(state.presence.watched, by_hand=turned_by_hand(planned, motion))
+        motion, life = parts.life.step(motion, times_s, now_s, life, shown_pose, watched)
     angles_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
     if not state.heat.none:
         angles_rad = parts.rest_rad + state.heat.share * (angles_rad - parts.rest_rad)

@@ -6,12 +6,11 @@ is being played, has sound, pauses between words included: neither a text nor wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
-import numpy as np
-
 from sfms_robot.frames import SpeakerFrame
+from sfms_robot.ports import Watched
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.voice_activity import Ear
@@ -19,7 +18,7 @@ from sfms_robot.signals.voice_activity import Ear
 GONE_S: Final = 10.0  # neither seen nor heard for so long
 LOST_S: Final = 0.5  # without sound or face from any source
 TURN_GAP_S: Final = 0.6  # a pause between the robot's own words
-SAYS_DB: Final = -55.0  # what is played is clean: anything louder is speech
+SAYS_DB: Final = -45.0  # what is played is clean: anything louder is speech
 
 _NEVER_S: Final = -float("inf")
 
@@ -30,45 +29,44 @@ class Presence:
 
     Attributes:
         ear: the person's voice activity.
-        person_s, spoke_s: when the person was last seen or heard, and the robot last made a sound.
+        watched: where they were seen, and when the robot last made a sound.
+        heard_s: when their voice was last heard.
         sensed_s: when anything last came, silence included.
-        attention: of the newest frame, see `Sighting`.
     """
 
     ear: Ear
-    person_s: float = _NEVER_S
-    spoke_s: float = _NEVER_S
+    watched: Watched = Watched()
+    heard_s: float = _NEVER_S
     sensed_s: float = _NEVER_S
-    attention: float | None = None
 
     @classmethod
     def start(cls) -> Presence:
         return cls(voice_activity.start())
 
     def after(self, frame: SpeakerFrame) -> Presence:
-        """One frame later."""
+        """One frame later. A frame without a face leaves the person where they were seen."""
         ear = voice_activity.step(energy_db(frame.audio), self.ear) if len(frame.audio) else self.ear
-        there = frame.face is not None or (len(frame.audio) > 0 and ear.active)
-        says = frame.agent_audio is not None and len(frame.agent_audio) > 0 and _sounds(frame)
+        watched = self.watched
+        if frame.agent_audio is not None and energy_db(frame.agent_audio) > SAYS_DB:
+            watched = replace(watched, said_s=frame.time_s)
+        if frame.face is not None:
+            seen_s = frame.face.time_s
+            watched = replace(watched, seen_s=seen_s, place_m=frame.place_m, attention=frame.attention)
+        heard = len(frame.audio) > 0 and ear.active
+        sensed = len(frame.audio) > 0 or frame.face is not None
         return Presence(
-            ear,
-            frame.time_s if there else self.person_s,
-            frame.time_s if says else self.spoke_s,
-            frame.time_s if len(frame.audio) or frame.face is not None else self.sensed_s,
-            frame.attention,
+            ear, watched, frame.time_s if heard else self.heard_s, frame.time_s if sensed else self.sensed_s
         )
 
     def person(self, now_s: float) -> bool:
-        return now_s - self.person_s <= GONE_S
+        """Whether somebody is there."""
+        seen_s = _NEVER_S if self.watched.seen_s is None else self.watched.seen_s
+        return now_s - max(seen_s, self.heard_s) <= GONE_S
 
     def answered(self, now_s: float) -> bool:
         """Whether what the listener plans is to show: somebody is there, or is spoken to, and can be sensed."""
         return self.speaking(now_s) or (self.person(now_s) and now_s - self.sensed_s <= LOST_S)
 
     def speaking(self, now_s: float) -> bool:
-        return now_s - self.spoke_s <= TURN_GAP_S
-
-
-def _sounds(frame: SpeakerFrame) -> bool:
-    assert frame.agent_audio is not None
-    return energy_db(np.asarray(frame.agent_audio, np.float32)) > SAYS_DB
+        """Whether the robot's own voice is being played."""
+        return now_s - self.watched.said_s <= TURN_GAP_S

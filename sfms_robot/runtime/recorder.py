@@ -5,9 +5,9 @@ value is dropped and counted, never waited for - except in virtual time, where w
 be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
 goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
-Topics: /speaker (25 Hz: sound, level, face), /plan (per plan), /event (nods, blinks and smiles that plans hold), /face
-(per tick: the 58 channels asked for), /joints (per tick and joint: goal, present, age, fault), /servos (once a second:
-what else they tell), /state (when it changes).
+Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /event (nods, blinks and smiles that
+plans hold), /face (per tick: the 58 channels asked for), /joints (per tick and joint: goal, present, age, fault),
+/servos (once a second: what else they tell), /state (when it changes).
 """
 
 from __future__ import annotations
@@ -66,6 +66,8 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "audio_hz": _NUMBER,
         "energy_db": _NUMBER,
         "face": {"type": ["object", "null"], "properties": _CHANNELS},
+        "attention": _NUMBER_OR_NULL,
+        "place_m": {"type": ["array", "null"], "items": _NUMBER},
     },
     "/plan": {
         "made_at_s": _NUMBER,
@@ -273,6 +275,8 @@ def _speaker_body(frame: SpeakerFrame) -> dict[str, Any]:
         "audio_hz": AUDIO_HZ,
         "energy_db": round(energy_db(frame.audio), 2),
         "face": None if frame.face is None else _by_channel(frame.face.motion),
+        "attention": None if frame.attention is None else _number(frame.attention),
+        "place_m": None if frame.place_m is None else _numbers(frame.place_m),
     }
 
 

@@ -32,12 +32,6 @@ class FaceArgument:
         return np.array([-1.0 if name in self.flip else 1.0 for name in POSE_CHANNELS], dtype=np.float32)
 
 
-def split_kind(face: str) -> tuple[str, str]:
-    """What `--face` says -> the kind's name and its argument: `live-link,flip=yaw` has one without a colon."""
-    end = min((face.index(mark) for mark in ":," if mark in face), default=len(face))
-    return face[:end], face[end:].removeprefix(":")
-
-
 def parse_face_argument(kind: str, argument: str) -> FaceArgument:
     """What stands behind `KIND:`. Raises ConfigError for another option and a channel that is none."""
     place, flip = argument, ()

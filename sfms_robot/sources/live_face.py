@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.frames import CHANNEL_INDEX, POSE, FaceFrame, Floats, Sighting
 from sfms_robot.sources import neutral
-
-# Does a person look at the head? (face, state or None) -> (0..1 or None where that cannot be told, state).
-Attention = Callable[[FaceFrame, Any], tuple[float | None, Any]]
 
 _BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
 _WAITING: Final = 256  # faces; who is not asked for longer than these keeps the newest
@@ -24,17 +20,13 @@ class LiveFace:
     Several faces between two questions become one, the newest, with the strongest blink of all: none falls between
     frames. Not thread-safe.
 
-    Args:
-        signs: (6,) factors of the pose channels.
-        attention: fills `Sighting.attention`; without it that stays None.
+    signs: (6,) factors of the pose channels.
     """
 
-    def __init__(self, signs: Floats, attention: Attention | None = None) -> None:
+    def __init__(self, signs: Floats) -> None:
         self._signs = signs
-        self._attention = attention
-        self._attention_state: Any = None
         self._neutral: neutral.Neutral | None = None
-        self._waiting: deque[tuple[float, Floats]] = deque(maxlen=_WAITING)
+        self._waiting: deque[tuple[float, Floats, Floats | None]] = deque(maxlen=_WAITING)
         self._sighting: Sighting | None = None
         self._origin_s = 0.0
 
@@ -44,11 +36,11 @@ class LiveFace:
 
     def forget(self) -> None:
         """Another camera, or another person: what was learned of the last one does not hold."""
-        self._neutral, self._attention_state = None, None
+        self._neutral = None
 
-    def put(self, time_s: float, motion: Floats) -> None:
-        """A face (58,) of `time_s` of `time.monotonic`, in order of time."""
-        self._waiting.append((time_s, motion))
+    def put(self, time_s: float, motion: Floats, place_m: Floats | None = None) -> None:
+        """A face (58,) of `time_s` of `time.monotonic`, in order of time; `place_m`: see `Sighting`."""
+        self._waiting.append((time_s, motion, place_m))
 
     def at(self, time_s: float) -> Sighting | None:
         """See `ports.Sight.at`."""
@@ -56,17 +48,14 @@ class LiveFace:
         while self._waiting and self._waiting[0][0] - self._origin_s <= time_s:
             seen.append(self._waiting.popleft())
         if seen:
-            motion = seen[-1][1].copy()
-            motion[_BLINKS] = np.max([each[_BLINKS] for _, each in seen], axis=0)
-            self._sighting = self._seen(seen[-1][0] - self._origin_s, motion)
+            seen_s, newest, place_m = seen[-1]
+            motion = newest.copy()
+            motion[_BLINKS] = np.max([each[_BLINKS] for _, each, _ in seen], axis=0)
+            self._sighting = Sighting(self._face(seen_s, motion), place_m=place_m)
         return self._sighting
 
-    def _seen(self, time_s: float, motion: Floats) -> Sighting:
+    def _face(self, seen_s: float, motion: Floats) -> FaceFrame:
         motion[POSE] *= self._signs
         # Learned in monotonic time: a start does not tear it apart.
-        motion, self._neutral = neutral.step(motion, time_s + self._origin_s, self._neutral)
-        face = FaceFrame.of(time_s, motion)
-        if self._attention is None:
-            return Sighting(face)
-        attention, self._attention_state = self._attention(face, self._attention_state)
-        return Sighting(face, attention)
+        motion, self._neutral = neutral.step(motion, seen_s, self._neutral)
+        return FaceFrame.of(seen_s - self._origin_s, motion)

@@ -25,7 +25,7 @@ from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
 from sfms_robot.signals.tracks import SOURCES
 from sfms_robot.sources.face_argument import parse_endpoint, parse_face_argument
-from sfms_robot.sources.live_face import Attention, LiveFace
+from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.udp_sight import DatagramSocket, UdpSight, addresses_of_this_machine
 
 PORT: Final = 11111  # what the app suggests
@@ -188,7 +188,7 @@ class LiveLinkDecoder:
         return True
 
 
-def open_live_link(argument: str, attention: Attention | None = None) -> UdpSight:
+def open_live_link(argument: str) -> UdpSight:
     """`[[HOST:]PORT][,flip=...]`; a phone is another machine, so every address of this one is listened on by default.
 
     Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
@@ -199,4 +199,4 @@ def open_live_link(argument: str, attention: Attention | None = None) -> UdpSigh
     own = addresses_of_this_machine() if host in ("0.0.0.0", "::") else [host]
     target = f"{' or '.join(own) or 'this machine'}, port {opened.address[1]}"
     hint = f"in the app, capture mode Live Link (ARKit), enter the target {target}"
-    return UdpSight("live-link", opened, LiveLinkDecoder(), LiveFace(given.signs, attention), hint)
+    return UdpSight("live-link", opened, LiveLinkDecoder(), LiveFace(given.signs), hint)

@@ -58,6 +58,12 @@ def source_kinds(others: Iterable[EntryPoint] | None = None) -> SourceKinds:
     return SourceKinds({**found, **VOICES}, {**found, **SIGHTS}, AGENT_VOICES)
 
 
+def split_kind(value: str) -> tuple[str, str]:
+    """What a flag says -> the kind's name and its argument: `live-link,flip=yaw` has one without a colon."""
+    end = min((value.index(mark) for mark in ":," if mark in value), default=len(value))
+    return value[:end], value[end:].removeprefix(":")
+
+
 def check_source(
     audio: str = "default", face: str = "auto", agent_audio: str = "none", kinds: SourceKinds | None = None
 ) -> None:
@@ -108,7 +114,7 @@ def open_source(
 
 
 def _check(flag: str, value: str, kinds: Kinds, file: Path | None, files: Iterable[str]) -> None:
-    name, choices = value.partition(":")[0], ", ".join([*kinds, *files])
+    (name, _), choices = split_kind(value), ", ".join([*kinds, *files])
     if name in kinds:
         module = kinds[name].value.partition(":")[0]
         if module.startswith(f"{_HERE}.") and find_spec(module) is None:
@@ -123,7 +129,7 @@ def _existing(name: str) -> Path | None:
 
 def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack) -> Any:
     """What a kind opens; None where `value` names none."""
-    name, _, argument = value.partition(":")
+    name, argument = split_kind(value)
     if name not in kinds:
         return None
     kind = kinds[name]

@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 PACKETS_PER_CALL: Final = 64
 LONGEST_CALL_S: Final = 0.002
 LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
+LOST_S: Final = 1.0
 SILENT_S: Final = 2.0  # after so long another sender may take over
 UNHEARD_S: Final = 5.0  # so long into a run without a sender, what to type there is said
 _REASONS_SAID: Final = 4
@@ -131,6 +132,9 @@ class UdpSight:
     """`ports.Sight` of one person who is seen by another device. What lies between lens and wire nobody tells here.
 
     hint: what a person has to do when nobody sends, in words.
+
+    Attributes:
+        lost: who sent is silent.
     """
 
     duration_s: float | None = None
@@ -143,7 +147,8 @@ class UdpSight:
         self._face = face
         self._hint: str | None = hint
         self._sender: Address | None = None
-        self._heard_s = -float("inf")
+        self._heard_s, self._origin_s = -float("inf"), 0.0
+        self.lost = False
         self._said: set[str] = set()
         self._refusal_said = False
         self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused"), 0)
@@ -155,11 +160,13 @@ class UdpSight:
         return self._socket.address
 
     def start(self, origin_s: float) -> None:
+        self._origin_s = origin_s
         self._face.start(origin_s)
 
     def at(self, time_s: float) -> Sighting | None:
         for packet in self._socket.waiting():
             self.feed(packet)
+        self.lost = self._sender is not None and self._origin_s + time_s - self._heard_s > LOST_S
         if self._hint is not None and time_s > UNHEARD_S:
             logger.warning("%s: nobody sends yet: %s", self._kind, self._hint)
             self._hint = None

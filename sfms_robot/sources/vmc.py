@@ -29,7 +29,7 @@ from pythonosc.parsing import osc_types
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Floats
 from sfms_robot.sources.face_argument import parse_endpoint, parse_face_argument
-from sfms_robot.sources.live_face import Attention, LiveFace
+from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.udp_sight import DatagramSocket, UdpSight
 
 PORT: Final = 39539  # what the protocol gives those who receive
@@ -275,7 +275,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, float | int) and not isinstance(value, bool)
 
 
-def open_vmc(argument: str, attention: Attention | None = None) -> UdpSight:
+def open_vmc(argument: str) -> UdpSight:
     """`[[HOST:]PORT][,flip=...]`; avatar software on this machine by default, on another with `vmc:0.0.0.0:39539`.
 
     Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
@@ -285,4 +285,4 @@ def open_vmc(argument: str, attention: Attention | None = None) -> UdpSight:
     opened = DatagramSocket("vmc", host, port)
     target = f"{opened.address[0]}, port {opened.address[1]}"
     hint = f"let the avatar software send VMC to {target} (vmc:0.0.0.0:{port} also hears other machines)"
-    return UdpSight("vmc", opened, VmcDecoder(), LiveFace(given.signs, attention), hint)
+    return UdpSight("vmc", opened, VmcDecoder(), LiveFace(given.signs), hint)

@@ -68,3 +68,27 @@ def test_pauses_between_its_words_and_what_the_person_says_do_not_end_its_turn()
     assert room.presence.speaking(room.now_s)
     room.goes_on(0.2, voice, says=SILENCE)
     assert not room.presence.speaking(room.now_s)
+
+
+def test_a_face_that_is_lost_leaves_the_person_where_they_were_seen() -> None:
+    place_m = np.array([1.0, 0.2, 0.0], np.float32)
+    face = FaceFrame(0.9, FACE.pose, FACE.blendshapes)
+    seen = Presence.start().after(SpeakerFrame(1.0, NONE, face, attention=0.5, place_m=place_m))
+    assert (seen.watched.seen_s, seen.watched.attention) == (0.9, 0.5) and seen.watched.place_m is place_m
+    assert seen.after(SpeakerFrame(1.04, NONE)).watched == seen.watched
+    assert seen.after(SpeakerFrame(1.04, NONE, face)).watched.place_m is None
+
+
+def test_the_robot_talks_while_its_own_voice_is_loud() -> None:
+    presence = Presence.start()
+    for time_s, said in ((0.04, None), (0.08, voice()), (0.12, SILENCE), (0.16, NONE)):
+        presence = presence.after(SpeakerFrame(time_s, NONE, agent_audio=said))
+    assert presence.watched.said_s == 0.08 and presence.watched.seen_s is None
+
+
+def test_what_does_not_come_any_more_is_not_answered_after_half_a_second() -> None:
+    room = Room()
+    room.goes_on(2.0, voice, FACE)
+    assert room.presence.answered(room.now_s)
+    room.goes_on(0.6, NONE)
+    assert room.presence.person(room.now_s) and not room.presence.answered(room.now_s)

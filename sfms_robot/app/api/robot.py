@@ -182,8 +182,9 @@ class Robot:
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
         """The person's voice: the next piece of sound, of any length. Never blocks.
 
-        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. Sound that has
-        waited for more than a second is left out. Raises ConfigError for another type, shape or rate.
+        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It counts from
+        this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
+        kept. Raises ConfigError for another type, shape or rate.
         """
         self._pushed("hear").voice.hear(pcm, rate_hz)
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import logging
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -35,6 +36,7 @@ from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +62,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         servos: in joint order; `id` is the channel.
         conversion: joint angles (J,) <-> ticks (J,) of pulse width.
         read_deadline_s: silence after which a question counts as unanswered; at least 20 ms is granted.
-        protocol: of the board.
         confirmed: somebody knows that servos jump when their pulses come on.
         rest_rad: (J,) where a joint goes first when nobody knows better; 0 rad, inside the limits, unless told.
         config: what the head says of this bus.
@@ -75,9 +76,8 @@ class PulseBus(WireBus[RateLimitedPort]):
         conversion: TickConversion,
         open_port: Callable[[], Port],
         baud: int,
-        read_deadline_s: float,
+        read_deadline_s: float = _LEAST_PATIENCE_S,
         *,
-        protocol: BoardProtocol,
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
         config: BusConfig | None = None,
@@ -86,7 +86,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
         super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
         self._channels = [servo.id for servo in servos]
-        self._protocol = protocol
         self._confirmed = confirmed
         self._lowest = np.array([servo.min_rad for servo in servos])
         self._highest = np.array([servo.max_rad for servo in servos])
@@ -94,6 +93,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self.model = table.model
         if beyond := pulses_beyond(servos, conversion, table, table.pulse_us or (0.0, 0.0)):
             raise ConfigError(f"bus {name!r}: a {table.model} does not make the pulses of {', '.join(beyond)}")
+        self._protocol = self._protocol_of(table)
         rest = np.zeros(len(servos)) if rest_rad is None else np.asarray(rest_rad, np.float64)
         self._ticks = conversion.to_ticks(np.clip(rest, self._lowest, self._highest))  # goals; before any, the rest
         self._warned = False  # that servos jump
@@ -102,6 +102,10 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._off: tuple[int, ...] | None = None  # since torque off: channels that stay off; None: armed
         self._off_unsent = False  # they could not be told
         self._forget()
+
+    @abstractmethod
+    def _protocol_of(self, table: Table) -> BoardProtocol:
+        """What the board speaks; pulses that its own settings may keep from it are logged."""
 
     def _forget(self) -> None:
         """What holds for one connection only."""

@@ -108,6 +108,10 @@ class ChainBus(WireBus[L], Generic[L]):
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
         self._letting_go: frozenset[int] = frozenset()  # asked for by `release`, not yet told to their members
         self._sending = RLock()
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """What a family keeps besides, at the end of the constructor. Raises ConfigError for servos it cannot drive."""
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
