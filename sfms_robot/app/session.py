@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +26,7 @@ from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import figures_so_far, run_report
+from sfms_robot.app.listen.run_facts import run_facts
 from sfms_robot.app.listen.status_server import status_server
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
@@ -510,12 +511,7 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
 def _recorder(options: RunOptions, head: Head) -> Recorder | None:
     if options.record is None:
         return None
-    about = {
-        "head": head.name,
-        "listener": Path(options.listener).name,
-        "seed": str(options.seed),
-        "audio": Path(options.audio).name,
-    }
+    about = run_facts(head, options.listener, asdict(options))
     when_full: FullPolicy = "wait" if options.fast else "drop"
     return Recorder(options.record, list(head.joints), when_full=when_full, about=about)
 
