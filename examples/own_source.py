@@ -10,7 +10,7 @@ import sfms_robot as sr
 RATE_HZ, FRAME_SAMPLES, FRAME_HZ = 16_000, 640, 25
 
 
-class Hum:
+class Hum(sr.Source):
     def __init__(self, seconds: float) -> None:
         self.duration_s = seconds  # None for something live
         self._given = 0
@@ -25,9 +25,6 @@ class Hum:
             tone = (loud * np.sin(2 * np.pi * 150 * seconds)).astype(np.float32)
             frames.append(sr.SpeakerFrame(self._given / FRAME_HZ, tone, face=None))
         return frames
-
-    def close(self) -> None:
-        """Give back what is open."""
 
 
 source = Hum(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)

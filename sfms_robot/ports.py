@@ -68,16 +68,34 @@ class Sight(Protocol):
 
 
 class Source(Protocol):
-    """Where the person's voice and face come from."""
+    """Where the person's voice and face come from, as frames. Derive your own from it: all but `read` have defaults.
 
-    @property
-    def duration_s(self) -> float | None:
-        """Length of a recording; None for something live."""
+    Attributes:
+        duration_s: length of a recording; None for something live.
+        latency_s: as of `Voice`.
+    """
+
+    duration_s: float | None = None
+    latency_s: float = 0.0
+
+    def start(self, origin_s: float) -> None:
+        """Loop time 0, the first tick after torque came on, is `origin_s` of `time.monotonic`; drop what was before.
+
+        In virtual time `origin_s` is the time of the virtual clock.
+        """
+        return None
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
-        """Frames complete at or before `now_s` and not given yet, oldest first; now_s = 0 is the start."""
+        """Frames complete at or before loop time `now_s` and not given yet, oldest first. Must not block."""
+        ...
 
-    def close(self) -> None: ...
+    def statistics(self) -> Mapping[str, Any]:
+        """What was lost: for the report."""
+        return {}
+
+    def close(self) -> None:
+        """Give back what is open. Idempotent."""
+        return None
 
 
 class Listener(Protocol):
@@ -220,6 +238,10 @@ class Tick:
 
 class Clock(Protocol):
     """Loop time from 0. Real clocks sleep; a virtual one jumps."""
+
+    @property
+    def origin_s(self) -> float:
+        """Its 0 in seconds of `time.monotonic`; 0 where time is virtual."""
 
     def now_s(self) -> float: ...
 

@@ -427,7 +427,7 @@ def run(
         )  # fmt: skip
         report["exit_code"] = drove.exit_code
         report["limitation"] = limited
-        report["source"] = dict(source.statistics()) if hasattr(source, "statistics") else {}
+        report["source"] = dict(source.statistics())
         if recorder is not None:
             recorder.close()
             report["recording"] = recorder.statistics()

@@ -20,10 +20,10 @@ class RealClock:
     """Monotonic time since construction."""
 
     def __init__(self) -> None:
-        self._origin_s = time.monotonic()
+        self.origin_s = time.monotonic()
 
     def now_s(self) -> float:
-        return time.monotonic() - self._origin_s
+        return time.monotonic() - self.origin_s
 
     def wait_until(self, time_s: float) -> None:
         delay_s = time_s - self.now_s()
@@ -33,6 +33,8 @@ class RealClock:
 
 class VirtualClock:
     """Time that jumps to where it is asked to be, and never runs by itself."""
+
+    origin_s = 0.0
 
     def __init__(self) -> None:
         self._now_s = 0.0

@@ -96,6 +96,7 @@ def drive(
             return "interrupted"
         start_s = clock.now_s()
         try:
+            parts.source.start(clock.origin_s + start_s)
             for tick in tick_times(clock, rate_hz, start_s):
                 if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
                     break

@@ -1,136 +1,83 @@
-"""A source that is fed from outside: sound and faces by calls, from any thread, at any rate.
+"""A person who is handed over by calls, from any thread: sound, faces, and what the robot itself says.
 
-What comes in is resampled to 16 kHz as it comes and waits in a queue; every 40 ms a frame takes its 640 samples, or is
-empty where they are not there yet. So the grid never slips, however uneven the calls are. What has waited longest is
-dropped where the caller is faster than time for long.
+A call brings no time of its own, so sound counts from the moment it comes: a piece is played out from then on, and the
+next ones follow it. Where pieces are long, or come unevenly, that leaves room for the longest of them.
 """
 
 from __future__ import annotations
 
-import math
 import threading
-from collections.abc import Sequence
-from typing import Final
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, SpeakerFrame
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Sighting
 from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Resampler
+from sfms_robot.sources.live_voice import LiveVoice
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 
 HEARD_S: Final = 1.0  # a person's voice that is older than this is no use to a listener
 SAID_S: Final = 120.0  # speech is synthesized faster than it is spoken, a sentence at once
-FACE_S: Final = 0.25  # a face that is older counts as lost
-PATIENCE_FRAMES: Final = 25  # a voice may come in pieces of up to a second; after so long without any it has ended
-_EPS_FRAMES: Final = 1e-6
+SIGHTINGS: Final = 64  # kept: more than a camera sees until they are asked for
 _NONE: Final = np.zeros(0, dtype=np.float32)
 
 
-class PcmQueue:
-    """Sound of any rate in, frames of 640 samples at 16 kHz out. Not thread-safe.
+class PushedVoice(LiveVoice):
+    """`ports.Voice` of what a program hears."""
 
-    Attributes:
-        dropped: samples that were thrown away because more than `longest_s` waited.
-        not_finite: samples that came in as NaN or infinite, and count as silence.
-    """
-
-    def __init__(self, longest_s: float, patience_frames: int) -> None:
-        """`patience_frames`: so many frames find nothing before what was pushed counts as a whole."""
-        self.dropped = 0
-        self.not_finite = 0
-        self._longest = int(longest_s * AUDIO_HZ)
-        self._patience_frames = patience_frames
-        self._rate_hz = float(AUDIO_HZ)
-        self._resampler = Resampler(self._rate_hz)
-        self._waiting: Floats = _NONE
-        self._fed = False
-        self._starved = 0  # frames since the last push for which nothing was there
-
-    def push(self, pcm: Pcm, rate_hz: float) -> None:
-        """(n,) or (n, channels): float of full scale 1, int16, or bytes of 16-bit little-endian mono.
-
-        Raises ConfigError for another rate, type or shape.
-        """
-        if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
-            raise ConfigError(f"rate_hz = {rate_hz!r} is no rate for speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
-        samples = _as_floats(pcm)
-        finite = np.isfinite(samples)
-        if not finite.all():
-            self.not_finite += int(samples.size - finite.sum())
-            samples = np.where(finite, samples, np.float32(0))
-        if rate_hz != self._rate_hz:
-            self._finish()
-            self._rate_hz, self._resampler = rate_hz, Resampler(rate_hz)
-        self._fed, self._starved = True, 0
-        self._append(self._resampler.push(np.clip(samples, -1.0, 1.0)))
-
-    def take(self) -> Floats | None:
-        """The next (640,), or None where fewer wait. The last of a whole is filled up with silence."""
-        if len(self._waiting) < FRAME_SAMPLES:
-            self._starved += 1
-            if self._starved < self._patience_frames:
-                return None
-            self._finish()
-            if not len(self._waiting):
-                return None
-        frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-        part, self._waiting = self._waiting[:FRAME_SAMPLES], self._waiting[FRAME_SAMPLES:]
-        frame[: len(part)] = part
-        return frame
-
-    def _finish(self) -> None:
-        """What was pushed so far is a whole: let out what the resampler still holds."""
-        if self._fed:
-            self._append(self._resampler.push(_NONE, last=True))
-            self._resampler, self._fed = Resampler(self._rate_hz), False
-
-    def _append(self, samples: Floats) -> None:
-        waiting = np.concatenate([self._waiting, samples])
-        self.dropped += max(0, len(waiting) - self._longest)
-        self._waiting = waiting[-self._longest :]
-
-
-class PushSource:
-    """`ports.Source` whose voice, face and robot's voice are pushed into it. All methods may be called from any thread.
-
-    Args:
-        duration_s: length of the run; None: until somebody ends it.
-        heard_s, said_s: most sound that waits of the person, and of the robot.
-    """
-
-    def __init__(self, duration_s: float | None = None, heard_s: float = HEARD_S, said_s: float = SAID_S) -> None:
-        self._duration_s = duration_s
-        self._lock = threading.Lock()
-        self._heard = PcmQueue(heard_s, PATIENCE_FRAMES)
-        self._said = PcmQueue(said_s, 1)  # who plays it has no more either
-        self._face: FaceFrame | None = None
-        self._face_at_s: float | None = None  # None: pushed since the last read, which tells its time
-        self._speaks = False
-        self._given = 0
-
-    @property
-    def duration_s(self) -> float | None:
-        return self._duration_s
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._now = now
+        self._pushing = threading.Lock()
+        self._longest_s = 0.0  # piece
+        self._last_s = 0.0
+        self._dropped = 0
 
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
-        """What the person says. Never blocks; raises ConfigError as `PcmQueue.push` does."""
-        with self._lock:
-            self._heard.push(pcm, rate_hz)
+        """The next piece: (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit mono.
 
-    def say(self, pcm: Pcm, rate_hz: float) -> None:
-        """What the robot says, from the next frame on; play it one frame (40 ms) after it is pushed.
-
-        A sentence may come in pieces; stay ahead of what is played, or there is a gap.
+        Of one that is longer than a second the newest is kept. Never blocks. Raises ConfigError for another rate, type
+        or shape.
         """
-        with self._lock:
-            self._said.push(pcm, rate_hz)
-            self._speaks = True
+        check_rate(rate_hz)
+        samples = as_floats(pcm)
+        kept = samples[-int(HEARD_S * rate_hz) :]
+        with self._pushing:
+            self._dropped += len(samples) - len(kept)
+            now_s, piece_s = self._now(), len(kept) / rate_hz
+            if now_s - self._last_s > self._longest_s + HEARD_S:
+                self._longest_s = 0.0
+            if piece_s > self._longest_s:
+                self._longest_s = piece_s
+                self.interrupt()
+            self._last_s = now_s
+            self.push(kept, rate_hz, now_s + self._longest_s)
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {**super().statistics(), "dropped": self._dropped, "delay_ms": round(self._longest_s * 1e3, 1)}
+
+
+class PushedSight:
+    """`ports.Sight` of what a program sees."""
+
+    duration_s: float | None = None
+    latency_s = 0.0
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._lock = threading.Lock()
+        self._origin_s = 0.0
+        self._seen: deque[tuple[float, Sighting | None]] = deque(maxlen=SIGHTINGS)  # seconds of `now`
 
     def see(self, face: FaceFrame | NDArray[np.floating] | None) -> None:
-        """The person's face now, as a `FaceFrame` or (58,) motion; None: it is lost. It holds for 250 ms.
+        """The person's face now, as a `FaceFrame` or (58,) motion; None: it is lost. Never blocks.
 
         Raises ConfigError for another shape.
         """
@@ -139,48 +86,104 @@ class PushSource:
                 raise ConfigError(f"face has the shape {np.shape(face)}, not ({MOTION_DIM},): pose 6, blendshapes 52")
             face = FaceFrame.of(0.0, face)
         with self._lock:
-            self._face, self._face_at_s = face, None
+            self._seen.append((self._now(), None if face is None else Sighting(face)))
 
-    def read(self, now_s: float) -> Sequence[SpeakerFrame]:
-        """Frames complete at or before `now_s` and not given yet, oldest first."""
-        until_s = now_s if self._duration_s is None else min(now_s, self._duration_s)
-        complete = math.floor(until_s * FRAME_HZ + _EPS_FRAMES)
+    def start(self, origin_s: float) -> None:
         with self._lock:
-            return [self._frame(now_s) for _ in range(self._given, complete)]
+            self._origin_s = origin_s
+
+    def at(self, time_s: float) -> Sighting | None:
+        """See `ports.Sight`; None also from the moment on in which the face was lost."""
+        with self._lock:
+            for seen_s, sighting in reversed(self._seen):
+                if seen_s - self._origin_s <= time_s:
+                    return sighting and replace(sighting, face=replace(sighting.face, time_s=seen_s - self._origin_s))
+        return None
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {}
 
     def close(self) -> None:
         """Nothing is held open."""
 
-    def statistics(self) -> dict[str, int]:
+
+class PushedSpeech:
+    """`ports.Voice` of what the robot says: a queue, for speech is synthesized faster than it is spoken.
+
+    Nothing until it has said something, silence after that. All methods may be called from any thread.
+    """
+
+    duration_s: float | None = None
+    latency_s = 0.0
+
+    def __init__(self, longest_s: float = SAID_S) -> None:
+        self._lock = threading.Lock()
+        self._longest = int(longest_s * AUDIO_HZ)
+        self._rate_hz = float(AUDIO_HZ)
+        self._resampler = Resampler(self._rate_hz)
+        self._waiting: Floats = _NONE
+        self._speaks = False
+        self._counts = {"dropped": 0, "not_finite": 0}
+
+    def say(self, pcm: Pcm, rate_hz: float) -> None:
+        """What it says from the next frame on, as `PushedVoice.hear`; play it one frame (40 ms) after this call.
+
+        A sentence may come in pieces; stay ahead of what is played, or there is a gap. Of more than two minutes that
+        wait the oldest are dropped.
+        """
+        check_rate(rate_hz)
+        samples = as_floats(pcm)
+        finite = np.isfinite(samples)
+        with self._lock:
+            self._counts["not_finite"] += int(samples.size - finite.sum())
+            if rate_hz != self._rate_hz:
+                self._finish()
+                self._rate_hz, self._resampler = rate_hz, Resampler(rate_hz)
+            self._speaks = True
+            self._append(self._resampler.push(np.clip(np.where(finite, samples, np.float32(0)), -1.0, 1.0)))
+
+    def start(self, origin_s: float) -> None:
+        """It is played from when the loop asks for it."""
+
+    def take(self, index: int) -> Floats | None:
+        """The next (640,), whatever the index; the end of a sentence is filled up with silence."""
+        with self._lock:
+            if not self._speaks:
+                return None
+            if len(self._waiting) < FRAME_SAMPLES:
+                self._finish()  # who plays it has no more either
+            frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+            part, self._waiting = self._waiting[:FRAME_SAMPLES], self._waiting[FRAME_SAMPLES:]
+            frame[: len(part)] = part
+            return frame
+
+    def statistics(self) -> Mapping[str, Any]:
         """Samples dropped because too many waited, and those that were not finite."""
         with self._lock:
-            both = (self._heard, self._said)
-            return {"dropped": sum(q.dropped for q in both), "not_finite": sum(q.not_finite for q in both)}
+            return dict(self._counts)
 
-    def _frame(self, now_s: float) -> SpeakerFrame:
-        self._given += 1
-        time_s = self._given / FRAME_HZ
-        heard, says = self._heard.take(), self._said.take()
-        if says is None and self._speaks:
-            says = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-        return SpeakerFrame(time_s, _NONE if heard is None else heard, self._seen(time_s, now_s), says)
+    def close(self) -> None:
+        """Nothing is held open."""
 
-    def _seen(self, time_s: float, now_s: float) -> FaceFrame | None:
-        if self._face is None:
-            return None
-        if self._face_at_s is None:
-            self._face_at_s = now_s
-        if now_s - self._face_at_s > FACE_S:
-            return None
-        return FaceFrame(time_s, self._face.pose, self._face.blendshapes, self._face.jaw_rad)
+    def _finish(self) -> None:
+        """What was said so far is a whole: let out what the resampler still holds."""
+        self._append(self._resampler.push(_NONE, last=True))
+        self._resampler = Resampler(self._rate_hz)
+
+    def _append(self, samples: Floats) -> None:
+        waiting = np.concatenate([self._waiting, samples])
+        self._counts["dropped"] += max(0, len(waiting) - self._longest)
+        self._waiting = waiting[-self._longest :]
 
 
-def open_push(argument: str, duration_s: float | None) -> PushSource:
-    """`--audio push`; it takes no argument."""
-    return PushSource(duration_s)
+def check_rate(rate_hz: float) -> None:
+    """Raises ConfigError."""
+    if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
+        raise ConfigError(f"rate_hz = {rate_hz!r} is no rate for speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
 
 
-def _as_floats(pcm: Pcm) -> NDArray[np.float32]:
+def as_floats(pcm: Pcm) -> NDArray[np.float32]:
+    """(n,) or (n, channels), full scale 1. Raises ConfigError for another type or shape."""
     if isinstance(pcm, bytes | bytearray | memoryview):
         if len(pcm) % 2:
             raise ConfigError(f"pcm of {len(pcm)} bytes is not of 16-bit samples")
@@ -193,3 +196,13 @@ def _as_floats(pcm: Pcm) -> NDArray[np.float32]:
         return samples.astype(np.float32) / np.float32(32768)
     with np.errstate(over="ignore"):  # what is too large for 32 bits becomes infinite, and is judged as that
         return samples.astype(np.float32)
+
+
+def open_pushed_voice(argument: str) -> PushedVoice:
+    """`--audio push`; it takes no argument."""
+    return PushedVoice()
+
+
+def open_pushed_sight(argument: str) -> PushedSight:
+    """`--face push`; it takes no argument."""
+    return PushedSight()

@@ -1,50 +1,71 @@
-"""The kinds of sources there are, and what `--audio`, `--face` and `--agent-audio` make of them.
+"""What `--audio`, `--face` and `--agent-audio` may say: a kind by name with its argument, a file, a shipped speaker.
 
 A kind of somebody else's is an entry point of the group `sfms_robot.sources`: a callable that takes what stands behind
-the colon of `--audio NAME:ARGUMENT` and the length of the run (or None), and returns a `ports.Source`. Kinds are
-imported when they are opened, so that a name that is wrong is found at once.
+the colon (NAME:ARGUMENT) and returns a `ports.Voice`, a `ports.Sight`, or, for `--audio`, a whole `ports.Source`. Kinds
+are imported when they are opened, so that a name that is wrong is found at once. Any voice goes with any face.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Final
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.sources.speakers import recorded_files
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, speakers, voice_file
 
 if TYPE_CHECKING:
     from sfms_robot.ports import Source
-    from sfms_robot.sources.validated import ValidatedSource
 
 GROUP: Final = "sfms_robot.sources"
-# What `--audio` says when it is neither a file nor a shipped speaker.
-SOURCES: Final[Mapping[str, EntryPoint]] = {
-    "push": EntryPoint("push", "sfms_robot.sources.push:open_push", GROUP),
-}
+_HERE: Final = "sfms_robot.sources"
+_METHODS: Final = {"voice": "take", "face": "at", "source": "read"}  # by which each is told from the others
+
+Kinds = Mapping[str, EntryPoint]
 
 
-def source_kinds(others: Iterable[EntryPoint] | None = None) -> dict[str, EntryPoint]:
-    """Every kind by name, not yet imported; ours go before those of other packages."""
-    found = entry_points(group=GROUP) if others is None else others
-    return {each.name: each for each in found} | dict(SOURCES)
+def _ours(**kinds: str) -> Kinds:
+    named = {name.replace("_", "-"): place for name, place in kinds.items()}
+    return {name: EntryPoint(name, f"{_HERE}.{place}", GROUP) for name, place in named.items()}
+
+
+VOICES: Final = _ours(
+    mic="microphone:open_microphone", push="push:open_pushed_voice", browser="browser:open_browser_voice"
+)
+SIGHTS: Final = _ours(
+    live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
+    push="push:open_pushed_sight", browser="browser:open_browser_sight",
+)  # fmt: skip
+AGENT_VOICES: Final = _ours(device="loudspeaker:open_loudspeaker", tcp="tcp_audio:open_tcp_audio")
+
+
+@dataclass(frozen=True)
+class SourceKinds:
+    """Every kind of each flag by name, not yet imported; ours go before those of other packages."""
+
+    voices: Kinds
+    sights: Kinds
+    agent_voices: Kinds
+
+
+def source_kinds(others: Iterable[EntryPoint] | None = None) -> SourceKinds:
+    """`others`: None for what is installed."""
+    found = {each.name: each for each in (entry_points(group=GROUP) if others is None else others)}
+    return SourceKinds({**found, **VOICES}, {**found, **SIGHTS}, AGENT_VOICES)
 
 
 def check_source(
-    audio: str = "default",
-    face: str = "auto",
-    agent_audio: str = "none",
-    kinds: Mapping[str, EntryPoint] | None = None,
+    audio: str = "default", face: str = "auto", agent_audio: str = "none", kinds: SourceKinds | None = None
 ) -> None:
-    """Is there such a kind, or such files? Imports and opens nothing. Raises ConfigError."""
-    name = audio.partition(":")[0]
-    if name not in (source_kinds() if kinds is None else kinds):
-        recorded_files(audio, face, agent_audio)
-        return
-    for flag, value, free in (("--face", face, "auto"), ("--agent-audio", agent_audio, "none")):
-        if value not in (free, "none"):
-            raise ConfigError(f"{flag} {value}: --audio {name} brings its own ({free})")
+    """Are there such kinds, or such files? Imports and opens nothing. Raises ConfigError with the choices."""
+    known = source_kinds() if kinds is None else kinds
+    _check("--audio", audio, known.voices, voice_file(audio), ["FILE.wav", "none", "default", *speakers()])
+    _check("--face", face, known.sights, _existing(face), ["FILE.csv", "FILE.csv.gz", "none", "auto"])
+    _check("--agent-audio", agent_audio, known.agent_voices, voice_file(agent_audio), ["FILE.wav", "none", *speakers()])
 
 
 def open_source(
@@ -53,26 +74,81 @@ def open_source(
     duration_s: float | None = None,
     loop: bool = True,
     agent_audio: str = "none",
-    kinds: Mapping[str, EntryPoint] | None = None,
-) -> ValidatedSource:
-    """A source by what a run is told of it: a kind by name, or a recording (`open_recording`).
+    kinds: SourceKinds | None = None,
+) -> Source:
+    """A person by what a run is told of them.
 
-    Raises ConfigError for what is not there and for files that cannot be used.
+    An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
+    own, else none. `loop`: recordings start again when they end before `duration_s` does.
+
+    Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
-    from sfms_robot.sources.recording import open_recording
-    from sfms_robot.sources.validated import ValidatedSource
+    from sfms_robot.sources.paired import JudgedSource, PairedSource
 
     known = source_kinds() if kinds is None else kinds
     check_source(audio, face, agent_audio, known)
-    name, _, argument = audio.partition(":")
-    if name in known:
-        return ValidatedSource(_opened(known[name], argument, duration_s))
-    return ValidatedSource(open_recording(audio, face, duration_s, loop, agent_audio))
+    if audio == "default":
+        audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
+    again = loop and duration_s is not None
+    with ExitStack() as failed:  # closes what was opened before the one that cannot be
+        voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed) or _recorded_voice(audio, again)
+        if voice is not None and hasattr(voice, _METHODS["source"]):
+            for flag, value, free in (("--face", face, "auto"), ("--agent-audio", agent_audio, "none")):
+                if value not in (free, "none"):
+                    raise ConfigError(f"{flag} {value}: --audio {audio} brings its own ({free})")
+            source: Source = JudgedSource(voice)
+        else:
+            sight = _opened("--face", face, known.sights, ("face",), failed)
+            sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
+            agent = _opened("--agent-audio", agent_audio, known.agent_voices, ("voice",), failed)
+            agent = agent or _recorded_voice(agent_audio, False)
+            source = PairedSource(voice, sight, agent, duration_s)
+        failed.pop_all()
+    return source
 
 
-def _opened(kind: EntryPoint, argument: str, duration_s: float | None) -> Source:
+def _check(flag: str, value: str, kinds: Kinds, file: Path | None, files: Iterable[str]) -> None:
+    name, choices = value.partition(":")[0], ", ".join([*kinds, *files])
+    if name in kinds:
+        module = kinds[name].value.partition(":")[0]
+        if module.startswith(f"{_HERE}.") and find_spec(module) is None:
+            raise ConfigError(f"{flag} {value}: not available yet ({choices})")
+    elif value not in files and file is None:
+        raise ConfigError(f"{flag} {value}: no such file ({choices})")
+
+
+def _existing(name: str) -> Path | None:
+    return Path(name) if Path(name).exists() else None
+
+
+def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack) -> Any:
+    """What a kind opens; None where `value` names none."""
+    name, _, argument = value.partition(":")
+    if name not in kinds:
+        return None
+    kind = kinds[name]
     try:
-        build: Callable[[str, float | None], Source] = kind.load()
+        build = kind.load()
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"--audio {kind.name}: {kind.value} cannot be imported: {error}") from error
-    return build(argument, duration_s)
+        raise ConfigError(f"{flag} {name}: {kind.value} cannot be imported: {error}") from error
+    part = build(argument)
+    failed.callback(part.close)
+    if not any(hasattr(part, _METHODS[each]) for each in wanted):
+        raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {' or '.join(wanted)}")
+    return part
+
+
+def _recorded_voice(name: str, loop: bool) -> Any:
+    from sfms_robot.signals.audio import AudioFile
+    from sfms_robot.sources.recording import RecordedVoice
+
+    file = None if name == "none" else voice_file(name)
+    return None if file is None else RecordedVoice(AudioFile(file), loop)
+
+
+def _recorded_sight(face: str, audio: str, loop: bool, frames: int | None) -> Any:
+    from sfms_robot.signals.tracks import read_track
+    from sfms_robot.sources.recording import RecordedSight
+
+    file = own_face(audio) if face == "auto" else _existing(face)
+    return None if face == "none" or file is None else RecordedSight(read_track(file), loop, frames)

@@ -29,19 +29,16 @@ class Nodder:
         frames[0, 1] = self.size * np.sin(2 * np.pi * 1.5 * speaker.time_s)
         return sr.Plan(speaker.time_s, np.array([speaker.time_s + 0.04]), frames), memory
 
-class Hum:
-    def __init__(self, argument, duration_s):
-        self.level, self.duration_s, self.given = float(argument), duration_s, 0
+class Hum(sr.Source):
+    def __init__(self, argument):
+        self.level, self.given = float(argument), 0
 
     def read(self, now_s):
         frames = []
-        while (self.given + 1) / 25 <= min(now_s, self.duration_s):
+        while (self.given + 1) / 25 <= now_s:
             self.given += 1
             frames.append(sr.SpeakerFrame(self.given / 25, np.full(640, self.level, np.float32)))
         return frames
-
-    def close(self):
-        pass
 """
 
 FAMILY = """

@@ -124,16 +124,11 @@ class Still(Nodder):
         return sr.Plan(plan.made_at_s, plan.times_s, np.full((2, 58), 0.1, np.float32)), memory
 
 
-class BadSource:
-    duration_s = None
-
+class BadSource(sr.Source):
     def read(self, now_s):
         if now_s > 0.3:
             raise OSError("the browser tab was closed")
         return []
-
-    def close(self):
-        """Nothing is open."""
 
 
 def test_an_error_in_the_loop_surfaces_at_the_end_of_the_block_with_the_head_at_rest():

@@ -17,7 +17,8 @@ from sfms_robot.motion.limits import JointLimits
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, STANDS_RAD, Interrupt
-from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.paired import PairedSource
+from sfms_robot.sources.recording import RecordedVoice
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
 SECONDS = 1.6
@@ -65,7 +66,7 @@ def driven(head, servos, seconds, seed, fault=None):
         for chain in opened.values() if fault else ():
             chain.inject(fault)
         options = HeadOptions(head.name, fast=True)
-        silence = Recording(np.zeros(round(seconds * 16_000), np.float32), None, seconds)
+        silence = PairedSource(RecordedVoice(np.zeros(round(seconds * 16_000), np.float32)), duration_s=seconds)
         motion = build_motion(head, rate_hz)
         there = OpenHead(options, head, motion, bus, clock, rate_hz, opened)
         began_s = clock.now_s()

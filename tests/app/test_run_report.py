@@ -7,6 +7,7 @@ import sys
 
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.errors import ModelError
+from sfms_robot.ports import Source
 
 HEAD = "interbotix_wxxms"
 
@@ -33,7 +34,7 @@ def test_a_disk_that_is_full_costs_the_recording_and_neither_the_run_nor_its_rep
     assert "too large" in report["recording"]["trouble"] and "the recording ends here" in err
 
 
-class Broken:
+class Broken(Source):
     """A source that breaks after a second."""
 
     duration_s = 2.0
@@ -42,8 +43,6 @@ class Broken:
         if now_s > 1.0:
             raise ModelError("the cable was pulled")
         return []
-
-    def close(self): ...
 
 
 def test_a_run_that_ends_by_an_error_has_its_report_and_says_why(tmp_path):

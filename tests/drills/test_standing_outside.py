@@ -16,7 +16,8 @@ from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.servo.families import family_named
-from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.paired import PairedSource
+from sfms_robot.sources.recording import RecordedVoice
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
 LISTEN_S = 0.5
@@ -73,7 +74,7 @@ def test_wherever_joints_stand_a_run_ends_at_rest_and_limp(name, seed):
         bus.connect()
         motion = build_motion(head, rate_hz)
         there = OpenHead(HeadOptions(name, fast=True), head, motion, bus, clock, rate_hz, chains)
-        silence = Recording(np.zeros(round(LISTEN_S * 16_000), np.float32), None, LISTEN_S)
+        silence = PairedSource(RecordedVoice(np.zeros(round(LISTEN_S * 16_000), np.float32)), duration_s=LISTEN_S)
         programme = Programme(silence, InlineFeed(Nodder(), seed, 0.01), LISTEN_S)
         drove = drive_head(there, programme, Interrupt(), signals=False)
         states = {key: chains[joint.bus].state(joint.id) for key, joint in head.joints.items()}

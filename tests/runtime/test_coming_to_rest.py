@@ -21,7 +21,7 @@ from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.safety import REST_LIMIT_S, Interrupt, Released
-from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.paired import PairedSource
 
 HEAD = load_head("interbotix_wxxms")
 RATE_HZ = max(bus.rate_hz for bus in HEAD.buses.values())
@@ -107,7 +107,7 @@ def driven(
     bus.connect()
     log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
     parts: dict[str, Any] = {
-        "source": Recording(None, None, SECONDS), "feed": InlineFeed(Turner(), 0, 0.01), "timeline": motion.timeline,
+        "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Turner(), 0, 0.01), "timeline": motion.timeline,
         "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus, "life": Life(HEAD.life, 0),
     }  # fmt: skip
     if limiter:

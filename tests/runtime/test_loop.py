@@ -21,7 +21,7 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
-from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.paired import PairedSource
 
 RATE_HZ = 100.0
 HEAD = load_head("face28")
@@ -102,7 +102,7 @@ def run(
     bus = build_bus(HEAD, {"main": chain}, clock)
     log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
     parts = Parts(
-        Recording(None, None, seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.retargeter,
+        PairedSource(duration_s=seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.retargeter,
         motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.paired import PairedSource
 
 RATE_HZ = 100.0
 HEAD = load_head("face28")
@@ -63,8 +63,8 @@ def run(chain: Chain, hand: Hand, seconds: float) -> tuple[str, RunLog]:
     bus = build_bus(HEAD, {"main": chain}, clock)
     log = RunLog(JOINTS, 1 / RATE_HZ, motion.audit)
     parts = Parts(
-        Recording(None, None, seconds), InlineFeed(Bow(), 0, 0.01), motion.timeline, motion.retargeter, motion.limiter,
-        bus, [hand], motion.leads_s, motion.rest_rad,
+        PairedSource(duration_s=seconds), InlineFeed(Bow(), 0, 0.01), motion.timeline, motion.retargeter,
+        motion.limiter, bus, [hand], motion.leads_s, motion.rest_rad,
     )  # fmt: skip
     bus.connect()
     try:

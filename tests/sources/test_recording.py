@@ -11,9 +11,18 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.tracks import Track, write_track
-from sfms_robot.sources.recording import Recording
+from sfms_robot.sources.paired import PairedSource
+from sfms_robot.sources.recording import RecordedSight, RecordedVoice
 from sfms_robot.sources.registry import open_source
 from sfms_robot.sources.speakers import shipped_speaker, speakers
+
+
+def recorded(audio, track, duration_s=None, loop=True, agent_audio=None):
+    """As `open_source` joins them."""
+    loop = loop and duration_s is not None
+    voice = None if audio is None else RecordedVoice(audio, loop)
+    sight = None if track is None else RecordedSight(track, loop, voice and voice.frames)
+    return PairedSource(voice, sight, None if agent_audio is None else RecordedVoice(agent_audio), duration_s)
 
 
 def voice(frames):
@@ -28,7 +37,7 @@ def face(seconds):
 
 @given(st.lists(st.floats(0, 0.3), max_size=20))
 def test_frames_do_not_depend_on_when_they_are_asked_for(steps_s):
-    source, now_s, frames = Recording(voice(10), face(0.3)), 0.0, []
+    source, now_s, frames = recorded(voice(10), face(0.3)), 0.0, []
     for step_s in [*steps_s, 1.0]:
         now_s += step_s
         frames += source.read(now_s)
@@ -38,7 +47,7 @@ def test_frames_do_not_depend_on_when_they_are_asked_for(steps_s):
 
 
 def test_a_face_belongs_to_the_end_of_its_frame_and_ends_with_its_track():
-    frames = Recording(voice(10), face(0.2)).read(1.0)
+    frames = recorded(voice(10), face(0.2)).read(1.0)
     assert [frame.face is not None for frame in frames] == [True] * 5 + [False] * 5
     for frame in frames[:5]:
         assert frame.face.time_s == frame.time_s
@@ -46,7 +55,7 @@ def test_a_face_belongs_to_the_end_of_its_frame_and_ends_with_its_track():
 
 
 def test_a_short_voice_starts_again_after_a_second_of_silence():
-    frames = Recording(voice(10), face(0.4), duration_s=2.0).read(9.0)
+    frames = recorded(voice(10), face(0.4), duration_s=2.0).read(9.0)
     heard = [float(frame.audio[0]) for frame in frames]
     assert len(frames) == 50
     assert heard[10:35] == [0.0] * 25 and heard[35:45] == heard[:10]
@@ -54,28 +63,28 @@ def test_a_short_voice_starts_again_after_a_second_of_silence():
 
 
 def test_without_loop_silence_follows():
-    frames = Recording(voice(10), None, duration_s=2.0, loop=False).read(2.0)
+    frames = recorded(voice(10), None, duration_s=2.0, loop=False).read(2.0)
     assert not any(frame.audio.any() for frame in frames[10:])
 
 
 def test_the_last_frame_is_filled_with_silence():
-    (frame,) = Recording(voice(1)[:100], None).read(1.0)
+    (frame,) = recorded(voice(1)[:100], None).read(1.0)
     assert frame.audio.shape == (FRAME_SAMPLES,) and not frame.audio[100:].any()
 
 
 def test_a_face_alone_and_nothing_at_all_are_normal():
-    only_face = Recording(None, face(1.0))
+    only_face = recorded(None, face(1.0))
     assert only_face.duration_s == 1.0 and len(only_face.read(1.0)[0].audio) == 0
-    nothing = Recording(None, None)
+    nothing = recorded(None, None)
     assert nothing.duration_s is None
     assert all(frame.face is None and not len(frame.audio) for frame in nothing.read(3.0))
-    assert len(Recording(None, None, 2.0).read(9.0)) == 50
+    assert len(recorded(None, None, 2.0).read(9.0)) == 50
 
 
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_run_needs_a_length(duration_s):
     with pytest.raises(ConfigError, match="--duration"):
-        Recording(None, None, duration_s)
+        recorded(None, None, duration_s)
 
 
 def test_shipped_speakers_can_be_heard_and_seen():
@@ -103,8 +112,8 @@ def test_files_are_opened_by_path(tmp_path):
 @pytest.mark.parametrize(
     ("audio", "face", "message"),
     [
-        ("mic", "auto", "--audio mic: not available yet .*FILE.wav, none, default"),
-        ("none", "live-link:11111", "--face live-link:11111: not available yet .*FILE.csv"),
+        ("browser", "auto", "--audio browser: not available yet .mic, push, browser, FILE.wav, none, default"),
+        ("none", "browser:8000", "--face browser:8000: not available yet .live-link, vmc, .*FILE.csv"),
         ("nobody.wav", "auto", "--audio nobody.wav: no such file .*facegood_1114_3_16, katie"),
         ("none", "nobody.csv", "--face nobody.csv: no such file"),
     ],
@@ -115,26 +124,26 @@ def test_what_cannot_be_opened_is_said_with_the_choices(audio, face, message):
 
 
 def test_what_the_robot_says_is_told_one_frame_early_and_silence_follows():
-    frames = Recording(voice(5), None, duration_s=0.4, agent_audio=voice(3)).read(1.0)
+    frames = recorded(voice(5), None, duration_s=0.4, agent_audio=voice(3)).read(1.0)
     assert [float(frame.agent_audio[0]) * 1000 for frame in frames] == pytest.approx([2, 3] + [0] * 8)
     assert all(len(frame.agent_audio) == FRAME_SAMPLES for frame in frames)
 
 
 def test_a_robot_that_says_nothing_has_no_track():
-    assert all(frame.agent_audio is None for frame in Recording(voice(3), None).read(1.0))
+    assert all(frame.agent_audio is None for frame in recorded(voice(3), None).read(1.0))
 
 
 def test_the_robots_voice_does_not_start_again_with_the_persons():
-    frames = Recording(voice(5), None, duration_s=3.0, agent_audio=voice(5)).read(3.0)
+    frames = recorded(voice(5), None, duration_s=3.0, agent_audio=voice(5)).read(3.0)
     assert frames[30].audio.any() and not any(frame.agent_audio.any() for frame in frames[5:])
 
 
 def test_a_robots_voice_alone_lasts_as_long_as_it_speaks():
-    assert Recording(None, None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
-    assert Recording(voice(3), None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
+    assert recorded(None, None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
+    assert recorded(voice(3), None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
 
 
-@pytest.mark.parametrize(("name", "said"), [("gone.wav", "no such file"), ("loopback", "not available yet")])
+@pytest.mark.parametrize(("name", "said"), [("gone.wav", "no such file"), ("tcp:9000", "not available yet")])
 def test_a_robots_voice_that_is_not_there_is_named(name, said):
     with pytest.raises(ConfigError, match=f"--agent-audio {name}: {said}"):
         open_source("none", "none", agent_audio=name)
@@ -148,7 +157,7 @@ def test_a_shipped_speaker_lends_the_robot_its_voice():
 def test_a_recording_read_from_its_file_is_the_recording_held_in_memory(tmp_path):
     rng = np.random.default_rng(5)
     soundfile.write(tmp_path / "a.wav", rng.uniform(-1, 1, (30_000, 2)), 22050)
-    held = Recording(read_audio(tmp_path / "a.wav"), None, 7.0, agent_audio=read_audio(tmp_path / "a.wav"))
+    held = recorded(read_audio(tmp_path / "a.wav"), None, 7.0, agent_audio=read_audio(tmp_path / "a.wav"))
     streamed = open_source(str(tmp_path / "a.wav"), "none", 7.0, agent_audio=str(tmp_path / "a.wav"))
     for one, other in zip(held.read(7.0), streamed.read(7.0), strict=True):  # it starts again twice
         np.testing.assert_array_equal(one.audio, other.audio)
@@ -173,7 +182,7 @@ def test_three_hours_are_not_loaded(tmp_path):
 
 
 def test_a_robots_voice_that_is_longer_is_not_cut_and_the_person_does_not_begin_again():
-    source = Recording(voice(3), None, agent_audio=voice(40))
+    source = recorded(voice(3), None, agent_audio=voice(40))
     frames = source.read(60.0)
     assert len(frames) == 40 and source.duration_s == pytest.approx(1.6)
     assert frames[38].agent_audio.any() and not any(frame.audio.any() for frame in frames[3:])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -28,13 +29,25 @@ from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
 from sfms_robot.runtime.safety import Interrupt
-from sfms_robot.sources.push import Pcm, PushSource
-from sfms_robot.sources.validated import ValidatedSource
+from sfms_robot.sources.paired import JudgedSource, PairedSource
+from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
 
 log = logging.getLogger(__name__)
 
 PUSH: Final = "push"
 EVENTS_LIMIT_S: Final = 1.0  # how long `stop` waits for callbacks
+
+
+@dataclass(frozen=True)
+class _PushedPerson:
+    """What a program hears, sees and says."""
+
+    voice: PushedVoice = field(default_factory=PushedVoice)
+    sight: PushedSight = field(default_factory=PushedSight)
+    speech: PushedSpeech = field(default_factory=PushedSpeech)
+
+    def source(self) -> Source:
+        return PairedSource(self.voice, self.sight, self.speech)
 
 
 class Robot:
@@ -51,8 +64,8 @@ class Robot:
             `Listener`, which is then stepped in a thread of this process.
         audio: "push" for what `hear`, `see` and `say` hand over; else a source that `run --audio` knows.
         face, agent_audio: as `run --face`, `--agent-audio`, beside another source than "push".
-        source: an object that implements `Source`, instead of `audio`, `face` and `agent_audio`. Its `read` is called
-            in the loop: it must not block.
+        source: an object of a class derived from `Source`, instead of `audio`, `face` and `agent_audio`. Its `read` is
+            called in the loop: it must not block.
         duration_s: seconds after which it ends by itself; None for that of the source.
         fast: virtual time on emulated servos, as fast as they compute; not with "push".
         seed: of everything that is drawn at random.
@@ -99,9 +112,8 @@ class Robot:
         prepare_head(self._options.servos)
         config = load_head(self._options.head)
         self._listener = own
-        self._push = PushSource() if pushed else None
-        inner = self._push if pushed else source
-        self._source = None if inner is None else ValidatedSource(inner)
+        self._person = _PushedPerson() if pushed else None
+        self._source = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
         self._puppet = Puppet(config.life.gaze, frozenset(HeadRetargeter(config).blind_channels))
@@ -160,26 +172,26 @@ class Robot:
         (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. Sound that has
         waited for more than a second is left out. Raises ConfigError for another type, shape or rate.
         """
-        self._pushed("hear").hear(pcm, rate_hz)
+        self._pushed("hear").voice.hear(pcm, rate_hz)
 
     def see(self, face: FaceFrame | Floats | None) -> None:
         """The person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms. Never blocks.
 
         Raises ConfigError for another shape.
         """
-        self._pushed("see").see(face)
+        self._pushed("see").sight.see(face)
 
     def say(self, pcm: Pcm, rate_hz: float) -> None:
         """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
 
         Play it one frame (40 ms) after it is handed over. Up to two minutes may wait. Never blocks.
         """
-        self._pushed("say").say(pcm, rate_hz)
+        self._pushed("say").speech.say(pcm, rate_hz)
 
-    def _pushed(self, what: str) -> PushSource:
-        if self._push is None:
+    def _pushed(self, what: str) -> _PushedPerson:
+        if self._person is None:
             raise InputError(f'{what}() needs audio="push"; this robot listens to {self._hears!r}')
-        return self._push
+        return self._person
 
     # --- what the face shows ---
 
@@ -240,7 +252,7 @@ class Robot:
                 stack.callback(feed.close)
             return run(
                 self._options,
-                source=self._source,
+                source=self._source if self._person is None else self._person.source(),
                 feed=feed,
                 observers=[progress, self._events],
                 knobs=lambda _: lambda: self._knobs.now,

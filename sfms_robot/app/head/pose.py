@@ -17,7 +17,7 @@ from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.ports import Source, Tick
 from sfms_robot.runtime.feed import IDLE_FEED
 from sfms_robot.runtime.safety import EASE_S, Interrupt, smooth
 
@@ -136,10 +136,8 @@ class HeldFace:
         return (share[:, None] * self._face).astype(np.float32), None
 
 
-class NobodyThere:
+class NobodyThere(Source):
     """The empty source and the empty feed: nobody speaks, nobody listens."""
-
-    duration_s = None
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
         return ()
@@ -152,9 +150,6 @@ class NobodyThere:
 
     def statistics(self) -> Mapping[str, Any]:
         return IDLE_FEED
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 class Furthest:

@@ -1,0 +1,250 @@
+"""The grid of 40 ms: a voice, a sight and the robot's own voice, whatever each of them is, as one source.
+
+1. Frame i covers (i, i + 1) x 40 ms of loop time. Every index yields exactly one frame, in order: a listener counts.
+2. A frame is given as soon as its voice is whole. When that takes `ALLOWANCE_S` longer than the voice's latency it is
+   given without (an overrun: empty audio), and what comes of it after that is discarded. No frame waits for longer than
+   `LONGEST_WAIT_S`, for a plan looks only a third of a second ahead.
+3. The face is the newest one at or before the end of the frame, and none when that is older than `FACE_S`.
+4. What the robot says is told one frame early, as a program that speaks knows it: frame i carries the samples of frame
+   i + 1, for which a listener plans its lips while it hears frame i.
+5. What is not finite or not of the right shape is left out here, for everybody after: one NaN would stay with a
+   listener for good.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
+from sfms_robot.ports import Sight, Source, Voice
+from sfms_robot.signals.quantiles import Quantiles
+
+logger = logging.getLogger(__name__)
+
+ALLOWANCE_S: Final = 0.04
+LONGEST_WAIT_S: Final = 0.15
+FACE_S: Final = 0.25  # a face that is older counts as lost
+_EPS_FRAMES: Final = 1e-6
+_EPS_S: Final = 1e-6
+_NONE: Final = np.zeros(0, dtype=np.float32)
+
+
+class PairedSource:
+    """`ports.Source` of a voice and a sight; None for what there is not.
+
+    Args:
+        agent: what the robot itself says.
+        duration_s: length of the run; None: that of the voice, of the sight where there is no voice, and in any case
+            until the robot has said what it says.
+
+    Attributes:
+        duration_s: None for one without end.
+        latency_s: see `ports.Voice`.
+    """
+
+    def __init__(
+        self,
+        voice: Voice | None = None,
+        sight: Sight | None = None,
+        agent: Voice | None = None,
+        duration_s: float | None = None,
+    ) -> None:
+        if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
+            raise ConfigError(f"--duration = {duration_s:g}: a run lasts longer than 0 s")
+        self.duration_s = _length_s(voice, sight, agent) if duration_s is None else duration_s
+        self.latency_s = 0.0
+        self._voice, self._sight, self._agent = voice, sight, agent
+        self._judge = FrameJudge()
+        self._given = 0
+        self._overruns = 0
+        self._wait_ms = Quantiles()
+        self._face_age_ms = Quantiles()
+
+    def start(self, origin_s: float) -> None:
+        """Loop time 0 is `origin_s` of `time.monotonic`."""
+        for part in self._parts().values():
+            part.start(origin_s)
+
+    def read(self, now_s: float) -> Sequence[SpeakerFrame]:
+        """Frames that are due by `now_s` and whole, or waited for long enough; oldest first. Never blocks."""
+        until_s = now_s if self.duration_s is None else min(now_s, self.duration_s)
+        due = math.floor(until_s * FRAME_HZ + _EPS_FRAMES)
+        frames: list[SpeakerFrame] = []
+        while self._given < due:
+            heard = self._heard(self._given, now_s)
+            if heard is None:
+                break
+            frames.append(self._frame(self._given, heard))
+            self._given += 1
+        return frames
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Of the grid, and under `voice`, `face` and `agent_audio` what these tell of themselves.
+
+        frames, overruns (frames without the voice that should be in them), faces_lost (frames whose face was too old),
+        left_out (by what it was), wait_ms from the end of a frame until it was given, face_age_ms at the end of its
+        frame.
+        """
+        told: dict[str, Any] = {
+            "frames": self._given,
+            "overruns": self._overruns,
+            "left_out": dict(self._judge.left_out),
+        }
+        told["wait_ms"] = self._wait_ms.report(p50=50, p99=99)
+        if self._sight is not None:
+            told["faces_lost"] = self._given - len(self._face_age_ms)
+            told["face_age_ms"] = self._face_age_ms.report(p50=50, p99=99)
+        return told | {name: dict(part.statistics()) for name, part in self._parts().items()}
+
+    def close(self) -> None:
+        """Close all parts. Idempotent."""
+        for part in self._parts().values():
+            part.close()
+
+    def _parts(self) -> dict[str, Voice | Sight]:
+        parts = {"voice": self._voice, "face": self._sight, "agent_audio": self._agent}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def _heard(self, index: int, now_s: float) -> Floats | None:
+        """The voice of a frame, empty where it is given up; None: wait."""
+        waited_s = max(0.0, now_s - (index + 1) / FRAME_HZ)
+        heard: Floats | None = _NONE
+        if self._voice is not None:
+            heard, self.latency_s = self._voice.take(index), self._voice.latency_s
+            if heard is None and waited_s < min(self.latency_s + ALLOWANCE_S, LONGEST_WAIT_S) - _EPS_S:
+                return None
+        self._wait_ms.add(waited_s * 1e3)
+        if heard is None:
+            self._overruns += 1
+            return _NONE
+        return heard
+
+    def _frame(self, index: int, heard: Floats) -> SpeakerFrame:
+        time_s = (index + 1) / FRAME_HZ
+        sighting = None if self._sight is None else self._sight.at(time_s)
+        if sighting is not None:
+            age_s = time_s - sighting.face.time_s
+            if age_s > FACE_S + _EPS_S:
+                sighting = None
+            else:
+                self._face_age_ms.add(max(0.0, age_s * 1e3))
+        says = None if self._agent is None else self._agent.take(index + 1)
+        return self._judge.frame(index, heard, sighting, says)
+
+
+class JudgedSource:
+    """`ports.Source` around one that somebody else wrote: what it gives is judged, and put on the grid, as it comes."""
+
+    def __init__(self, inner: Source) -> None:
+        """Raises ConfigError for an object that is no source."""
+        if missing := [name for name in _SOURCE if not hasattr(inner, name)]:
+            raise ConfigError(f"{type(inner).__name__} lacks {', '.join(missing)}: derive it from sfms_robot.Source")
+        self.duration_s = inner.duration_s
+        self.latency_s = inner.latency_s
+        self._inner = inner
+        self._judge = FrameJudge()
+        self._given = 0
+
+    def start(self, origin_s: float) -> None:
+        self._inner.start(origin_s)
+
+    def read(self, now_s: float) -> Sequence[SpeakerFrame]:
+        """Raises what the inner source raises."""
+        frames: list[SpeakerFrame] = []
+        for given in self._inner.read(now_s):
+            seen = None if given.face is None else Sighting(given.face, given.attention, given.place_m)
+            frames.append(self._judge.frame(self._given, given.audio, seen, given.agent_audio))
+            self._given += 1
+        self.latency_s = self._inner.latency_s
+        return frames
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Frames so far, what was left out of them, and what the source tells of itself."""
+        return {"frames": self._given, "left_out": dict(self._judge.left_out), **self._inner.statistics()}
+
+    def close(self) -> None:
+        self._inner.close()
+
+
+_SOURCE: Final = ("duration_s", "latency_s", "start", "read", "statistics", "close")
+
+
+class FrameJudge:
+    """Makes frames of what may be anything: 640 finite samples or none, a finite face or none, on the grid.
+
+    Attributes:
+        left_out: of how many frames the voice, the face, the attention, the place or the robot's voice was left out;
+            each is named once in the log.
+    """
+
+    def __init__(self) -> None:
+        self.left_out: dict[str, int] = {}
+
+    def frame(self, index: int, heard: Floats, seen: Sighting | None, says: Floats | None) -> SpeakerFrame:
+        """Frame `index`, whatever times its parts tell."""
+        time_s = (index + 1) / FRAME_HZ
+        audio = self._samples(index, "voice", heard)
+        own_audio = None if says is None else self._samples(index, "robot's voice", says)
+        face = None if seen is None else self._face(index, seen.face)
+        if seen is None or face is None:
+            return SpeakerFrame(time_s, audio, None, own_audio)
+        attention, place_m = self._attention(index, seen.attention), self._place(index, seen.place_m)
+        return SpeakerFrame(time_s, audio, face, own_audio, attention, place_m)
+
+    def _samples(self, index: int, what: str, given: Floats) -> Floats:
+        samples = np.asarray(given, dtype=np.float32)
+        if samples.shape == (0,):
+            return samples
+        if samples.shape != (FRAME_SAMPLES,):
+            self._leave_out(index, what, f"shape {samples.shape}, not ({FRAME_SAMPLES},)")
+            return _NONE
+        if not np.isfinite(samples).all():
+            self._leave_out(index, what, "samples that are not finite")
+            return _NONE
+        clipped: Floats = np.clip(samples, -1.0, 1.0)
+        return clipped
+
+    def _face(self, index: int, face: FaceFrame) -> FaceFrame | None:
+        pose, shapes = np.asarray(face.pose, dtype=np.float32), np.asarray(face.blendshapes, dtype=np.float32)
+        jaw = None if face.jaw_rad is None else np.asarray(face.jaw_rad, dtype=np.float32)
+        if pose.shape != (6,) or shapes.shape != (len(BLENDSHAPES),) or (jaw is not None and jaw.shape != (3,)):
+            self._leave_out(index, "face", f"pose {pose.shape} and blendshapes {shapes.shape}, not (6,) and (52,)")
+            return None
+        if not all(np.isfinite(part).all() for part in (pose, shapes, *(() if jaw is None else (jaw,)))):
+            self._leave_out(index, "face", "values that are not finite")
+            return None
+        return FaceFrame((index + 1) / FRAME_HZ, pose, np.clip(shapes, 0.0, 1.0), jaw)
+
+    def _attention(self, index: int, attention: float | None) -> float | None:
+        if attention is None or math.isfinite(attention):
+            return None if attention is None else min(max(float(attention), 0.0), 1.0)
+        self._leave_out(index, "attention", "not finite")
+        return None
+
+    def _place(self, index: int, place_m: Floats | None) -> Floats | None:
+        if place_m is None:
+            return None
+        place = np.asarray(place_m, dtype=np.float32)
+        if place.shape == (3,) and np.isfinite(place).all():
+            return place
+        self._leave_out(index, "place", f"{place.tolist()} is no point")
+        return None
+
+    def _leave_out(self, index: int, what: str, why: str) -> None:
+        if what not in self.left_out:
+            logger.warning("source: frame %d: %s left out: %s (said once)", index, what, why)
+        self.left_out[what] = self.left_out.get(what, 0) + 1
+
+
+def _length_s(voice: Voice | None, sight: Sight | None, agent: Voice | None) -> float | None:
+    person = voice or sight
+    says_s = 0.0 if agent is None else agent.duration_s or 0.0
+    if person is None:
+        return says_s or None
+    return None if person.duration_s is None else max(person.duration_s, says_s)

@@ -1,0 +1,124 @@
+"""Kinds of voices and sights are found by name, imported when opened, and go together in every way."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import SpeakerFrame
+from sfms_robot.ports import Source
+from sfms_robot.sources.paired import LONGEST_WAIT_S
+from sfms_robot.sources.push import PushedSight, PushedVoice
+from sfms_robot.sources.recording import RecordedVoice
+from sfms_robot.sources.registry import SIGHTS, VOICES, check_source, open_source, source_kinds
+from sfms_robot.sources.speakers import shipped_speaker
+
+
+class Entry:
+    """The part of importlib's EntryPoint that is used."""
+
+    def __init__(self, name, value, loaded=None):
+        self.name, self.value, self.loaded = name, value, loaded
+
+    def load(self):
+        if self.loaded is None:
+            raise ImportError("no module named so")
+        return self.loaded
+
+
+class Own(Source):
+    closed = False
+
+    def read(self, now_s):
+        return [SpeakerFrame(0.0, np.zeros(0, dtype=np.float32))]
+
+    def close(self):
+        self.closed = True
+
+
+def kinds(**loaded):
+    return source_kinds([Entry(name, f"theirs:{name}", value) for name, value in loaded.items()])
+
+
+def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed():
+    inner, told = Own(), []
+    source = open_source("ear:left:2", kinds=kinds(ear=lambda argument: told.append(argument) or inner))
+    source.close()
+    assert told == ["left:2"] and inner.closed
+
+
+@pytest.mark.parametrize("audio", ["push", "katie", "none", "ear"])
+@pytest.mark.parametrize("face", ["push", "none", str(shipped_speaker("facegood_1114_3_16").face), "eye"])
+@pytest.mark.parametrize("agent_audio", ["katie", "none"])
+def test_any_voice_goes_with_any_face(audio, face, agent_audio):
+    theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
+    source = open_source(audio, face, 2.0, agent_audio=agent_audio, kinds=theirs)
+    source.start(0.0)
+    frames = source.read(2.0 + LONGEST_WAIT_S)
+    assert [frame.time_s for frame in frames] == [index / 25 for index in range(1, 51)]
+    assert all(len(frame.audio) == (640 if audio == "katie" else 0) for frame in frames)
+    assert all((frame.agent_audio is not None) == (agent_audio == "katie") for frame in frames)
+    source.close()
+
+
+def test_a_face_that_is_named_goes_without_the_default_voice():
+    assert open_source("default", "push").duration_s is None
+    assert open_source("default", "none").duration_s == pytest.approx(47.68)
+
+
+def test_a_recording_ends_a_run_also_beside_a_live_face_and_what_is_live_does_not():
+    assert open_source("katie", "push").duration_s == pytest.approx(18.36)
+    assert open_source("push", "auto", agent_audio="katie").duration_s is None
+
+
+def test_a_whole_source_brings_its_own_face():
+    inner = Own()
+    with pytest.raises(ConfigError, match="--face push: --audio ear brings its own"):
+        open_source("ear", "push", kinds=kinds(ear=lambda argument: inner))
+    assert inner.closed
+
+
+def test_a_face_is_no_voice_and_a_voice_no_face():
+    theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
+    with pytest.raises(ConfigError, match="--audio eye: theirs:eye gave a PushedSight, no voice or source"):
+        open_source("eye", kinds=theirs)
+    with pytest.raises(ConfigError, match="--face ear: theirs:ear gave a PushedVoice, no face"):
+        open_source("none", "ear", kinds=theirs)
+
+
+def test_what_was_opened_is_closed_when_the_next_cannot_be():
+    class Ear(RecordedVoice):
+        closed = False
+
+        def close(self):
+            self.closed = True
+
+    ear = Ear(np.zeros(640, dtype=np.float32))
+    with pytest.raises(ConfigError, match="--face broken: theirs:broken cannot be imported"):
+        open_source("ear", "broken", kinds=kinds(ear=lambda argument: ear, broken=None))
+    assert ear.closed
+
+
+def test_kinds_of_other_packages_are_imported_when_opened_and_never_replace_ours():
+    theirs = kinds(push=Own, broken=None)
+    assert theirs.voices["push"] is VOICES["push"] and theirs.sights["push"] is SIGHTS["push"]
+    check_source("broken", kinds=theirs)
+    with pytest.raises(ConfigError, match="--audio broken: theirs:broken cannot be imported: no module named so"):
+        open_source("broken", kinds=theirs)
+
+
+def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
+    code = (
+        "import sys; from sfms_robot.sources.registry import check_source\n"
+        "check_source('push', 'push')\n"
+        "sys.exit(bool({'numpy', 'soundfile', 'soxr'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    with pytest.raises(ConfigError, match="--audio nothing-so: no such file .mic, push, browser, FILE.wav"):
+        check_source("nothing-so")
+    with pytest.raises(ConfigError, match="--face nothing-so: no such file .live-link, vmc, webcam, push"):
+        check_source(face="nothing-so")
+    with pytest.raises(ConfigError, match="--agent-audio nothing-so: no such file .device, tcp, FILE.wav"):
+        check_source(agent_audio="nothing-so")
