@@ -10,7 +10,7 @@ import pytest
 import sfms_robot
 
 PACKAGE = Path(sfms_robot.__file__).parent
-BASE = {"errors", "frames", "ports", "signals", "data", "config", "ranges"}
+BASE = {"errors", "frames", "ports", "signals", "data", "config", "ranges", "child_process"}
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
 ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},

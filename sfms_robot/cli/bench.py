@@ -20,6 +20,7 @@ class Bench(StrEnum):
     memory = "memory"
     campaign = "campaign"
     fuzz = "fuzz"
+    webcam = "webcam"
 
 
 def bench(
@@ -36,8 +37,12 @@ def bench(
     """Measure: start of the command line, one bus tick, one retarget tick, one listener plan.
 
     'campaign' tries every fault on every family of servos, 'fuzz' random bytes; both end with exit code 1 when
-    something is not as it should be. They and 'memory' are not part of 'all'.
+    something is not as it should be. 'webcam' shows the webcam a face that is known. They and 'memory' are not part
+    of 'all'.
     """
+    if name is Bench.webcam:
+        _webcam(json)
+        return
     if name in (Bench.campaign, Bench.fuzz):
         _trial(name, minutes, json)
         return
@@ -50,6 +55,19 @@ def bench(
         from sfms_robot.cli.show import print_bench
 
         print_bench(result)
+
+
+def _webcam(json: bool) -> None:
+    from sfms_robot.app.bench import webcam
+    from sfms_robot.cli.show import print_rows
+
+    result = webcam.webcam()
+    if json:
+        print(json_module.dumps(result))
+        return
+    print_rows(webcam.table(result))
+    for name, ms in result["timings_ms"].items():
+        print(f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})")
 
 
 def _trial(name: Bench, minutes: float, json: bool) -> None:

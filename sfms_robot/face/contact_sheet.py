@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from sfms_robot.errors import ConfigError, MissingExtra
+from sfms_robot.face.drawing import BACKGROUND, add_head, add_renderer, load_vtk, look, open_window, save
 from sfms_robot.face.human import HumanHead, load_human
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
 
@@ -26,11 +26,9 @@ _CAPTION_PX: Final = 58
 _GAP_PX: Final = 8
 _TITLE_PX: Final = 62
 _PAPER: Final = (1.0, 1.0, 1.0)
-_BACKGROUND: Final = (0.905, 0.915, 0.925)
 _INK: Final = (0.16, 0.17, 0.20)
 _FAINT: Final = (0.45, 0.46, 0.49)
 _ACCENT: Final = (0.10, 0.38, 0.55)
-_COLLAR: Final = (0.23, 0.29, 0.36)
 
 _NOD_RAD: Final = np.radians(2.0)  # pitch below its own median of 1.6 s that shows as a nod
 _NOD_WINDOW_S: Final = 1.6
@@ -154,18 +152,18 @@ def render_sheet(
 
     talking: (N,) whether the speaker talks, told under each picture. Raises MissingExtra without vtk.
     """
-    vtk = _vtk()
+    vtk = load_vtk()
     instants = pick_instants(times_s, motion)
     wide, high = _CELL_PX[0] + _GAP_PX, _CELL_PX[1] + _CAPTION_PX
     size = (_COLUMNS * wide + _GAP_PX, -(-len(instants) // _COLUMNS) * high + _TITLE_PX)
-    window, head = _window(vtk, size), load_human()
-    paper = _renderer(vtk, window, (0, 0, 1, 1), _PAPER)
+    window, head = open_window(vtk, size), load_human()
+    paper = add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
     _text(vtk, paper, title, (_GAP_PX + 4, size[1] - 42), 24, _INK, bold=True)
     for index, instant in enumerate(instants):
         left = _GAP_PX + index % _COLUMNS * wide
         low = size[1] - _TITLE_PX - index // _COLUMNS * high - _CELL_PX[1]
         box = (left / size[0], low / size[1], (left + _CELL_PX[0]) / size[0], (low + _CELL_PX[1]) / size[1])
-        _add_head(vtk, _renderer(vtk, window, box, _BACKGROUND), head, motion[instant.row])
+        _add_portrait(vtk, add_renderer(vtk, window, box, BACKGROUND), head, motion[instant.row])
         _text(vtk, paper, f"{instant.time_s:.2f} s", (left + 4, low - 26), 19, _INK, bold=True)
         _text(vtk, paper, instant.label, (left + 96, low - 26), 19, _ACCENT, bold=instant.label != "-")
         if talking is not None:
@@ -177,133 +175,22 @@ def render_sheet(
                 14,
                 _FAINT,
             )
-    _save(vtk, window, file)
+    save(vtk, window, file)
     return instants
 
 
 def render_head(file: Path | str, motion: Floats, size_px: tuple[int, int] = (640, 640)) -> None:
     """Draw one face, motion (58,), as a PNG. Raises MissingExtra without vtk."""
-    vtk = _vtk()
-    window = _window(vtk, size_px)
-    _add_head(vtk, _renderer(vtk, window, (0, 0, 1, 1), _BACKGROUND), load_human(), motion)
-    _save(vtk, window, file)
+    vtk = load_vtk()
+    window = open_window(vtk, size_px)
+    _add_portrait(vtk, add_renderer(vtk, window, (0, 0, 1, 1), BACKGROUND), load_human(), motion)
+    save(vtk, window, file)
 
 
-def _vtk() -> Any:
-    """The parts of vtk that are used. Importing the whole takes a second more."""
-    try:
-        import vtkmodules.vtkRenderingFreeType
-        import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
-        from vtkmodules import (
-            vtkCommonCore,
-            vtkCommonDataModel,
-            vtkFiltersCore,
-            vtkIOImage,
-            vtkRenderingCore,
-        )
-        from vtkmodules.util import numpy_support
-    except ImportError as error:
-        raise MissingExtra.of("a picture of the head", "pictures") from error
-    vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # no display is no warning
-    names: dict[str, Any] = {"arrays": numpy_support}
-    for module in (vtkCommonCore, vtkCommonDataModel, vtkFiltersCore, vtkIOImage, vtkRenderingCore):
-        names |= {name.removeprefix("vtk"): getattr(module, name) for name in dir(module) if name.startswith("vtk")}
-    return type("Vtk", (), names)
-
-
-def _window(vtk: Any, size_px: tuple[int, int]) -> Any:
-    window = vtk.RenderWindow()
-    window.SetOffScreenRendering(True)
-    window.SetMultiSamples(8)
-    window.SetSize(*size_px)
-    return window
-
-
-def _renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], color: Any) -> Any:
-    renderer = vtk.Renderer()
-    renderer.SetViewport(*box)
-    renderer.SetBackground(*color)
-    window.AddRenderer(renderer)
-    return renderer
-
-
-def _add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
-    """The head at one instant, its collar, three lights, and a camera a little to its left."""
-    skin = _actor(vtk, head.vertices(motion), head.triangles)
-    colors = vtk.arrays.numpy_to_vtk(head.colors, deep=True)
-    skin.GetMapper().GetInput().GetPointData().SetScalars(colors)
-    skin.GetProperty().SetSpecular(0.12)
-    skin.GetProperty().SetSpecularPower(18)
-    renderer.AddActor(skin)
-    collar = _actor(vtk, *_collar())
-    collar.GetProperty().SetColor(*_COLLAR)
-    renderer.AddActor(collar)
-    for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
-        light = vtk.Light()
-        light.SetLightTypeToSceneLight()
-        light.SetPosition(*place)
-        light.SetFocalPoint(0, 0, 0)
-        light.SetIntensity(strength)
-        renderer.AddLight(light)
-    camera = renderer.GetActiveCamera()
-    camera.SetViewAngle(16.4)
-    camera.SetFocalPoint(0.012, 0, 0.008)
-    camera.SetPosition(1.07, 0.36, 0.07)
-    camera.SetViewUp(0, 0, 1)
-    renderer.ResetCameraClippingRange()
-
-
-def _actor(vtk: Any, vertices: Floats, triangles: NDArray[np.int64]) -> Any:
-    """A smooth-shaded mesh: vertices (V, 3), triangles (T, 3)."""
-    mesh, points, cells = vtk.PolyData(), vtk.Points(), vtk.CellArray()
-    points.SetData(vtk.arrays.numpy_to_vtk(np.ascontiguousarray(vertices, dtype=np.float32), deep=True))
-    corners = np.ascontiguousarray(triangles, dtype=np.int64).ravel()
-    starts = np.arange(0, len(corners) + 1, 3, dtype=np.int64)
-    cells.SetData(
-        vtk.arrays.numpy_to_vtkIdTypeArray(starts, deep=True), vtk.arrays.numpy_to_vtkIdTypeArray(corners, deep=True)
-    )
-    mesh.SetPoints(points)
-    mesh.SetPolys(cells)
-    normals = vtk.PolyDataNormals()
-    normals.SetInputData(mesh)
-    normals.SplittingOff()
-    normals.ConsistencyOff()
-    normals.Update()
-    mesh.GetPointData().SetNormals(normals.GetOutput().GetPointData().GetNormals())
-    mapper, actor = vtk.PolyDataMapper(), vtk.Actor()
-    mapper.SetInputData(mesh)
-    actor.SetMapper(mapper)
-    actor.GetProperty().SetInterpolationToPhong()
-    return actor
-
-
-def _collar(around: int = 64) -> tuple[Floats, NDArray[np.int64]]:
-    """A roll-neck that hides the cut edge of the neck: rings of centre x, height z, half width, half depth."""
-    rings = (
-        (-0.012, -0.100, 0.050, 0.046),
-        (-0.012, -0.084, 0.054, 0.051),
-        (-0.012, -0.082, 0.059, 0.056),
-        (-0.012, -0.090, 0.064, 0.061),
-        (-0.012, -0.112, 0.066, 0.063),
-        (-0.014, -0.124, 0.078, 0.066),
-        (-0.018, -0.140, 0.125, 0.078),
-        (-0.020, -0.165, 0.190, 0.090),
-        (-0.020, -0.250, 0.215, 0.095),
-    )
-    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    # The neck leans forward: the rim is lower in front than behind.
-    points = [
-        np.stack([x + depth * np.cos(angle), width * np.sin(angle), z - 0.012 * np.cos(angle)], axis=1)
-        for x, z, width, depth in rings
-    ]
-    here = np.arange(around)
-    there = (here + 1) % around
-    triangles = []
-    for ring in range(len(rings) - 1):
-        a, b = ring * around, (ring + 1) * around
-        triangles += [np.stack([a + here, b + here, b + there], axis=1)]
-        triangles += [np.stack([a + here, b + there, a + there], axis=1)]
-    return np.concatenate(points).astype(np.float32), np.concatenate(triangles)
+def _add_portrait(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
+    """The head, seen from a little to its left."""
+    add_head(vtk, renderer, head, motion)
+    look(renderer, (1.07, 0.36, 0.07), (0.012, 0.0, 0.008), 16.4)
 
 
 def _text(
@@ -318,15 +205,3 @@ def _text(
     style.SetColor(*color)
     style.SetBold(bold)
     renderer.AddViewProp(actor)
-
-
-def _save(vtk: Any, window: Any, file: Path | str) -> None:
-    if not Path(file).parent.is_dir():
-        raise ConfigError(f"{file}: cannot be written: no folder {Path(file).parent}")
-    window.Render()
-    image, writer = vtk.WindowToImageFilter(), vtk.PNGWriter()
-    image.SetInput(window)
-    image.ReadFrontBufferOff()
-    writer.SetFileName(str(file))
-    writer.SetInputConnection(image.GetOutputPort())
-    writer.Write()

@@ -1,8 +1,7 @@
 """A listener in a process of its own: the same `step`, frames one way, plans the other, over two pipes.
 
 In one process torch and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
-model and its threads (cores - 1), and the servo process never loads torch. The child is a plain interpreter, not a
-copy of this program: a script, a notebook and a thread may all start it. It ends when its pipe does, so it never
+model and its threads (cores - 1), and the servo process never loads torch. It ends when its pipe does, so it never
 outlives its parent, whatever killed that.
 
 The child says of every frame that it is done. One that is silent for `HUNG_S` is named as hung; after `RESTART_S`, or
@@ -30,14 +29,13 @@ import logging
 import os
 import pickle
 import queue
-import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import IO, Any, Final
 
+from sfms_robot.child_process import end_child, start_child, take_pipes
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
@@ -183,11 +181,7 @@ class _Child:
     """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
 
     def __init__(self, name: str, seed: int) -> None:
-        command = [sys.executable, "-c", "from sfms_robot.listeners.process import main; main()"]
-        # In a session of its own, so that Ctrl-C is the parent's alone: the head must reach rest first.
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, env=_environment()
-        )
+        self._process = start_child("sfms_robot.listeners.process:main")
         self._frames: deque[Any] = deque([(name, seed)])
         self._changed = threading.Condition()
         self._messages: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
@@ -223,11 +217,7 @@ class _Child:
         with self._changed:
             self._closing = True
             self._changed.notify()
-        try:
-            self._process.wait(CLOSE_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()  # also one that is stopped
-            self._process.wait()
+        end_child(self._process, CLOSE_LIMIT_S)
 
     def _write(self) -> None:
         pipe = self._process.stdin
@@ -258,12 +248,6 @@ class _Child:
                 self.ended = True
 
 
-def _environment() -> dict[str, str]:
-    """Where the child finds this package: wherever this process did."""
-    paths = [path for path in sys.path if path]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-
-
 def threads() -> int:
     """Of torch in the child: one core is the servo loop's."""
     return max(1, (os.cpu_count() or 2) - 1)
@@ -274,8 +258,7 @@ def threads() -> int:
 
 def main() -> None:
     """Load what the first message names, then listen until the pipe ends."""
-    plans, frames = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")
-    os.dup2(2, 1)  # whatever a library prints goes to stderr
+    frames, plans = take_pipes()
     inbox = Inbox()
     try:
         name, seed = pickle.load(frames)

@@ -1,0 +1,152 @@
+"""How the virtual head is drawn, off-screen, by vtk (extra `pictures`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.errors import ConfigError, MissingExtra
+from sfms_robot.face.human import HumanHead
+from sfms_robot.frames import Floats
+
+BACKGROUND: Final = (0.905, 0.915, 0.925)
+_COLLAR: Final = (0.23, 0.29, 0.36)
+
+
+def load_vtk() -> Any:
+    """The parts of vtk that are used. Importing the whole takes a second more. Raises MissingExtra without it."""
+    try:
+        import vtkmodules.vtkRenderingFreeType
+        import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
+        from vtkmodules import (
+            vtkCommonCore,
+            vtkCommonDataModel,
+            vtkFiltersCore,
+            vtkIOImage,
+            vtkRenderingCore,
+        )
+        from vtkmodules.util import numpy_support
+    except ImportError as error:
+        raise MissingExtra.of("a picture of the head", "pictures") from error
+    vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # no display is no warning
+    names: dict[str, Any] = {"arrays": numpy_support}
+    for module in (vtkCommonCore, vtkCommonDataModel, vtkFiltersCore, vtkIOImage, vtkRenderingCore):
+        names |= {name.removeprefix("vtk"): getattr(module, name) for name in dir(module) if name.startswith("vtk")}
+    return type("Vtk", (), names)
+
+
+def open_window(vtk: Any, size_px: tuple[int, int]) -> Any:
+    window = vtk.RenderWindow()
+    window.SetOffScreenRendering(True)
+    window.SetMultiSamples(8)
+    window.SetSize(*size_px)
+    return window
+
+
+def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], color: Any) -> Any:
+    renderer = vtk.Renderer()
+    renderer.SetViewport(*box)
+    renderer.SetBackground(*color)
+    window.AddRenderer(renderer)
+    return renderer
+
+
+def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
+    """The head at one instant, its collar and three lights."""
+    skin = _actor(vtk, head.vertices(motion), head.triangles)
+    colors = vtk.arrays.numpy_to_vtk(head.colors, deep=True)
+    skin.GetMapper().GetInput().GetPointData().SetScalars(colors)
+    skin.GetProperty().SetSpecular(0.12)
+    skin.GetProperty().SetSpecularPower(18)
+    renderer.AddActor(skin)
+    collar = _actor(vtk, *_collar())
+    collar.GetProperty().SetColor(*_COLLAR)
+    renderer.AddActor(collar)
+    for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
+        light = vtk.Light()
+        light.SetLightTypeToSceneLight()
+        light.SetPosition(*place)
+        light.SetFocalPoint(0, 0, 0)
+        light.SetIntensity(strength)
+        renderer.AddLight(light)
+
+
+Point = tuple[float, float, float]
+
+
+def look(renderer: Any, from_m: Point, to_m: Point, angle_deg: float) -> None:
+    """The camera, in the axes of the head at rest; `angle_deg` is what it sees across the height of the picture."""
+    camera = renderer.GetActiveCamera()
+    camera.SetViewAngle(angle_deg)
+    camera.SetFocalPoint(*to_m)
+    camera.SetPosition(*from_m)
+    camera.SetViewUp(0, 0, 1)
+    renderer.ResetCameraClippingRange()
+
+
+def _actor(vtk: Any, vertices: Floats, triangles: NDArray[np.int64]) -> Any:
+    """A smooth-shaded mesh: vertices (V, 3), triangles (T, 3)."""
+    mesh, points, cells = vtk.PolyData(), vtk.Points(), vtk.CellArray()
+    points.SetData(vtk.arrays.numpy_to_vtk(np.ascontiguousarray(vertices, dtype=np.float32), deep=True))
+    corners = np.ascontiguousarray(triangles, dtype=np.int64).ravel()
+    starts = np.arange(0, len(corners) + 1, 3, dtype=np.int64)
+    cells.SetData(
+        vtk.arrays.numpy_to_vtkIdTypeArray(starts, deep=True), vtk.arrays.numpy_to_vtkIdTypeArray(corners, deep=True)
+    )
+    mesh.SetPoints(points)
+    mesh.SetPolys(cells)
+    normals = vtk.PolyDataNormals()
+    normals.SetInputData(mesh)
+    normals.SplittingOff()
+    normals.ConsistencyOff()
+    normals.Update()
+    mesh.GetPointData().SetNormals(normals.GetOutput().GetPointData().GetNormals())
+    mapper, actor = vtk.PolyDataMapper(), vtk.Actor()
+    mapper.SetInputData(mesh)
+    actor.SetMapper(mapper)
+    actor.GetProperty().SetInterpolationToPhong()
+    return actor
+
+
+def _collar(around: int = 64) -> tuple[Floats, NDArray[np.int64]]:
+    """A roll-neck that hides the cut edge of the neck: rings of centre x, height z, half width, half depth."""
+    rings = (
+        (-0.012, -0.100, 0.050, 0.046),
+        (-0.012, -0.084, 0.054, 0.051),
+        (-0.012, -0.082, 0.059, 0.056),
+        (-0.012, -0.090, 0.064, 0.061),
+        (-0.012, -0.112, 0.066, 0.063),
+        (-0.014, -0.124, 0.078, 0.066),
+        (-0.018, -0.140, 0.125, 0.078),
+        (-0.020, -0.165, 0.190, 0.090),
+        (-0.020, -0.250, 0.215, 0.095),
+    )
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    # The neck leans forward: the rim is lower in front than behind.
+    points = [
+        np.stack([x + depth * np.cos(angle), width * np.sin(angle), z - 0.012 * np.cos(angle)], axis=1)
+        for x, z, width, depth in rings
+    ]
+    here = np.arange(around)
+    there = (here + 1) % around
+    triangles = []
+    for ring in range(len(rings) - 1):
+        a, b = ring * around, (ring + 1) * around
+        triangles += [np.stack([a + here, b + here, b + there], axis=1)]
+        triangles += [np.stack([a + here, b + there, a + there], axis=1)]
+    return np.concatenate(points).astype(np.float32), np.concatenate(triangles)
+
+
+def save(vtk: Any, window: Any, file: Path | str) -> None:
+    if not Path(file).parent.is_dir():
+        raise ConfigError(f"{file}: cannot be written: no folder {Path(file).parent}")
+    window.Render()
+    image, writer = vtk.WindowToImageFilter(), vtk.PNGWriter()
+    image.SetInput(window)
+    image.ReadFrontBufferOff()
+    writer.SetFileName(str(file))
+    writer.SetInputConnection(image.GetOutputPort())
+    writer.Write()

@@ -1,0 +1,210 @@
+"""The webcam's own process: pictures in, one face out. No picture is kept, none leaves this process.
+
+MediaPipe (extra `webcam`) finds up to three faces in each picture; the person among them is chosen here (`choose`). A
+picture's time is when the driver says that it was taken, where it says so on this computer's clock, else when it came.
+A recorded video is played at its own pace from the moment on that it is told; what cannot be kept up with is left out.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import time
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError, MissingExtra, PortError
+from sfms_robot.sources.face_choice import Choice, choose
+from sfms_robot.sources.mediapipe_face import SeenFace, seen_face
+
+MOST_FACES: Final = 3
+_PICTURE_PX: Final = (640, 480)  # asked of a camera; more shows nothing new of a face at arm's length
+_DARK: Final = 16  # mean of 0..255: a lens that is covered, a room without light
+_OLDEST_S: Final = 0.5  # a driver's time stamp that is further away is of another clock
+_ALIVE_S: Final = 0.02
+
+Picture = NDArray[np.uint8]  # (H, W, 3) red, green, blue
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The first message. `duration_s`: of a recorded video; None for a camera."""
+
+    duration_s: float | None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One picture.
+
+    Attributes:
+        taken_s, known_s: when it was taken, and when its face was known; `time.monotonic`.
+        face: of the person, or None.
+        others: faces besides.
+        dark: the picture was black.
+    """
+
+    taken_s: float
+    known_s: float
+    face: SeenFace | None
+    others: int
+    dark: bool
+
+
+class Landmarker:
+    """MediaPipe's Face Landmarker over a stream of pictures. Creating one takes a second. Raises MissingExtra."""
+
+    def __init__(self, most_faces: int = MOST_FACES) -> None:
+        need_extra()
+        import mediapipe
+        from mediapipe.tasks.python import BaseOptions, vision
+
+        self._mediapipe = mediapipe
+        model = data_dir("sim") / "face_landmarker" / "face_landmarker.task"
+        self._landmarker = vision.FaceLandmarker.create_from_options(
+            vision.FaceLandmarkerOptions(
+                base_options=BaseOptions(model_asset_path=str(model)),
+                running_mode=vision.RunningMode.VIDEO,
+                num_faces=most_faces,
+                output_face_blendshapes=True,
+                output_facial_transformation_matrixes=True,
+            )
+        )
+        self._last_ms = -1
+
+    def faces(self, picture: Picture, taken_s: float) -> list[SeenFace]:
+        """Faces in the next picture of the stream."""
+        self._last_ms = max(self._last_ms + 1, round(taken_s * 1e3))  # it refuses a time that does not grow
+        image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=picture)
+        found = self._landmarker.detect_for_video(image, self._last_ms)
+        return [
+            seen_face(matrix, {shape.category_name: shape.score for shape in shapes})
+            for matrix, shapes in zip(found.facial_transformation_matrixes, found.face_blendshapes, strict=True)
+        ]
+
+    def close(self) -> None:
+        self._landmarker.close()
+
+
+def watch(argument: str) -> Generator[Opened | Seen | None, float | None, None]:
+    """What a camera (its number) or a recorded video (its file) shows; see `sources.worker`.
+
+    It looks from the moment on that it is told when loop time 0 is, where a video begins. Raises MissingExtra,
+    ConfigError for a file that is no video, PortError for a camera that cannot be opened or that goes away.
+    """
+    need_extra()
+    video = None if argument.isdigit() else argument
+    capture = open_video(argument) if video else open_camera(int(argument))
+    taken = None if video else live(capture, argument)
+    with closing(Landmarker()) as landmarker:
+        begins_s = yield Opened(_duration_s(capture) if video else None)
+        while begins_s is None:
+            if taken is None:
+                time.sleep(_ALIVE_S)
+            else:
+                next(taken)
+            begins_s = yield None
+        before: Choice | None = None
+        for taken_s, picture in taken or played(capture, begins_s):
+            if picture is None:
+                yield None
+                continue
+            faces = landmarker.faces(picture, taken_s)
+            index, before = choose([face.place_m for face in faces], taken_s, before)
+            face = None if index is None else faces[index]
+            dark = not faces and float(picture.mean()) < _DARK
+            yield Seen(taken_s, time.monotonic(), face, len(faces) - (face is not None), dark)
+
+
+def need_extra() -> None:
+    """Raises MissingExtra without MediaPipe."""
+    if importlib.util.find_spec("mediapipe") is None:
+        raise MissingExtra.of("--face webcam", "webcam")
+
+
+def open_camera(number: int) -> Any:
+    """Camera `number` of this computer. Raises PortError with the reason, as far as it can be told."""
+    import cv2
+
+    capture = cv2.VideoCapture(number)
+    if not capture.isOpened():
+        raise PortError(f"--face webcam: no camera {number} ({_why_not(number)})")
+    for key, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), _PICTURE_PX, strict=True):
+        capture.set(key, value)
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old pictures are of no use
+    return capture
+
+
+def open_video(file: str) -> Any:
+    """A recorded video. Raises ConfigError for a file that is none."""
+    import cv2
+
+    capture = cv2.VideoCapture(file)
+    if not capture.isOpened() or not capture.get(cv2.CAP_PROP_FPS) > 0:
+        raise ConfigError(f"--face webcam:{file}: not a video that can be played")
+    return capture
+
+
+def live(capture: Any, name: str) -> Iterator[tuple[float, Picture]]:
+    """Pictures of a camera and when they were taken. Raises PortError when it goes away."""
+    import cv2
+
+    while True:
+        if not capture.grab():
+            raise PortError(f"camera {name} went away")
+        came_s = time.monotonic()
+        stamped_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+        found, picture = capture.retrieve()
+        if found:
+            yield stamped_s if 0 <= came_s - stamped_s < _OLDEST_S else came_s, _rgb(picture)
+
+
+def played(capture: Any, begins_s: float) -> Iterator[tuple[float, Picture | None]]:
+    """Pictures of a video at their own pace, those that are late left out; None while the next one is to come."""
+    import cv2
+
+    period_s = 1.0 / capture.get(cv2.CAP_PROP_FPS)
+    number = 0
+    while capture.grab():
+        due_s, number = begins_s + number * period_s, number + 1
+        if time.monotonic() - due_s > period_s:
+            continue
+        while (wait_s := due_s - time.monotonic()) > 0:
+            yield due_s, None
+            time.sleep(min(wait_s, _ALIVE_S))
+        found, picture = capture.retrieve()
+        if found:
+            yield due_s, _rgb(picture)
+
+
+def _rgb(picture: Any) -> Picture:
+    import cv2
+
+    out: Picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return out
+
+
+def _duration_s(capture: Any) -> float | None:
+    """None where the file does not tell."""
+    import cv2
+
+    pictures = float(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    return pictures / float(capture.get(cv2.CAP_PROP_FPS)) if pictures > 0 else None
+
+
+def _why_not(number: int) -> str:
+    """Linux tells cameras by their device files."""
+    device = Path(f"/dev/video{number}")
+    if device.exists():
+        if not os.access(device, os.R_OK | os.W_OK):
+            return f"no permission for {device}: sudo usermod -aG video $USER, then log in again"
+        return f"{device} is there: another program may hold it, or it gives no pictures"
+    others = sorted(path.name.removeprefix("video") for path in Path("/dev").glob("video[0-9]*"))
+    return f"there are {', '.join(others)}" if others else "none is plugged in"

@@ -1,0 +1,180 @@
+"""`--face webcam`: what is told of a picture, when, and what is said where there is no camera."""
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scripted_worker import shows
+
+from sfms_robot.app.bench.webcam import face_of, webcam, write_video
+from sfms_robot.errors import ConfigError, MissingExtra, PortError
+from sfms_robot.face.virtual_webcam import VirtualWebcam
+from sfms_robot.sources.mediapipe_face import SeenFace
+from sfms_robot.sources.webcam import Webcam, open_webcam
+from sfms_robot.sources.webcam_worker import Landmarker, Opened, Seen, live, open_video, played, watch
+from sfms_robot.sources.worker import SourceWorker
+
+ORIGIN_S = 1000.0
+PLACE_M = np.array([0.6, 0.0, 0.0], np.float32)
+FACE = SeenFace(face_of(pitch=0.1), PLACE_M)
+
+
+def seen(time_s, face=FACE, others=0, dark=False):
+    """A picture of loop time `time_s`, known 20 ms later."""
+    return Seen(ORIGIN_S + time_s, ORIGIN_S + time_s + 0.02, face, others, dark)
+
+
+@pytest.fixture
+def camera():
+    """A webcam that has sent these messages."""
+    opened = []
+
+    def of(*messages):
+        worker = SourceWorker("webcam 0", shows, messages, silent_s=1e12)
+        opened.append(worker)
+        while len(worker._child.messages) < len(messages):
+            worker._child.arrived.wait(0.1)
+        return Webcam(worker, None)
+
+    yield of
+    for worker in opened:
+        worker.close()
+
+
+def test_the_newest_face_at_or_before_is_told_however_old(camera):
+    looking = camera(seen(0.02), seen(0.05), seen(0.09))
+    looking.start(ORIGIN_S)
+    assert looking.at(0.01) is None
+    assert looking.at(0.04).face.time_s == pytest.approx(0.02)
+    assert looking.at(0.1).face.time_s == pytest.approx(0.09)
+    assert looking.at(5.0).face.time_s == pytest.approx(0.09)
+    np.testing.assert_array_equal(looking.at(5.0).place_m, PLACE_M)
+    assert looking.at(5.0).attention is None
+    assert looking.latency_s == pytest.approx(0.02)
+
+
+def test_nothing_is_told_before_the_start_and_nothing_that_was_seen_before_it(camera):
+    looking = camera(seen(-0.5))
+    assert looking.at(0.0) is None
+    looking.start(ORIGIN_S)
+    assert looking.at(1.0) is None and looking.statistics()["pictures"] == 0
+    assert looking.latency_s == 0.0
+
+
+def test_what_was_not_seen_is_counted(camera):
+    looking = camera(seen(0.1), seen(0.2, None), seen(0.3, None, dark=True), seen(0.4, others=2))
+    looking.start(ORIGIN_S)
+    looking.at(0.35)
+    told = looking.statistics()
+    assert {key: told[key] for key in ("pictures", "without_face", "dark", "with_others")} == {
+        "pictures": 4, "without_face": 2, "dark": 1, "with_others": 1,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("argument", "error", "text"),
+    [
+        ("nobody.avi", ConfigError, r"--face webcam:nobody\.avi: no such file, nor the number of a camera"),
+        (__file__, ConfigError, "not a video that can be played"),
+        ("97", PortError, r"--face webcam: no camera 97 \((there are|none is plugged in)"),
+    ],
+)
+def test_what_cannot_be_opened_is_one_line(argument, error, text):
+    with pytest.raises(error, match=text) as raised:
+        open_webcam(argument)
+    assert "\n" not in str(raised.value)
+
+
+def test_without_the_extra_the_install_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mediapipe", None)
+    with pytest.raises(MissingExtra, match=r"--face webcam needs .*pip install 'sfms-robot\[webcam\]'"):
+        next(watch("0"))
+
+
+@pytest.fixture
+def grey_video(tmp_path):
+    file = tmp_path / "grey.avi"
+    write_video(file, [np.full((48, 64, 3), 40 * k, np.uint8) for k in range(5)], 10)
+    return str(file)
+
+
+def test_a_camera_that_gives_no_more_pictures_went_away(grey_video):
+    pictures = live(open_video(grey_video), "3")
+    means = [next(pictures)[1].mean() for _ in range(5)]
+    assert means == sorted(means)
+    with pytest.raises(PortError, match="camera 3 went away"):
+        next(pictures)
+
+
+def test_a_video_waits_for_its_time_and_leaves_out_what_is_late(grey_video):
+    due_s, nothing_yet = next(played(open_video(grey_video), time.monotonic() + 60.0))
+    assert nothing_yet is None and due_s > time.monotonic()
+    assert list(played(open_video(grey_video), time.monotonic() - 60.0)) == []
+
+
+def test_a_worker_says_what_it_opened_and_waits_to_be_told_when_to_begin(grey_video):
+    work = watch(grey_video)
+    assert next(work) == Opened(0.5)
+    assert work.send(None) is None
+    first = work.send(time.monotonic())
+    while first is None:
+        first = work.send(None)
+    work.close()
+    assert first.face is None and first.dark and first.others == 0
+
+
+def test_a_covered_lens_shows_no_face():
+    landmarker = Landmarker()
+    assert landmarker.faces(np.zeros((480, 640, 3), np.uint8), 0.0) == []
+    landmarker.close()
+
+
+# --- closed loop: the virtual human before the camera ---------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_channels_come_back_with_their_signs_and_on_their_side():
+    turns = ("roll", "pitch", "yaw", "x", "y", "z")
+    shapes = ("eyeBlinkLeft", "eyeBlinkRight", "eyeLookOutLeft", "eyeLookInLeft", "eyeLookUpLeft", "jawOpen")
+    pairs = (("mouthSmileLeft", "mouthSmileRight"), ("mouthLeft", "mouthRight"), ("browDownLeft", "browDownRight"))
+    result = webcam((*turns, *shapes, *sum(pairs, ())))
+    for name in (*turns, *shapes, "mouthSmileLeft", "mouthSmileRight", "mouthLeft", "mouthRight"):
+        row = result["channels"][name]
+        assert row["correlation"] > 0.9 and row["slope"] > 0.1, (name, row)
+    for name in turns[:3]:
+        assert 0.6 < result["channels"][name]["slope"] < 1.4
+    for axis in "xyz":
+        assert result["place"][axis]["slope"] > 0.5 and result["place"][axis]["correlation"] > 0.95
+    for left, right in pairs[:2]:
+        for name, other in ((left, right), (right, left)):
+            row = result["channels"][name]
+            assert row["with"] != other or row["with_slope"] < 0.7 * row["slope"]
+
+
+@pytest.mark.slow
+def test_a_recorded_video_is_played_from_the_start_on_in_its_own_process(tmp_path):
+    camera = VirtualWebcam()
+    still, nodding = camera.picture(face_of()), camera.picture(face_of(pitch=0.25, jawOpen=0.8))
+    file = tmp_path / "nod.avi"
+    write_video(file, [still] * 20 + [nodding] * 20, 20)
+    webcam = open_webcam(str(file))
+    try:
+        assert webcam.duration_s == pytest.approx(2.0)
+        origin_s = time.monotonic()
+        webcam.start(origin_s)
+        told = {}
+        while webcam.statistics()["state"] != "finished":
+            sighting = webcam.at(time.monotonic() - origin_s)
+            if sighting is not None:
+                told[sighting.face.time_s] = sighting.face.motion
+        child = Path(f"/proc/{webcam._worker._child.process.pid}/fd")
+        assert not [fd for fd in child.glob("*") if fd.is_symlink() and "socket" in str(fd.readlink())]
+    finally:
+        webcam.close()
+    times_s = np.array(sorted(told))
+    np.testing.assert_allclose(times_s * 20, np.round(times_s * 20), atol=1e-6)  # those of its pictures
+    pitch = np.array([told[at][1] for at in times_s])
+    assert pitch[times_s >= 1.1].mean() > pitch[times_s < 1.0].mean() + 0.1
+    assert webcam.latency_s > 0.0
