@@ -18,6 +18,7 @@ class Bench(StrEnum):
     lead = "lead"
     listener = "listener"
     memory = "memory"
+    own_voice = "own-voice"
     campaign = "campaign"
     fuzz = "fuzz"
     webcam = "webcam"
@@ -32,14 +33,22 @@ def bench(
         None, help="A folder with another installation: it becomes the peer, and the two run in turn."
     ),
     hours: float = typer.Option(4.0, min=0.1, help="For 'memory': virtual hours."),
+    data: Path | None = typer.Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
     json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
     """Measure: start of the command line, one bus tick, one retarget tick, one listener plan.
 
     'campaign' tries every fault on every family of servos, 'fuzz' random bytes; both end with exit code 1 when
-    something is not as it should be. 'webcam' shows the webcam a face that is known. They and 'memory' are not part
-    of 'all'.
+    something is not as it should be. 'webcam' shows the webcam a face that is known; 'own-voice' is what a head hears
+    while it speaks and moves. They and 'memory' are not part of 'all'.
     """
+    if data is not None and name is not Bench.own_voice:
+        from sfms_robot.errors import ConfigError
+
+        raise ConfigError(f"--data {data}: only 'bench own-voice' takes calls")
+    if name is Bench.own_voice:
+        _own_voice(data, json)
+        return
     if name is Bench.webcam:
         _webcam(json)
         return
@@ -68,6 +77,18 @@ def _webcam(json: bool) -> None:
     print_rows(webcam.table(result))
     for name, ms in result["timings_ms"].items():
         print(f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})")
+
+
+def _own_voice(folder: Path | None, json: bool) -> None:
+    from sfms_robot.app.bench import own_voice
+    from sfms_robot.cli.show import print_rows
+
+    result = own_voice.own_voice(folder)
+    if json:
+        print(json_module.dumps(result))
+        return
+    print_rows(own_voice.table(result))
+    print(f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms")
 
 
 def _trial(name: Bench, minutes: float, json: bool) -> None:

@@ -4,6 +4,7 @@
 |---|---|---|
 | startup.help, .wrong_port, .wrong_head | until the process is over | the same Python doing nothing |
 | startup.first_goal, .exit, .resident | `run` typed to first goal; last byte to the end; memory | the same |
+| own-voice | own voice taken for the person, person missed, in rooms, double talk and motor noise | what is so in truth |
 | memory.growth | resident memory that a run gains per virtual hour, after the first | resident memory after it |
 | bus.write, bus.tick | our sync write; write and read of a head, of each family (CPU time) | the vendor's own calls |
 | bus.cpu_share, bus.wire_use, bus.one_silent | of a core; of the line; ticks with one servo dead | the same |

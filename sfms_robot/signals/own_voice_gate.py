@@ -1,0 +1,137 @@
+"""What a head hears of a person while it speaks and moves itself: microphone in, frames of 40 ms for a listener out.
+
+    echo off -> speech probability -> is it more than own motors -> what nobody said is turned down
+
+A frame holds the person's voice when Silero hears speech in what echo cancellation left, and when it stands out of the
+noise that the motors make at this speed. Causal: a frame is judged by itself and what came before.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sfms_robot.errors import InputError
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
+from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
+from sfms_robot.signals.motor_noise import STILL_RAD_S, MotorNoise, total_speed
+from sfms_robot.signals.speech_probability import SpeechProbability
+
+BEGINS: Final = 0.5  # probability from which on somebody speaks
+GOES_ON: Final = 0.3  # and below which he has stopped
+HOLD_FRAMES: Final = 2  # a voice lasts so long over a dip
+EXCESS_DB: Final = 4.0  # over the motors, else it is they
+NOBODY: Final = 0.1  # probability below which motor noise is learned
+LEFT_DB: Final = -25.0  # after echo cancellation against before, while own voice is in the room: below it is echo
+LEFT_AT_FIRST_DB: Final = -6.0  # while the echo filter still learns the room
+LEARNING_FRAMES: Final = 100  # of own voice until it has
+ECHO_FRAMES: Final = 8  # for so long after its end own voice is still in the room
+OWN_VOICE_DB: Final = -60.0  # of full scale: a reference above it is heard
+REJECTED_GAIN: Final = 0.03  # -30 dB, for what is own voice or own motors
+_RAMP: Final = 160  # samples over which the gain changes
+_NONE: Final = np.zeros(0, np.float32)
+
+
+@dataclass(frozen=True)
+class HeardFrame:
+    """40 ms of what a person may have said.
+
+    Attributes:
+        audio: (640,) without echo; 30 dB down where own voice or own motors are all there is.
+        voice: the person speaks.
+        probability: 0..1, of speech of whomever, after echo cancellation.
+        mic_db, left_db, reference_db: levels of the microphone, after echo cancellation, of own voice.
+        excess_db: over the learned noise of the motors.
+    """
+
+    audio: Floats
+    voice: bool
+    probability: float
+    mic_db: float
+    left_db: float
+    reference_db: float
+    excess_db: float
+
+
+class OwnVoiceGate:
+    """Streams of any block size; frames and decisions do not depend on how they were cut. Memory is fixed.
+
+    `speaks`: the head has a voice of its own, so that there is a reference; frames are then `latency_s` = 8 ms late.
+    Without one the microphone passes as it is, at no latency. One instance belongs to one thread.
+    """
+
+    def __init__(self, speaks: bool = True) -> None:
+        self._echo = EchoCanceller() if speaks else None
+        self._speech = SpeechProbability()
+        self._motors = MotorNoise()
+        self._mic, self._reference, self._left = _NONE, _NONE, _NONE
+        self._probability = 0.0
+        self._hold = 0
+        self._echoes = 0
+        self._said_frames = 0
+        self._gain = 1.0
+
+    @property
+    def latency_s(self) -> float:
+        """From the microphone's sample to the same sample in a frame, the frame's own length not counted."""
+        return ECHO_LATENCY_SAMPLES / AUDIO_HZ if self._echo else 0.0
+
+    def push(self, mic: Floats, reference: Floats | None = None, speed_rad_s: ArrayLike = 0.0) -> list[HeardFrame]:
+        """The frames that (n,) more samples complete; blocks for less than a millisecond per 10 ms of sound.
+
+        mic (n,) float32 16 kHz, -1..1; reference (n,) what the loudspeaker is given at the same instants, or None for
+        silence; speed_rad_s, one number or (J,): commanded joint speeds, for every frame that these samples complete.
+        Raises InputError where the lengths differ, or where there is a reference and the gate was told of none.
+        """
+        said = np.zeros_like(mic) if reference is None else reference
+        if said.shape != mic.shape:
+            raise InputError(f"microphone and reference differ: {len(mic)} and {len(said)} samples")
+        if self._echo is None and reference is not None:
+            raise InputError("a reference for a gate that was made with speaks=False")
+        self._mic, self._reference = np.concatenate([self._mic, mic]), np.concatenate([self._reference, said])
+        left = self._echo.push(mic, said) if self._echo else mic
+        self._left = np.concatenate([self._left, left])
+        return [self._frame(speed_rad_s) for _ in range(len(self._left) // FRAME_SAMPLES)]
+
+    def _frame(self, speed_rad_s: ArrayLike) -> HeardFrame:
+        left, self._left = self._left[:FRAME_SAMPLES], self._left[FRAME_SAMPLES:]
+        mic, self._mic = self._mic[:FRAME_SAMPLES], self._mic[FRAME_SAMPLES:]
+        reference, self._reference = self._reference[:FRAME_SAMPLES], self._reference[FRAME_SAMPLES:]
+        reference_db = energy_db(reference)
+        self._probability = max(self._speech.push(left), default=self._probability)
+        self._echoes = ECHO_FRAMES if reference_db > OWN_VOICE_DB else max(0, self._echoes - 1)
+        excess_db = self._motors.excess_db(left, speed_rad_s)
+        self._said_frames += reference_db > OWN_VOICE_DB
+        mic_db, left_db = energy_db(mic), energy_db(left)
+        voice = self._judge(excess_db > EXCESS_DB and left_db - mic_db > self._least_left_db())
+        if self._probability < NOBODY and not voice and not self._echoes:
+            self._motors.learn(left, speed_rad_s)
+        own = self._echoes > 0 or total_speed(speed_rad_s) > STILL_RAD_S
+        audio = self._turn(left, REJECTED_GAIN if own and not voice else 1.0)
+        return HeardFrame(audio, voice, self._probability, mic_db, left_db, reference_db, excess_db)
+
+    def _least_left_db(self) -> float:
+        """How much of the microphone's level a person leaves at least: less is residual echo."""
+        if not self._echoes:
+            return -math.inf
+        return LEFT_AT_FIRST_DB if self._said_frames < LEARNING_FRAMES else LEFT_DB
+
+    def _judge(self, stands_out: bool) -> bool:
+        """Hysteresis and hold, so that a word does not fall apart."""
+        if self._probability > (GOES_ON if self._hold else BEGINS) and stands_out:
+            self._hold = HOLD_FRAMES
+        else:
+            self._hold = max(0, self._hold - 1)
+        return self._hold > 0
+
+    def _turn(self, left: Floats, gain: float) -> Floats:
+        """(640,) with the gain going from the last frame's to `gain` within 10 ms."""
+        ramp = np.linspace(self._gain, gain, _RAMP, endpoint=False) if gain != self._gain else np.full(_RAMP, gain)
+        self._gain = gain
+        out: Floats = (left * np.concatenate([ramp, np.full(FRAME_SAMPLES - _RAMP, gain)])).astype(np.float32)
+        return out

@@ -1,0 +1,37 @@
+"""A small version of `bench own-voice`."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.bench.acoustics import gear_noise
+from sfms_robot.app.bench.own_voice import CHOSEN_ON, Condition, call_names, own_voice
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+
+
+def test_calls_that_parameters_were_chosen_on_are_not_reported_on(tmp_path):
+    for name in (CHOSEN_ON[0], "other"):
+        (tmp_path / f"{name}_caller.flac").touch()
+    assert call_names(tmp_path) == ["other"]
+    assert len(call_names(data_dir("sim") / "conversations")) == 2
+    with pytest.raises(ConfigError, match="has no NAME_caller"):
+        call_names(tmp_path / "nothing")
+
+
+def test_motors_that_stand_are_silent():
+    speed = np.zeros((20, 2))
+    speed[10:, 0] = 1.0
+    noise = gear_noise(speed).reshape(20, 640)
+    assert not noise[:9].any() and (np.abs(noise[11:]).max(axis=1) > 0.01).all()
+
+
+@pytest.mark.slow
+def test_own_voice_is_not_the_person_and_the_person_is_heard():
+    pytest.importorskip("pyroomacoustics")
+    turns = Condition("office", 0.0, None, False)
+    over = Condition("office", 0.0, None, True)
+    result = own_voice(conditions=(turns, over), seconds=30.0)
+    in_turns, talking_over = result["conditions"]
+    assert result["echo_latency_ms"] <= 10.0
+    assert in_turns["own_voice_taken"] < 0.02 and in_turns["person_missed"] < 0.05
+    assert talking_over["own_voice_taken"] < 0.05 and talking_over["person_missed_in_double_talk"] < 0.15

