@@ -355,6 +355,11 @@ class RunOptions:
     without: tuple[str, ...] = field(default=())
 
     @property
+    def hears(self) -> str:
+        """`audio`, where "default" is the microphone for servos that are not emulated here."""
+        return "mic" if self.audio == "default" and self.port != SIM and not self.dry_run else self.audio
+
+    @property
     def servos(self) -> HeadOptions:
         """The head and its servos."""
         return HeadOptions(self.head, self.port, self.fast, self.yes or self.dry_run, self.without)
@@ -397,7 +402,7 @@ def run(
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         if source is None:
-            source = open_source(options.audio, options.face, options.duration_s, agent_audio=options.agent_audio)
+            source = open_source(options.hears, options.face, options.duration_s, agent_audio=options.agent_audio)
             stack.callback(source.close)
         duration_s = source.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
@@ -460,7 +465,7 @@ def _recorder(options: RunOptions, head: Head) -> Recorder | None:
         "head": head.name,
         "listener": Path(options.listener).name,
         "seed": str(options.seed),
-        "audio": Path(options.audio).name,
+        "audio": Path(options.hears).name,
     }
     when_full: FullPolicy = "wait" if options.fast else "drop"
     return Recorder(options.record, list(head.joints), when_full=when_full, about=about)

@@ -40,7 +40,7 @@ SIGHTS: Final = _ours(
     live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
     push="push:open_pushed_sight", browser="browser:open_browser_sight",
 )  # fmt: skip
-AGENT_VOICES: Final = _ours(device="loudspeaker:open_loudspeaker", tcp="tcp_audio:open_tcp_audio")
+AGENT_VOICES: Final = _ours(device="microphone:open_loudspeaker", tcp="tcp_audio:open_tcp_audio")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,12 @@ def open_source(
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     again = loop and duration_s is not None
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
-        voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed) or _recorded_voice(audio, again)
+        agent = None
+        if audio.partition(":")[0] == "mic" and agent_audio != "none":
+            voice, agent = _conversation(audio, agent_audio, known, failed)
+        else:
+            voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed)
+        voice = voice or _recorded_voice(audio, again)
         if voice is not None and hasattr(voice, _METHODS["source"]):
             for flag, value, free in (("--face", face, "auto"), ("--agent-audio", agent_audio, "none")):
                 if value not in (free, "none"):
@@ -100,8 +105,7 @@ def open_source(
         else:
             sight = _opened("--face", face, known.sights, ("face",), failed)
             sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
-            agent = _opened("--agent-audio", agent_audio, known.agent_voices, ("voice",), failed)
-            agent = agent or _recorded_voice(agent_audio, False)
+            agent = agent or _agent(agent_audio, known, failed)
             source = PairedSource(voice, sight, agent, duration_s)
         failed.pop_all()
     return source
@@ -136,6 +140,25 @@ def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed
     if not any(hasattr(part, _METHODS[each]) for each in wanted):
         raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {' or '.join(wanted)}")
     return part
+
+
+def _conversation(audio: str, agent_audio: str, known: SourceKinds, failed: ExitStack) -> tuple[Any, Any]:
+    """A microphone, and what the robot says: the one has to know of the other, whose echo it hears."""
+    from sfms_robot.sources.microphone import open_microphone_and_loudspeaker, open_microphone_beside
+
+    device, (kind, _, loudspeaker) = audio.partition(":")[2], agent_audio.partition(":")
+    both: tuple[Any, Any]
+    if kind == "device":
+        both = open_microphone_and_loudspeaker(device, loudspeaker)
+    else:
+        both = open_microphone_beside(device, _agent(agent_audio, known, failed))
+    failed.callback(both[0].close)
+    return both
+
+
+def _agent(value: str, known: SourceKinds, failed: ExitStack) -> Any:
+    agent = _opened("--agent-audio", value, known.agent_voices, ("voice",), failed)
+    return agent or _recorded_voice(value, False)
 
 
 def _recorded_voice(name: str, loop: bool) -> Any:
