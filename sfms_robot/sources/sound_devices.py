@@ -48,6 +48,11 @@ class SoundDevice:
         """What a person may type for it, number first where it has one of its own."""
         return self.name if self.server_source else f"{self.number} {self.name}"
 
+    @property
+    def monitor(self) -> bool:
+        """It records what a loudspeaker is given."""
+        return self.server_source is not None and self.server_source.endswith(".monitor")
+
     @contextmanager
     def selected(self) -> Iterator[None]:
         """What is opened in here by `number` is this device. Not for several threads."""
