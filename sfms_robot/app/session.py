@@ -392,6 +392,8 @@ def run(
     Raises RobotError before torque came on.
     """
     prepare_head(options.servos)
+    if options.fast and options.hears.partition(":")[0] == "mic":
+        raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
