@@ -2,6 +2,7 @@
 
 import copy
 import re
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -12,11 +13,22 @@ from sfms_robot.config.check import check_head
 from sfms_robot.config.life import Gaze, Idle
 from sfms_robot.config.mapping import Coupling, Fold
 from sfms_robot.config.schema import text
+from sfms_robot.config.yaml_file import read
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 
 GUIDE = (Path(__file__).parents[1] / "docs" / "heads.md").read_text(encoding="utf-8")
-EXAMPLES = [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", GUIDE, re.S)]
+
+
+def parsed(block: str):
+    """As the loader of heads has it: `on` is a text."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "block.yaml"
+        file.write_text(block, encoding="utf-8")
+        return read(file)
+
+
+EXAMPLES = [parsed(block) for block in re.findall(r"```yaml\n(.*?)```", GUIDE, re.S)]
 OWL = EXAMPLES[0]
 
 

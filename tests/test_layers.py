@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,16 @@ ALLOWED = {
     "cli": {"app", "config", "errors", "data", "cli"},
 }
 SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}
+
+# File names that stand more than once, each with the part that it plays for both families.
+SHARED_NAMES = {
+    "audio_frontend": "sound into features, of the SFMS and of the ARIG listener",
+    "model": "the network of SFMS, and that of ARIG",
+    "stream": "the listener that plans with SFMS, and that with ARIG",
+    "features": "what SFMS is trained on, and what ARIG is trained on",
+    "losses": "what SFMS learns by, and what ARIG learns by",
+    "registry": "the kinds of listeners, and those of sources",
+}
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
@@ -56,6 +67,11 @@ def test_module_imports_only_what_its_layer_may(module: Path) -> None:
         assert target[0] in ALLOWED[layer], f"{layer} may not import {'.'.join(target)}"
         if layer == "emulator" and target[0] == "servo":
             assert set(target[1:2]) <= SERVO_PARTS_FOR_THE_EMULATOR, f"emulator may not import {'.'.join(target)}"
+
+
+def test_no_two_files_share_a_name_unless_they_play_the_same_part_for_two_families() -> None:
+    names = Counter(module.stem for module in MODULES if module.stem != "__init__")
+    assert {name: count for name, count in names.items() if count > 1} == dict.fromkeys(SHARED_NAMES, 2)
 
 
 def test_every_layer_has_a_rule() -> None:

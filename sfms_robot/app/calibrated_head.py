@@ -9,7 +9,7 @@ import logging
 from collections.abc import Collection, Mapping
 from typing import Final
 
-from sfms_robot.app.servo.serial_line import Seen, Wire
+from sfms_robot.app.servo.serial_line import FoundServo, Wire
 from sfms_robot.app.wiring import SIM, devices, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.calibrate_first import held_back
@@ -96,7 +96,7 @@ def _identity(port: Port, family: str, baud: int, joint: Joint, clock: Clock) ->
     )
 
 
-def _register(wire: Wire, seen: Seen, table: Table, name: str) -> int | None:
+def _register(wire: Wire, seen: FoundServo, table: Table, name: str) -> int | None:
     field = table.fields.get(name)
     if field is None:
         return None

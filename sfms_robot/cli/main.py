@@ -15,20 +15,18 @@ import typer
 
 from sfms_robot import __version__
 from sfms_robot.cli import (
-    bench,
-    data,
-    demo,
-    doctor,
-    emulate,
-    evaluate,
-    head,
-    listener,
-    port,
-    replay,
-    run,
-    servo,
-    speaker,
-    train,
+    bench_command,
+    data_command,
+    demo_command,
+    doctor_command,
+    emulate_command,
+    evaluate_command,
+    head_command,
+    list_commands,
+    replay_command,
+    run_command,
+    servo_command,
+    train_command,
 )
 from sfms_robot.errors import ConfigError, RobotError
 
@@ -45,20 +43,20 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(demo.demo)
-app.command("run")(run.run)
-app.command("replay")(replay.replay)
-app.command("emulate")(emulate.emulate)
-app.command("doctor")(doctor.doctor)
-app.command("bench")(bench.bench)
-app.add_typer(head.app, name="head")
-app.add_typer(listener.app, name="listener")
-app.add_typer(speaker.app, name="speaker")
-app.add_typer(port.app, name="port")
-app.add_typer(servo.app, name="servo")
-app.add_typer(data.app, name="data")
-app.add_typer(train.app, name="train")
-app.add_typer(evaluate.app, name="evaluate")
+app.command("demo")(demo_command.demo)
+app.command("run")(run_command.run)
+app.command("replay")(replay_command.replay)
+app.command("emulate")(emulate_command.emulate)
+app.command("doctor")(doctor_command.doctor)
+app.command("bench")(bench_command.bench)
+app.add_typer(head_command.app, name="head")
+app.add_typer(list_commands.listener, name="listener")
+app.add_typer(list_commands.speaker, name="speaker")
+app.add_typer(list_commands.port, name="port")
+app.add_typer(servo_command.app, name="servo")
+app.add_typer(data_command.app, name="data")
+app.add_typer(train_command.app, name="train")
+app.add_typer(evaluate_command.app, name="evaluate")
 
 
 def _version(wanted: bool) -> None:

@@ -3,11 +3,12 @@
 from sfms_robot.config.arig import Arig, Diffusion
 from sfms_robot.config.arig_training import ArigPhase, ArigTraining, Stage, load_training, parse_training
 from sfms_robot.config.base import Model, load, parse
+from sfms_robot.config.camera_mount import CameraMount
 from sfms_robot.config.drives import drives
 from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
 from sfms_robot.config.head import Head, load_head
 from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
-from sfms_robot.config.life import Gaze, Idle, Life
+from sfms_robot.config.life import Gaze, Idle, Life, Person
 from sfms_robot.config.listener import (
     ChannelGroup,
     Listener,
@@ -28,6 +29,7 @@ __all__ = [
     "ArigTraining",
     "Baseline",
     "Bus",
+    "CameraMount",
     "ChannelGroup",
     "Coupling",
     "Dense",
@@ -47,6 +49,7 @@ __all__ = [
     "Listener",
     "LoadRule",
     "Model",
+    "Person",
     "Phase",
     "PredictorTraining",
     "Recipe",

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field, PrivateAttr, model_validator
 
 from sfms_robot.config.base import Model, Name, parse
+from sfms_robot.config.camera_mount import CameraMount
 from sfms_robot.config.consistency import problems, rates, wiring
 from sfms_robot.config.inheritance import expanded
 from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
@@ -47,6 +48,7 @@ class Head(Model):
     folds: tuple[Fold, ...] = ()
     regions: dict[Name, Region] = Field(default_factory=dict)
     kinematics: Kinematics | None = None
+    camera: CameraMount | None = None
     life: Life = Life()
     _folder: Path | None = PrivateAttr(None)
 

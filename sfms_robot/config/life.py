@@ -1,4 +1,4 @@
-"""What a head does of itself: where it keeps its eyes, and the small motion that the listener left out."""
+"""What a head does of itself: where it keeps its eyes, whom it looks at, and the small motion that was left out."""
 
 from __future__ import annotations
 
@@ -50,8 +50,22 @@ class Idle(Model):
     fade_s: Positive = 3.0
 
 
+class Person(Model):
+    """Looking at whom the head listens to, and away as people do.
+
+    Attributes:
+        head_share: of the direction to a person, what the neck turns; the eyes keep the rest. A head that is given no
+            gaze turns its neck all the way.
+        look_away: how often the head looks away, people being 1; 0 is never.
+    """
+
+    head_share: Share = 0.6
+    look_away: Annotated[float, Field(ge=0, le=2)] = 1.0
+
+
 class Life(Model):
-    """Both are optional; a section that is left out does nothing."""
+    """All are optional; a section that is left out does nothing."""
 
     gaze: Gaze | None = None
     idle: Idle | None = None
+    person: Person | None = None

@@ -22,7 +22,7 @@ from sfms_robot.corpora.external import dualtalk, l2l, lm_listener, react, react
 from sfms_robot.corpora.reading import pose_last
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
-from sfms_robot.signals.features import Feature, cached
+from sfms_robot.signals.audio_features import Feature, cached
 from sfms_robot.signals.spaces import decode
 
 LAYOUTS: Final = {

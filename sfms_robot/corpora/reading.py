@@ -167,11 +167,11 @@ def sound(file: Path, frames: int, fps: float) -> Floats:
     """A voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
     if not file.is_file():
         raise ClipError.of("missing sound", file, "no such file")
-    heard, wanted = read_audio(file), samples_of(frames, fps)
-    if wanted - len(heard) > SOUND_SLACK_S * AUDIO_HZ:
-        detail = f"{len(heard) / AUDIO_HZ:.2f} s of sound for {frames / fps:.2f} s of face"
+    audio, wanted = read_audio(file), samples_of(frames, fps)
+    if wanted - len(audio) > SOUND_SLACK_S * AUDIO_HZ:
+        detail = f"{len(audio) / AUDIO_HZ:.2f} s of sound for {frames / fps:.2f} s of face"
         raise ClipError.of("lengths differ", file, detail)
-    return np.pad(heard[:wanted], (0, max(0, wanted - len(heard))))
+    return np.pad(audio[:wanted], (0, max(0, wanted - len(audio))))
 
 
 def dyad(
@@ -205,10 +205,10 @@ def filed_dyad(
         track(str(file), pose_last(npy(file), pose_first), frames, WIDTHS[space], gaps=gaps)
         for file, gaps in zip(faces, (True, False), strict=True)
     )
-    return dyad(name, speaker, listener, space, fps, **heard(voices, frames, fps))
+    return dyad(name, speaker, listener, space, fps, **voices_of(voices, frames, fps))
 
 
-def heard(voices: Sequence[Path], frames: int, fps: float) -> dict[str, Floats | None]:
+def voices_of(voices: Sequence[Path], frames: int, fps: float) -> dict[str, Floats | None]:
     """`audio` of the speaker and `own` of the listener from their files, as `dyad` takes them; the second may lack."""
     if not voices:
         return {}

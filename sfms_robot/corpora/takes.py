@@ -43,7 +43,7 @@ def build(data: Path) -> Iterator[tuple[str, Take]]:
     for split, folders in ((TRAIN, _WHOLE), (HELD_OUT, _WHOLE_HELD_OUT)):
         for folder, names in folders.items():
             for name in names:
-                yield from ((split, take) for take in seen(data / folder / f"{name}.csv.gz", name))
+                yield from ((split, take) for take in face_stretches(data / folder / f"{name}.csv.gz", name))
     folder, name = _HALVED
     motion = resample(read_track(data / folder / f"{name}.csv.gz"), FRAME_HZ).motion
     middle = len(motion) // 2
@@ -51,7 +51,7 @@ def build(data: Path) -> Iterator[tuple[str, Take]]:
     yield from ((HELD_OUT, take) for take in _stretches(motion[middle:], name))
 
 
-def seen(file: Path, name: str) -> list[Take]:
+def face_stretches(file: Path, name: str) -> list[Take]:
     """The stretches of a face track in which a face was seen. Raises ConfigError."""
     return _stretches(resample(read_track(file), FRAME_HZ).motion, name)
 
@@ -61,7 +61,7 @@ def folder_takes(folder: Path) -> list[Take]:
     files = sorted([*folder.rglob("*.csv"), *folder.rglob("*.csv.gz")])
     if not files:
         raise ConfigError(f"--data {str(folder)!r}: no face tracks (*.csv, *.csv.gz) below it")
-    return [take for file in files for take in seen(file, str(file.relative_to(folder)))]
+    return [take for file in files for take in face_stretches(file, str(file.relative_to(folder)))]
 
 
 def save(file: Path, takes: Iterable[tuple[str, Take]]) -> None:

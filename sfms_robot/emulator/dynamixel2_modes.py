@@ -32,7 +32,7 @@ class TickFrames:
         turned = file.table.ticks_per_revolution if self.sign < 0 and self.mode == POSITION else 0.0
         self.offset = offset + turned
 
-    def told(self, shaft: float) -> float:
+    def reported(self, shaft: float) -> float:
         return self.sign * shaft + self.offset
 
     def shaft(self, told: float) -> float:

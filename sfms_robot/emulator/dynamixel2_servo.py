@@ -146,7 +146,7 @@ class Dynamixel2Servo:
             return _RESULT_FAIL
         self.plant.position %= self.table.ticks_per_revolution
         self.plant.reference = self.plant.position
-        self._put("goal_position", round(self._frames.told(self.plant.position)))
+        self._put("goal_position", round(self._frames.reported(self.plant.position)))
         self._settings()
         return 0
 
@@ -201,7 +201,7 @@ class Dynamixel2Servo:
         """What an onlooker sees, whatever the wire says."""
         self.advance(now_s)
         return {
-            "position": self._frames.told(self.plant.position),
+            "position": self._frames.reported(self.plant.position),
             "speed": self._frames.sign * self.plant.speed,
             "goal": self._get("goal_position"),
             "torque": bool(self.torque),
@@ -224,7 +224,7 @@ class Dynamixel2Servo:
                 self._put("bus_watchdog", -1)
                 self._tripped = True
                 if self.table.watchdog != "flags_only":
-                    self._put("goal_position", round(self._frames.told(self.plant.position)))
+                    self._put("goal_position", round(self._frames.reported(self.plant.position)))
                     self._put("goal_velocity", 0)
                 self._settings()
         self.plant.advance(now_s, self._drive)
@@ -288,7 +288,7 @@ class Dynamixel2Servo:
             self._frames = TickFrames(self._file)
             for name in ("profile_velocity", "profile_acceleration", "goal_velocity", "goal_pwm", "goal_current"):
                 self._put(name, 0)
-            self._put("goal_position", round(self._frames.told(self.plant.position)))
+            self._put("goal_position", round(self._frames.reported(self.plant.position)))
         if "bus_watchdog" in names:
             self._tripped = False
         self._settings()
@@ -340,9 +340,9 @@ class Dynamixel2Servo:
             round(1000.0 * sign * plant.effort),
             round(speed * per_tick),
             round(speed * per_tick),
-            round(self._frames.told(plant.position)),
+            round(self._frames.reported(plant.position)),
             round(sign * plant.reference_speed * per_tick),
-            round(self._frames.told(plant.reference)),
+            round(self._frames.reported(plant.reference)),
             volts,
             volts,
             round(plant.temperature_C),

@@ -78,7 +78,7 @@ class PositionFrame:
         self._offset = file.get("multi_turn_offset") if many else -file.get("homing_offset")
         self._counts = many or bool(file.get("phase") & _COUNTS_TURNS and "operating_mode" in table.fields)
 
-    def told(self, shaft: float) -> float:
+    def reported(self, shaft: float) -> float:
         """Ticks of the registers, beyond one turn as well."""
         return shaft / self._divider + self._offset
 
@@ -87,7 +87,7 @@ class PositionFrame:
 
     def shown(self, shaft: float) -> int:
         """What the present position reads: a servo that does not count turns knows one, with or without a gap."""
-        told = round(self.told(shaft))
+        told = round(self.reported(shaft))
         if self._counts:
             return told
         told = round(told % self._turn) if not 0 <= told < self._turn else told

@@ -154,7 +154,7 @@ class Protocol1Servo:
         """Whole turns are forgotten; it stays where it is."""
         self.advance(now_s)
         self.plant.position %= self.table.ticks_per_revolution
-        self._put("goal_position", round(self._frame.told(self.plant.position)))
+        self._put("goal_position", round(self._frame.reported(self.plant.position)))
         self._settings()
 
     # --- what happens to it -------------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ class Protocol1Servo:
         """What an onlooker sees, whatever the wire says."""
         self.advance(now_s)
         return {
-            "position": self._frame.told(self.plant.position),
+            "position": self._frame.reported(self.plant.position),
             "speed": self.plant.speed,
             "goal": self._get("goal_position"),
             "torque": self._powered and self._role("torque_enable") == 1,

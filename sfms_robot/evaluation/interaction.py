@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.corpora.states import STATE, UNKNOWN
+from sfms_robot.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
 from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.signals.events import near
@@ -50,7 +50,7 @@ class VoiceRule:
         return out
 
 
-def heard_voices(dyad: Dyad) -> Bools:
+def voice_tracks(dyad: Dyad) -> Bools:
     """(N, 2) speech of agent and user as the listener itself hears it: the agent's now, the user's a frame late."""
     silent = np.zeros(len(dyad.listener), bool)
     agent, user = (

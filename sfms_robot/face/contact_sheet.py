@@ -179,14 +179,6 @@ def render_sheet(
     return instants
 
 
-def render_head(file: Path | str, motion: Floats, size_px: tuple[int, int] = (640, 640)) -> None:
-    """Draw one face, motion (58,), as a PNG. Raises MissingExtra without vtk."""
-    vtk = load_vtk()
-    window = open_window(vtk, size_px)
-    _add_portrait(vtk, add_renderer(vtk, window, (0, 0, 1, 1), BACKGROUND), load_human(), motion)
-    save(vtk, window, file)
-
-
 def _add_portrait(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
     """The head, seen from a little to its left."""
     add_head(vtk, renderer, head, motion)

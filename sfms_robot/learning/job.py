@@ -1,6 +1,6 @@
 """What the training loop is told, and what it tells: the values that travel between a trainer, `fit` and its watchers.
 
-A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `learning.loop.fit`:
+A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `learning.training_loop.fit`:
 
     torch.manual_seed(settings.seed)                       # weights of a new model
     model = MyModel(settings.listener).to(run.device)

@@ -74,22 +74,14 @@ class ListenerProcess:
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
         """Block until the listener is loaded. Raises ModelError with its own message when it cannot be."""
-        self._wait("loaded", "building", ("starting",), limit_s)
-
-    def wait_ready(self, limit_s: float = START_LIMIT_S) -> None:
-        """Block until the listener listens. Raises ModelError with its own message when it cannot."""
-        self.wait_loaded(limit_s)
-        self._wait("ready", "listening", ("building",), limit_s)
-
-    def _wait(self, wanted: str, then: str, states: Sequence[str], limit_s: float) -> None:
-        if self._state not in states:
+        if self._state != "starting":
             return
         kind, value, _ = self._child.next(limit_s)
-        if kind == wanted:
-            self._state = then
+        if kind == "loaded":
+            self._state = "building"
             return
         self.close()
-        raise ModelError(value or f"the listener process was not {wanted} after {limit_s:g} s")
+        raise ModelError(value or f"the listener process was not loaded after {limit_s:g} s")
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Never blocks; what a child that does not listen leaves behind is dropped, oldest first, and counted."""
@@ -108,6 +100,11 @@ class ListenerProcess:
                 plans.append(plan)
         self._supervise(now_s)
         return plans
+
+    @property
+    def lost(self) -> bool:
+        """Hung, being started anew, or given up."""
+        return self._state in ("hung", "given up") or (self._restarts > 0 and self._state != "listening")
 
     def statistics(self) -> Mapping[str, Any]:
         """`state` (starting, building, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms`."""

@@ -118,15 +118,6 @@ class TimelineState:
     lead_limit_s: float = LEAD_S
 
 
-def horizon_left_s(horizon: int, hop: int, latency_s: float) -> float:
-    """Longest lead [s] that never runs past the plan: plans of `horizon` frames every `hop`, visible after `latency_s`.
-
-    Negative when plans come too late even without a lead.
-    """
-    delay = 1 if horizon == 1 else 0
-    return (horizon - hop + delay) * FRAME_S - latency_s
-
-
 class PlanTimeline:
     """Implements `ports.Timeline`.
 

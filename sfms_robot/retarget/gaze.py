@@ -23,7 +23,9 @@ import numpy as np
 
 from sfms_robot.config import Gaze
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
-from sfms_robot.retarget.eyes import Jump, directions, turn
+from sfms_robot.retarget.eyes import Jump
+from sfms_robot.retarget.gaze_target import Aim, turned
+from sfms_robot.signals.eye_angles import directions, turn
 
 ShownPose = Callable[[Floats], Doubles]  # motion (N, 58) -> the pose (N, 6) that the neck will show
 _HEAD = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
@@ -56,11 +58,17 @@ class GazeHold:
         self.full_rad = np.radians([config.full_yaw_deg, config.full_pitch_deg])
 
     def step(
-        self, motion: Floats, times_s: Doubles, state: GazeState | None, shown_pose: ShownPose | None = None
+        self,
+        motion: Floats,
+        times_s: Doubles,
+        state: GazeState | None,
+        shown_pose: ShownPose | None = None,
+        aim: Aim | None = None,
     ) -> tuple[Floats, GazeState]:
         """Motion (N, 58) at (N,) instants, with other eyes; `state` None begins by holding what is looked at.
 
-        `shown_pose` None: the neck shows the very pose that is asked.
+        `shown_pose` None: the neck shows the very pose that is asked. `aim`: what is held is beside it, and the head is
+        turned by its part.
         """
         both_rad = directions(motion, self.full_rad)  # (N, eye, axis)
         eyes_rad = 0.5 * (both_rad[:, 0] + both_rad[:, 1])
@@ -68,8 +76,14 @@ class GazeHold:
         last = int(np.argmax(times_s))
         state = self._decided(eyes_rad[last], head_rad[last], times_s, state)
         apart_rad = both_rad - eyes_rad[:, None]  # vergence stays the listener's
+        held_rad = state.jump.at(times_s)
         out = motion.copy()
-        turn(out, (state.jump.at(times_s) - head_rad)[:, None] + apart_rad, self.full_rad)
+        if aim is not None:
+            held_rad = held_rad + aim.gaze_rad
+            if aim.head_rad.any():
+                out = turned(motion, aim)
+                head_rad = self._head(out, times_s, shown_pose)
+        turn(out, (held_rad - head_rad)[:, None] + apart_rad, self.full_rad)
         return out, state
 
     def _head(self, motion: Floats, times_s: Doubles, shown_pose: ShownPose | None) -> Doubles:

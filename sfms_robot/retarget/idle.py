@@ -18,7 +18,8 @@ import numpy as np
 
 from sfms_robot.config import Idle
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
-from sfms_robot.retarget.eyes import Jump, directions, smooth, turn
+from sfms_robot.retarget.eyes import Jump, smooth
+from sfms_robot.signals.eye_angles import directions, turn
 
 ENOUGH = 0.8  # a listener with this share of the wanted blinks gets none added
 CLOSING_S, CLOSED_S, OPENING_S = 0.08, 0.04, 0.18  # a spontaneous blink, whole and a little slow for lid servos

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, POSE, SHAPES, Doubles, Floats
-from sfms_robot.retarget.eyes import directions, smooth, turn
+from sfms_robot.retarget.eyes import smooth
+from sfms_robot.signals.eye_angles import directions, turn
 
 RISE_S: Final = 0.25  # listener -> face
 CHANGE_S: Final = 0.12  # one face asked for -> the next; straight, so that a stream of them flows

@@ -19,6 +19,7 @@ import os
 import select
 import socket
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 from sfms_robot.errors import BusError, PortError
@@ -68,6 +69,38 @@ class Port(Protocol):
 
     def close(self) -> None:
         """Idempotent."""
+
+
+@dataclass
+class WrappedPort:
+    """A port that hands everything on to `inner`; subclasses change what they are about."""
+
+    inner: Port
+
+    @property
+    def name(self) -> str:
+        return self.inner.name
+
+    def write(self, data: bytes) -> None:
+        self.inner.write(data)
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        return self.inner.read(n, deadline_s)
+
+    def discard_input(self) -> None:
+        self.inner.discard_input()
+
+    def now_s(self) -> float:
+        return self.inner.now_s()
+
+    def wait_until(self, time_s: float) -> None:
+        self.inner.wait_until(time_s)
+
+    def set_baud(self, baud: int) -> None:
+        self.inner.set_baud(baud)
+
+    def close(self) -> None:
+        self.inner.close()
 
 
 class SerialPort:

@@ -1,4 +1,4 @@
-"""The linear part of an echo: an adaptive filter from what a loudspeaker is given to what the microphone hears of it."""
+"""Adaptive filter from what a loudspeaker is given to what the microphone hears of it: the linear echo."""
 
 from __future__ import annotations
 

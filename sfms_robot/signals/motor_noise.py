@@ -9,7 +9,10 @@ from numpy.typing import ArrayLike
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
 
-BAND_EDGES_HZ: Final = (100, 200, 300, 400, 510, 630, 770, 920, 1080, 1270, 1480, 1720, 2000, 2320, 2700, 3150, 3700, 4400, 5300, 6400, 7700)  # fmt: skip
+BAND_EDGES_HZ: Final = (
+    100, 200, 300, 400, 510, 630, 770, 920, 1080, 1270, 1480, 1720, 2000, 2320, 2700, 3150, 3700, 4400, 5300,
+    6400, 7700,
+)  # fmt: skip
 SPEED_EDGES_RAD_S: Final = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # of all joints together
 STILL_RAD_S: Final = SPEED_EDGES_RAD_S[1]
 _STEP: Final = 0.05  # per frame: of a band's mean towards what is heard

@@ -22,14 +22,15 @@ from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
 from sfms_robot.signals.motor_noise import STILL_RAD_S, MotorNoise, total_speed
 from sfms_robot.signals.speech_probability import SpeechProbability
 
-BEGINS: Final = 0.5  # probability from which on somebody speaks
-GOES_ON: Final = 0.3  # and below which he has stopped
-HOLD_FRAMES: Final = 2  # a voice lasts so long over a dip
-EXCESS_DB: Final = 4.0  # over the motors, else it is they
+# Probabilities from which on somebody speaks, and below which he has stopped: in general, and while own voice sounds.
+BEGINS, GOES_ON = 0.4, 0.2
+BEGINS_OVER_OWN, GOES_ON_OVER_OWN = 0.6, 0.3
+HOLD_FRAMES: Final = 3  # a voice lasts so long over a dip
+EXCESS_DB: Final = 3.0  # over the motors, else it is they
 NOBODY: Final = 0.1  # probability below which motor noise is learned
 LEFT_DB: Final = -25.0  # after echo cancellation against before, while own voice is in the room: below it is echo
-LEFT_AT_FIRST_DB: Final = -6.0  # while the echo filter still learns the room
-LEARNING_FRAMES: Final = 100  # of own voice until it has
+LEFT_AT_FIRST_DB: Final = -4.0  # while the echo filter still learns the room
+LEARNING_FRAMES: Final = 150  # of own voice until it has
 ECHO_FRAMES: Final = 8  # for so long after its end own voice is still in the room
 OWN_VOICE_DB: Final = -60.0  # of full scale: a reference above it is heard
 REJECTED_GAIN: Final = 0.03  # -30 dB, for what is own voice or own motors
@@ -123,7 +124,8 @@ class OwnVoiceGate:
 
     def _judge(self, stands_out: bool) -> bool:
         """Hysteresis and hold, so that a word does not fall apart."""
-        if self._probability > (GOES_ON if self._hold else BEGINS) and stands_out:
+        begins, goes_on = (BEGINS_OVER_OWN, GOES_ON_OVER_OWN) if self._echoes else (BEGINS, GOES_ON)
+        if self._probability > (goes_on if self._hold else begins) and stands_out:
             self._hold = HOLD_FRAMES
         else:
             self._hold = max(0, self._hold - 1)

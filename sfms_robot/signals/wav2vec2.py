@@ -23,7 +23,7 @@ import torch
 
 from sfms_robot.errors import MissingExtra, ModelError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats
-from sfms_robot.signals.features import Feature
+from sfms_robot.signals.audio_features import Feature
 
 CONTEXT_FRAMES: Final = 50
 STRIDE: Final = 320  # samples a latent
@@ -120,7 +120,7 @@ class Wav2Vec2:
 
 
 def feature(folder: Path | str, fps: float = FRAME_HZ, device: str = "cpu", hop_frames: int = 1) -> Feature:
-    """To be kept by `signals.features.cached`; its version tells the hop and a hash of the model's files."""
+    """To be kept by `signals.audio_features.cached`; its version tells the hop and a hash of the model's files."""
     model = Wav2Vec2(folder, device, hop_frames)
     compute = partial(model.of_recording, fps=fps)
     return Feature("wav2vec2", f"1 hop {hop_frames} {_digest(model.folder)}", model.dim, fps, compute)

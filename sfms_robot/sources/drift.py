@@ -50,7 +50,7 @@ class SampleClock:
     def observe(self, count: int, captured_s: float) -> None:
         """A callback: `count` samples so far, the newest of them at `captured_s` or before."""
         x_s = count / self._nominal_hz
-        point = (x_s, captured_s - x_s)
+        point = (x_s, float(captured_s) - x_s)
         below_s = point[1] - self.skew * x_s
         self._offset_s = below_s if self._offset_s is None else min(self._offset_s, below_s)
         if self._bin is None or below_s < self._bin[1] - self.skew * self._bin[0]:

@@ -42,6 +42,7 @@ class LiveVoice:
     """
 
     duration_s: float | None = None
+    lost: bool = False
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -70,24 +71,26 @@ class LiveVoice:
             self._origin_s, self._stream, self._next, self._wanted = origin_s, None, 0, 0
             self._frames.clear()
 
-    def push(self, samples: NDArray[np.float32], rate_hz: float, captured_s: float) -> None:
+    def push(
+        self, samples: NDArray[np.float32], rate_hz: float, captured_s: float, arrived_s: float | None = None
+    ) -> None:
         """The next piece, (n,) or (n, channels), full scale 1.
 
         Args:
             captured_s: `time.monotonic` of its newest sample; may be late by some tens of milliseconds, never early.
+            arrived_s: when it is pushed, for the latency, where that is another time.
 
         What is not finite counts as silence. Raises ConfigError for a rate outside 4 to 384 kHz.
         """
-        if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
-            raise ConfigError(f"rate_hz = {rate_hz!r} is no rate for speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
+        check_rate(rate_hz)
         mono, not_finite = _mono(samples)
         if not len(mono):
             return
         with self._lock:
             self._counts["not_finite"] += not_finite
-            self._observe(len(mono), rate_hz, float(captured_s))
+            self._observe(len(mono), rate_hz, captured_s)
             if self._origin_s is not None:
-                self._resample(mono, captured_s)
+                self._resample(mono, captured_s, captured_s if arrived_s is None else arrived_s)
 
     def take(self, index: int) -> Floats | None:
         """See `ports.Voice`. A frame of which only a part was heard is filled up with silence."""
@@ -129,7 +132,7 @@ class LiveVoice:
         self._clock.observe(self._received, captured_s)
         self._skew = self._clock.skew
 
-    def _resample(self, samples: Floats, captured_s: float) -> None:
+    def _resample(self, samples: Floats, captured_s: float, arrived_s: float) -> None:
         first = self._received - len(samples)
         settled = captured_s > self._settled_s
         if self._stream is not None and abs(self._behind()) > (GAP_S if settled else UNSETTLED_S) * self._rate_hz:
@@ -144,7 +147,7 @@ class LiveVoice:
         self._stream.set_io_ratio(ratio, 1.0)
         out = self._stream.resample_chunk(samples)
         self._position += ratio * len(out)
-        self._write(out, captured_s)
+        self._write(out, arrived_s)
 
     def _behind(self) -> float:
         """By how many samples of the card the stream is behind its place."""
@@ -175,8 +178,8 @@ class LiveVoice:
             self._write(self._stream.resample_chunk(_NONE, last=True), None)
             self._stream = None
 
-    def _write(self, samples: Floats, captured_s: float | None) -> None:
-        """Lay samples into their frames. `captured_s`: None for what a resampler still held."""
+    def _write(self, samples: Floats, arrived_s: float | None) -> None:
+        """Lay samples into their frames. `arrived_s`: None for what a resampler still held."""
         while len(samples):
             index, within = divmod(self._next, FRAME_SAMPLES)
             part, samples = samples[: FRAME_SAMPLES - within], samples[FRAME_SAMPLES - within :]
@@ -186,13 +189,19 @@ class LiveVoice:
             else:
                 frame = self._frames.setdefault(index, np.zeros(FRAME_SAMPLES, dtype=np.float32))
                 frame[within : within + len(part)] = np.clip(part, -1.0, 1.0)
-            if captured_s is not None and within + len(part) == FRAME_SAMPLES:
-                self._measure((index + 1) * FRAME_S, captured_s)
+            if arrived_s is not None and within + len(part) == FRAME_SAMPLES:
+                self._measure((index + 1) * FRAME_S, arrived_s)
 
-    def _measure(self, end_s: float, captured_s: float) -> None:
+    def _measure(self, end_s: float, arrived_s: float) -> None:
         assert self._origin_s is not None
-        late_s = captured_s - self._origin_s - end_s
+        late_s = float(arrived_s) - self._origin_s - end_s
         self._latency_s = max(late_s, self._latency_s - _LATENCY_FALLS_S, 0.0)
+
+
+def check_rate(rate_hz: float) -> None:
+    """Raises ConfigError for what is no rate of speech."""
+    if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
+        raise ConfigError(f"rate_hz = {rate_hz!r} is no rate for speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
 
 
 def _mono(samples: NDArray[np.float32]) -> tuple[Floats, int]:

@@ -7,7 +7,8 @@
 3. The face is the newest one at or before the end of the frame, and none when that is older than `FACE_S`.
 4. What the robot says is told one frame early, as a program that speaks knows it: frame i carries the samples of frame
    i + 1, for which a listener plans its lips while it hears frame i.
-5. What is not finite or not of the right shape is left out here, for everybody after: one NaN would stay with a
+5. Where a sighting does not tell the person's attention, their face does (`signals.attention`).
+6. What is not finite or not of the right shape is left out here, for everybody after: one NaN would stay with a
    listener for good.
 """
 
@@ -23,6 +24,7 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
 from sfms_robot.ports import Sight, Source, Voice
+from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
 
 logger = logging.getLogger(__name__)
@@ -46,6 +48,7 @@ class PairedSource:
     Attributes:
         duration_s: None for one without end.
         latency_s: see `ports.Voice`.
+        missing: voice, face, agent_audio: those that are lost.
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class PairedSource:
             raise ConfigError(f"--duration = {duration_s:g}: a run lasts longer than 0 s")
         self.duration_s = _length_s(voice, sight, agent) if duration_s is None else duration_s
         self.latency_s = 0.0
+        self.missing: tuple[str, ...] = ()
         self._voice, self._sight, self._agent = voice, sight, agent
         self._judge = FrameJudge()
         self._given = 0
@@ -82,6 +86,7 @@ class PairedSource:
                 break
             frames.append(self._frame(self._given, heard))
             self._given += 1
+        self.missing = tuple(name for name, part in self._parts().items() if part.lost)
         return frames
 
     def statistics(self) -> Mapping[str, Any]:
@@ -147,6 +152,7 @@ class JudgedSource:
             raise ConfigError(f"{type(inner).__name__} lacks {', '.join(missing)}: derive it from sfms_robot.Source")
         self.duration_s = inner.duration_s
         self.latency_s = inner.latency_s
+        self.missing: tuple[str, ...] = ()
         self._inner = inner
         self._judge = FrameJudge()
         self._given = 0
@@ -161,7 +167,7 @@ class JudgedSource:
             seen = None if given.face is None else Sighting(given.face, given.attention, given.place_m)
             frames.append(self._judge.frame(self._given, given.audio, seen, given.agent_audio))
             self._given += 1
-        self.latency_s = self._inner.latency_s
+        self.latency_s, self.missing = self._inner.latency_s, tuple(self._inner.missing)
         return frames
 
     def statistics(self) -> Mapping[str, Any]:
@@ -172,7 +178,7 @@ class JudgedSource:
         self._inner.close()
 
 
-_SOURCE: Final = ("duration_s", "latency_s", "start", "read", "statistics", "close")
+_SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "statistics", "close")
 
 
 class FrameJudge:
@@ -185,16 +191,20 @@ class FrameJudge:
 
     def __init__(self) -> None:
         self.left_out: dict[str, int] = {}
+        self._attending = AttentionState()
 
     def frame(self, index: int, heard: Floats, seen: Sighting | None, says: Floats | None) -> SpeakerFrame:
-        """Frame `index`, whatever times its parts tell."""
+        """Frame `index`, whatever times its parts tell; its face keeps the time that it was seen, where that can be."""
         time_s = (index + 1) / FRAME_HZ
         audio = self._samples(index, "voice", heard)
         own_audio = None if says is None else self._samples(index, "robot's voice", says)
         face = None if seen is None else self._face(index, seen.face)
         if seen is None or face is None:
             return SpeakerFrame(time_s, audio, None, own_audio)
-        attention, place_m = self._attention(index, seen.attention), self._place(index, seen.place_m)
+        place_m = self._place(index, seen.place_m)
+        attention = self._attention(index, seen.attention)
+        if attention is None:
+            attention, self._attending = attend(face, place_m, self._attending)
         return SpeakerFrame(time_s, audio, face, own_audio, attention, place_m)
 
     def _samples(self, index: int, what: str, given: Floats) -> Floats:
@@ -219,7 +229,9 @@ class FrameJudge:
         if not all(np.isfinite(part).all() for part in (pose, shapes, *(() if jaw is None else (jaw,)))):
             self._leave_out(index, "face", "values that are not finite")
             return None
-        return FaceFrame((index + 1) / FRAME_HZ, pose, np.clip(shapes, 0.0, 1.0), jaw)
+        end_s = (index + 1) / FRAME_HZ
+        time_s = face.time_s if end_s - FACE_S - _EPS_S <= face.time_s <= end_s else end_s
+        return FaceFrame(time_s, pose, np.clip(shapes, 0.0, 1.0), jaw)
 
     def _attention(self, index: int, attention: float | None) -> float | None:
         if attention is None or math.isfinite(attention):

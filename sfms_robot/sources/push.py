@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Sighting
-from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Resampler
-from sfms_robot.sources.live_voice import LiveVoice
+from sfms_robot.signals.audio import Resampler
+from sfms_robot.sources.live_voice import LiveVoice, check_rate
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 
@@ -58,7 +58,7 @@ class PushedVoice(LiveVoice):
                 self._longest_s = piece_s
                 self.interrupt()
             self._last_s = now_s
-            self.push(kept, rate_hz, now_s + self._longest_s)
+            self.push(kept, rate_hz, now_s + self._longest_s, now_s)
 
     def statistics(self) -> Mapping[str, Any]:
         return {**super().statistics(), "dropped": self._dropped, "delay_ms": round(self._longest_s * 1e3, 1)}
@@ -67,6 +67,7 @@ class PushedVoice(LiveVoice):
 class PushedSight:
     """`ports.Sight` of what a program sees."""
 
+    lost = False  # what is not pushed is not there
     duration_s: float | None = None
     latency_s = 0.0
 
@@ -113,6 +114,7 @@ class PushedSpeech:
     Nothing until it has said something, silence after that. All methods may be called from any thread.
     """
 
+    lost = False  # what is not pushed is not there
     duration_s: float | None = None
     latency_s = 0.0
 
@@ -174,12 +176,6 @@ class PushedSpeech:
         waiting = np.concatenate([self._waiting, samples])
         self._counts["dropped"] += max(0, len(waiting) - self._longest)
         self._waiting = waiting[-self._longest :]
-
-
-def check_rate(rate_hz: float) -> None:
-    """Raises ConfigError."""
-    if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
-        raise ConfigError(f"rate_hz = {rate_hz!r} is no rate for speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
 
 
 def as_floats(pcm: Pcm) -> NDArray[np.float32]:

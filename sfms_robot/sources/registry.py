@@ -58,6 +58,12 @@ def source_kinds(others: Iterable[EntryPoint] | None = None) -> SourceKinds:
     return SourceKinds({**found, **VOICES}, {**found, **SIGHTS}, AGENT_VOICES)
 
 
+def split_kind(value: str) -> tuple[str, str]:
+    """What a flag says -> the kind's name and its argument: `live-link,flip=yaw` has one without a colon."""
+    end = min((value.index(mark) for mark in ":," if mark in value), default=len(value))
+    return value[:end], value[end:].removeprefix(":")
+
+
 def check_source(
     audio: str = "default", face: str = "auto", agent_audio: str = "none", kinds: SourceKinds | None = None
 ) -> None:
@@ -92,7 +98,7 @@ def open_source(
     again = loop and duration_s is not None
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
         agent = None
-        if audio.partition(":")[0] == "mic" and agent_audio != "none":
+        if split_kind(audio)[0] == "mic" and agent_audio != "none":
             voice, agent = _conversation(audio, agent_audio, known, failed)
         else:
             voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed)
@@ -112,7 +118,7 @@ def open_source(
 
 
 def _check(flag: str, value: str, kinds: Kinds, file: Path | None, files: Iterable[str]) -> None:
-    name, choices = value.partition(":")[0], ", ".join([*kinds, *files])
+    (name, _), choices = split_kind(value), ", ".join([*kinds, *files])
     if name in kinds:
         module = kinds[name].value.partition(":")[0]
         if module.startswith(f"{_HERE}.") and find_spec(module) is None:
@@ -127,7 +133,7 @@ def _existing(name: str) -> Path | None:
 
 def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack) -> Any:
     """What a kind opens; None where `value` names none."""
-    name, _, argument = value.partition(":")
+    name, argument = split_kind(value)
     if name not in kinds:
         return None
     kind = kinds[name]
@@ -146,7 +152,7 @@ def _conversation(audio: str, agent_audio: str, known: SourceKinds, failed: Exit
     """A microphone, and what the robot says: the one has to know of the other, whose echo it hears."""
     from sfms_robot.sources.microphone import open_microphone_and_loudspeaker, open_microphone_beside
 
-    device, (kind, _, loudspeaker) = audio.partition(":")[2], agent_audio.partition(":")
+    device, (kind, loudspeaker) = split_kind(audio)[1], split_kind(agent_audio)
     both: tuple[Any, Any]
     if kind == "device":
         both = open_microphone_and_loudspeaker(device, loudspeaker)

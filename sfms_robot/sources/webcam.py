@@ -1,4 +1,4 @@
-"""A person's face from a webcam: `--face webcam[:N|FILE]`.
+"""A person's face from a webcam: `--face webcam[:N|FILE][,flip=...]`.
 
 Camera and MediaPipe are in a process of their own (`webcam_worker`), which is started again when the camera goes away.
 Without a face in the picture nothing new is told: the last one ages, and whoever asks judges how old is too old.
@@ -6,29 +6,27 @@ Without a face in the picture nothing new is told: the last one ages, and whoeve
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FaceFrame, Sighting
+from sfms_robot.frames import Sighting
 from sfms_robot.signals.quantiles import Quantiles
+from sfms_robot.sources.face_argument import parse_face_argument
+from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.webcam_worker import Opened, Seen, watch
 from sfms_robot.sources.worker import SourceWorker
 
 _NICE: Final = 5  # below the servo loop
-_REMEMBERED: Final = 64  # sightings newer than those asked for: two seconds
 
 
 class Webcam:
     """`ports.Sight` of the worker `watch`. Only `close` blocks."""
 
-    def __init__(self, worker: SourceWorker, duration_s: float | None) -> None:
-        self._worker, self._duration_s = worker, duration_s
+    def __init__(self, worker: SourceWorker, face: LiveFace, duration_s: float | None) -> None:
+        self._worker, self._face, self._duration_s = worker, face, duration_s
         self._origin_s: float | None = None
-        self._seen: Sighting | None = None
-        self._coming: deque[Sighting] = deque(maxlen=_REMEMBERED)
         self._pictures = self._without_face = self._dark = self._with_others = 0
         self._latency_ms = Quantiles()
 
@@ -37,12 +35,18 @@ class Webcam:
         return self._duration_s
 
     @property
+    def lost(self) -> bool:
+        """The camera is away, or its process."""
+        return self._worker.lost
+
+    @property
     def latency_s(self) -> float:
         """Median from a picture taken to its face known; 0 before the first picture."""
         return self._latency_ms.at(50) / 1e3 if len(self._latency_ms) else 0.0
 
     def start(self, origin_s: float) -> None:
         self._origin_s = origin_s
+        self._face.start(origin_s)
         self._worker.tell(origin_s)
 
     def at(self, time_s: float) -> Sighting | None:
@@ -50,10 +54,8 @@ class Webcam:
             return None
         for message in self._worker.messages(self._origin_s + time_s):
             if isinstance(message, Seen):
-                self._take(message, message.taken_s - self._origin_s)
-        while self._coming and self._coming[0].face.time_s <= time_s:
-            self._seen = self._coming.popleft()
-        return self._seen
+                self._take(message)
+        return self._face.at(time_s)
 
     def statistics(self) -> Mapping[str, Any]:
         """What the worker tells; pictures, of these without a face, dark, and with other people in them; latency."""
@@ -69,8 +71,8 @@ class Webcam:
     def close(self) -> None:
         self._worker.close()
 
-    def _take(self, seen: Seen, time_s: float) -> None:
-        if time_s < 0.0:  # before the start
+    def _take(self, seen: Seen) -> None:
+        if self._origin_s is None or seen.taken_s < self._origin_s:
             return
         self._pictures += 1
         self._without_face += seen.face is None
@@ -78,7 +80,7 @@ class Webcam:
         self._with_others += seen.others > 0
         self._latency_ms.add((seen.known_s - seen.taken_s) * 1e3)
         if seen.face is not None:
-            self._coming.append(Sighting(FaceFrame.of(time_s, seen.face.motion), place_m=seen.face.place_m))
+            self._face.put(seen.taken_s, seen.face.motion, seen.face.place_m)
 
 
 def open_webcam(argument: str) -> Webcam:
@@ -87,10 +89,12 @@ def open_webcam(argument: str) -> Webcam:
     Blocks until it is open and MediaPipe is loaded, a few seconds. Raises ConfigError for what is neither, for a file
     that is no video and (MissingExtra) without the extra `webcam`; PortError for a camera that cannot be opened.
     """
-    if not argument.isdigit() and argument and not Path(argument).is_file():
-        raise ConfigError(f"--face webcam:{argument}: no such file, nor the number of a camera (0, 1, ...)")
-    source = str(Path(argument).absolute()) if argument and not argument.isdigit() else argument or "0"
-    worker = SourceWorker(f"webcam {argument or 0}", watch, source, nice=_NICE)
+    given = parse_face_argument("webcam", argument)
+    place = given.place
+    if not place.isdigit() and place and not Path(place).is_file():
+        raise ConfigError(f"--face webcam:{place}: no such file, nor the number of a camera (0, 1, ...)")
+    source = str(Path(place).absolute()) if place and not place.isdigit() else place or "0"
+    worker = SourceWorker(f"webcam {place or 0}", watch, source, nice=_NICE)
     worker.wait()
     opened = worker.messages(0.0)[0]
-    return Webcam(worker, opened.duration_s if isinstance(opened, Opened) else None)
+    return Webcam(worker, LiveFace(given.signs), opened.duration_s if isinstance(opened, Opened) else None)

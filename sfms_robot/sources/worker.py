@@ -116,6 +116,11 @@ class SourceWorker:
         self._supervise(now_s)
         return values
 
+    @property
+    def lost(self) -> bool:
+        """It is away, or being started anew."""
+        return self._state == "lost" or (self._restarts > 0 and self._state == "starting")
+
     def statistics(self) -> Mapping[str, Any]:
         """`state` (starting, running, lost, finished, closed), `restarts`, `dropped` (messages)."""
         return {"state": self._state, "restarts": self._restarts, "dropped": self._dropped + self._child.dropped}

@@ -5,7 +5,7 @@ import pytest
 
 from sfms_robot.app.bench.adversary import CHUNK, adversarial, torment
 from sfms_robot.app.bench.lead import delay_ticks, delays
-from sfms_robot.app.bench.retarget import retarget
+from sfms_robot.app.bench.retarget_bench import retarget
 from sfms_robot.data import data_dir, shipped_names
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")

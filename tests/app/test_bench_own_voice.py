@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.bench.acoustics import gear_noise
-from sfms_robot.app.bench.own_voice import CHOSEN_ON, Condition, call_names, own_voice
+from sfms_robot.app.bench.own_voice_bench import CHOSEN_ON, Condition, call_names, own_voice
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 
@@ -30,7 +30,7 @@ def test_own_voice_is_not_the_person_and_the_person_is_heard():
     pytest.importorskip("pyroomacoustics")
     turns = Condition("office", 0.0, None, False)
     over = Condition("office", 0.0, None, True)
-    result = own_voice(conditions=(turns, over), seconds=30.0)
+    result = own_voice(conditions=(turns, over))
     in_turns, talking_over = result["conditions"]
     assert result["echo_latency_ms"] <= 10.0
     assert in_turns["own_voice_taken"] < 0.02 and in_turns["person_missed"] < 0.05

@@ -18,14 +18,10 @@ from sfms_robot.app.bench.campaign import (
     run_campaign,
     table,
 )
-from sfms_robot.app.bench.campaign_rig import FAMILIES, Judge, Rig, head_of
+from sfms_robot.app.bench.campaign_rig import FAMILIES, Judge, head_of, plugged_in
 from sfms_robot.app.bench.fuzz import BYTES, fuzz_one
-from sfms_robot.app.session import build_bus
-from sfms_robot.app.wiring import emulated
 from sfms_robot.emulator.faults import KINDS
-from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
-from sfms_robot.runtime.clock import VirtualClock
 
 IMPOSSIBLE = {(case, board) for case in (STORED, MANY_TURNS) for board in ("maestro", "ssc32")} | {
     (MANY_TURNS, family) for family in ("dynamixel1", "scs")
@@ -35,13 +31,9 @@ SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
 
 @pytest.fixture
 def rig():
-    head, clock = head_of("dynamixel2"), VirtualClock()
-    with launch(emulated(head)["main"], virtual=True) as chain:
-        rig = Rig(head, {"main": chain}, clock, build_bus(head, {"main": chain}, clock))
+    with plugged_in(head_of("dynamixel2")) as rig:
         rig.hold()
         yield rig
-        rig.bus.stop("release")
-        rig.bus.close()
 
 
 def test_every_kind_of_fault_is_tried():

@@ -11,7 +11,7 @@ from sfms_robot.app.train.datasets import check_data
 from sfms_robot.cli.main import main
 from sfms_robot.corpora.formats import open_dataset, with_feature
 from sfms_robot.errors import ConfigError
-from sfms_robot.signals.features import MFCC78
+from sfms_robot.signals.audio_features import MFCC78
 
 
 def problems(report, split="train"):

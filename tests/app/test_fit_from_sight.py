@@ -8,13 +8,13 @@ import pytest
 from sfms_robot.app.head.babble import Faces, babble
 from sfms_robot.app.head.faces import named_faces
 from sfms_robot.app.head.fidelity import of_head
-from sfms_robot.app.head.fit import fit_head, read_pairs, see_virtual_face, virtual_tracker, with_drives
+from sfms_robot.app.head.fit import fit_head, read_pairs, see_virtual_face, virtual_tracker
 from sfms_robot.config import load_head
 from sfms_robot.config.overlay import load_overlay, overlay_file
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.tracker import Skin, skin_motion
 from sfms_robot.frames import SHAPES
-from sfms_robot.retarget.response_fit import Units, asked, fit, looks_like, rms
+from sfms_robot.retarget.response_fit import Units, asked, fit, fitted_drives, looks_like, rms
 
 
 def recorded_shapes():
@@ -32,7 +32,9 @@ def test_held_out_faces_come_three_times_nearer(seed, record_property):
 
     train = asked(head, shapes[~held_out])
     responses = fit(train, looks_like(head, tracker.seen(train, rng)), units.low, units.high)
-    fitted = with_drives(head, responses)
+    drives = fitted_drives(head, responses)
+    joints_fitted = {n: j.model_copy(update={"drive": drives.get(n, j.drive)}) for n, j in head.joints.items()}
+    fitted = head.model_copy(update={"joints": joints_fitted})
 
     test = shapes[held_out]
     told, skin = asked(head, test), skin_motion()

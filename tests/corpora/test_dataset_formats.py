@@ -19,7 +19,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.learning.sfms.features import gather
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.l2l import l2l_bilateral
+from sfms_robot.signals.learning2listen import l2l_bilateral
 from sfms_robot.signals.spaces import rest_of
 
 
@@ -316,7 +316,7 @@ def test_manual_and_help_name_every_layout_as_it_is():
     rows = {line.split("|")[1].strip(" `"): line for line in manual.splitlines() if line.startswith("| `")}
     for name, layout in LAYOUTS.items():
         assert f"`{layout.space}`" in rows[name] and f"| {layout.fps:g} |" in rows[name]
-    help_text = (Path(formats.__file__).parents[1] / "cli" / "data.py").read_text(encoding="utf-8")
+    help_text = (Path(formats.__file__).parents[1] / "cli" / "data_command.py").read_text(encoding="utf-8")
     assert all(name in help_text for name in LAYOUTS)
 
 

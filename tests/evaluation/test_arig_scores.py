@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tiny_arig_training import HZ, dyad, settings
 
-from sfms_robot.corpora.states import STATE
+from sfms_robot.corpora.conversational_states import STATE
 from sfms_robot.evaluation import interaction as scores
 from sfms_robot.evaluation.paper import arig_tables as tables
 from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
@@ -45,7 +45,7 @@ def test_confusion_counts_frames_that_have_both_and_adds_up():
 
 def test_a_listener_hears_the_user_one_frame_late_and_itself_at_once():
     one = dyad("a", "interaction", 0)
-    agent, user = scores.heard_voices(one).T
+    agent, user = scores.voice_tracks(one).T
     speaks = np.arange(len(agent)) // HZ % 2 == 0
     assert (agent == speaks).mean() > 0.9
     assert (user[1:] == ~speaks[:-1]).mean() > 0.9 and not user[0]
@@ -179,8 +179,3 @@ def test_ablations_stand_beside_the_papers(number):
     assert by_name["ARIG"]["paper RPCC"] == 0.125 and by_name["ARIG"]["source"] == "here"
     assert set(tables.ABLATIONS[number]) <= set(by_name)
     assert len({tuple(row) for row in rows}) == 1
-
-
-def test_motion_shorter_than_a_clip_is_refused():
-    with pytest.raises(ValueError, match="as long as a clip of 250 frames"):
-        tables.cut([np.zeros((249, 58))])

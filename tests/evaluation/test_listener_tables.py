@@ -66,7 +66,7 @@ def test_a_table_has_the_truth_the_heuristics_the_listener_and_the_paper(space, 
     result = table(number, clips, given, samples=2)
     json.dumps(result, allow_nan=False)
     rows = {row["name"]: row for row in result["rows"] if row["source"] == "here"}
-    assert list(rows) == ["Ground truth", "Random", "Median", "Mime", "MeanFr", "MeanSeq", "tiny"]
+    assert list(rows) == ["Ground truth", "Random", "Median", "Mime", "MeanFr", "tiny"]
     assert {row["name"] for row in result["rows"] if row["source"] == "paper"} >= {"Ground truth", "Random", "SFMS"}
     wanted = [f"{part} {key}" for part in ("expression", "rotation") for key in columns] if number == 1 else columns
     assert all(isinstance(rows["tiny"][key], float) for key in wanted)
@@ -76,7 +76,7 @@ def test_a_table_has_the_truth_the_heuristics_the_listener_and_the_paper(space, 
 def test_the_truth_has_no_error_and_random_the_most():
     rng = np.random.default_rng(0)
     truth, speaker, train = (rng.uniform(0.4, 0.6, (6, 64, 58)) for _ in range(3))
-    rows = {row["name"]: row for row in table(1, Clips("arkit58", truth, speaker, train), {}, 2)["rows"][:6]}
+    rows = {row["name"]: row for row in table(1, Clips("arkit58", truth, speaker, train), {}, 2)["rows"][:5]}
     assert rows["Ground truth"]["expression L2"] == 0
     assert rows["Ground truth"]["expression FD"] == pytest.approx(0, abs=1e-9)
     assert rows["Random"]["expression L2"] == max(row["expression L2"] for row in rows.values())
@@ -86,7 +86,7 @@ def test_the_truth_has_no_error_and_random_the_most():
 def test_mime_of_a_speaker_who_copies_the_listener_is_the_truth():
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 1, (3, 60, 58))
-    rows = {row["name"]: row for row in table(2, Clips("arkit58", truth, truth, truth), {}, 2)["rows"][:6]}
+    rows = {row["name"]: row for row in table(2, Clips("arkit58", truth, truth, truth), {}, 2)["rows"][:5]}
     assert rows["Mime"]["FRDist"] == pytest.approx(0, abs=1e-4) and rows["Mime"]["FRSyn"] == 0
     assert rows["Mime"]["FRCorr per sample"] == pytest.approx(1, abs=1e-6)
     assert rows["Mime"]["FRCorr"] == pytest.approx(2, abs=1e-6)  # the challenge's sum over the samples

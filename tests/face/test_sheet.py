@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.contact_sheet import pick_instants, render_head, render_sheet
+from sfms_robot.face.contact_sheet import pick_instants, render_sheet
 from sfms_robot.face.human import load_human
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX
 
@@ -123,8 +123,6 @@ def png_size(file):
 
 def test_pictures_are_drawn_without_a_display(tmp_path):
     pytest.importorskip("vtkmodules")
-    render_head(tmp_path / "one.png", motion(mouthSmileLeft=1), size_px=(160, 120))
-    assert png_size(tmp_path / "one.png") == (160, 120)
     times_s, frames = run_with_events()
     instants = render_sheet(tmp_path / "sheet.png", times_s, frames, times_s > 5, "a run")
     width, height = png_size(tmp_path / "sheet.png")
@@ -135,4 +133,4 @@ def test_pictures_are_drawn_without_a_display(tmp_path):
 def test_a_picture_needs_a_folder(tmp_path):
     pytest.importorskip("vtkmodules")
     with pytest.raises(ConfigError, match="no folder"):
-        render_head(tmp_path / "none" / "a.png", motion())
+        render_sheet(tmp_path / "none" / "a.png", *run_with_events())

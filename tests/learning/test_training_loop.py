@@ -17,7 +17,7 @@ from sfms_robot import config
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.learning import resume
 from sfms_robot.learning.job import Job, Run
-from sfms_robot.learning.loop import fit, optimizer, schedule
+from sfms_robot.learning.training_loop import fit, optimizer, schedule
 
 
 def toy(identity=None, loss=None, held_out=None, seed=3, **phase) -> Job:

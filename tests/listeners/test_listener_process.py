@@ -92,7 +92,9 @@ def test_a_slow_listener_answers_the_newest_frame_and_tells_how_many_it_left_out
 @pytest.fixture
 def listener():
     child = ListenerProcess("sfms-small", 3)
-    child.wait_ready()
+    child.wait_loaded()
+    while child.statistics()["state"] != "listening":
+        child._take(*child._child.next(60.0), 0.0)
     yield child
     child.close()
 
@@ -126,7 +128,7 @@ def test_plans_come_back_and_torch_stays_in_the_child(listener):
 def test_an_unknown_listener_is_told_by_name():
     child = ListenerProcess("nobody", 0)
     with pytest.raises(ModelError, match="nobody"):
-        child.wait_ready()
+        child.wait_loaded()
 
 
 def test_a_child_that_dies_is_started_anew_and_listens_again(listener):
@@ -173,7 +175,7 @@ def test_a_child_that_keeps_dying_is_given_up_and_pushing_goes_on(listener):
 def test_the_child_ends_when_its_parent_is_killed():
     code = (
         "import os, signal; from sfms_robot.listeners.process import ListenerProcess\n"
-        "child = ListenerProcess('sfms-small', 0); child.wait_ready()\n"
+        "child = ListenerProcess('sfms-small', 0); child.wait_loaded()\n"
         "print(child._child._process.pid, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, SHAPES, Plan
-from sfms_robot.motion.timeline import EASE_S, HISTORY, LEAD_S, STALL_S, PlanTimeline, horizon_left_s
+from sfms_robot.motion.timeline import EASE_S, HISTORY, LEAD_S, STALL_S, PlanTimeline
 
 TICK_S = 0.01
 PITCH, BLINK, SMILE = (CHANNEL_INDEX[name] for name in ("pitch", "eyeBlinkLeft", "mouthSmileLeft"))
@@ -205,6 +205,15 @@ def test_the_jaw_pose_replaces_jaw_open():
 def test_the_state_stays_small():
     _, _, state = ran(faces(200, pitch=0.1), hop=1)
     assert len(state.curve.knots.times_s) <= HISTORY + 12
+
+
+def horizon_left_s(horizon: int, hop: int, latency_s: float) -> float:
+    """Longest lead [s] that never runs past the plan: plans of `horizon` frames every `hop`, visible after `latency_s`.
+
+    Negative when plans come too late even without a lead.
+    """
+    delay = 1 if horizon == 1 else 0
+    return (horizon - hop + delay) * FRAME_S - latency_s
 
 
 def test_the_horizon_left_is_enough_to_never_hold():

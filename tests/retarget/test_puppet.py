@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
-from sfms_robot.retarget.eyes import directions
 from sfms_robot.retarget.puppet import EYES_S, FALL_S, HEAD_S, RISE_S, Puppet
+from sfms_robot.signals.eye_angles import directions
 
 DT_S = 0.01
 LEADS_S = np.array([0.0, 0.02, 0.05, 0.11])

@@ -10,8 +10,8 @@ from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
-from sfms_robot.retarget.eyes import directions
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.signals.eye_angles import directions
 
 FULL_RAD = np.radians([30.0, 20.0])
 HEADS = {name: load_head(name) for name in shipped_names(data_dir("configs") / "heads", "head.yaml")}

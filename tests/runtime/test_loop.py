@@ -14,16 +14,17 @@ from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.emulator.sagging import sagged_rad
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.ports import Source, Tick
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.runtime.loop import Parts, drive, turned_by_hand
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.sources.paired import PairedSource
 
 RATE_HZ = 100.0
+ORIGIN_S = 300.0  # of the clock, as of `time.monotonic`
 HEAD = load_head("face28")
 
 
@@ -96,14 +97,16 @@ def run(
     interrupt_at: int | None = None,
     watcher: Watcher | None = None,
     seconds: float = 2.0,
+    source: Source | None = None,
 ) -> Ran:
     clock, watcher = VirtualClock(), watcher or Watcher()
+    clock.origin_s = ORIGIN_S
     motion = build_motion(HEAD, RATE_HZ)
     bus = build_bus(HEAD, {"main": chain}, clock)
     log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
     parts = Parts(
-        PairedSource(duration_s=seconds), InlineFeed(listener, 0, 0.01), motion.timeline, motion.retargeter,
-        motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
+        source or PairedSource(duration_s=seconds), InlineFeed(listener, 0, 0.01), motion.timeline,
+        motion.retargeter, motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
     )  # fmt: skip
 
     def interrupted() -> bool:
@@ -226,3 +229,34 @@ def test_a_servo_that_refuses_torque_leaves_none_of_them_with_torque(chain: Chai
     assert "lid_left (id 5)" in ran.outcome
     assert ran.watcher.ticks == []
     assert all(servo["torque"] == 0 for servo in ran.servos.values())
+
+
+class Started(Source):
+    """A source that keeps what it was told: its start, and when it was read."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, float]] = []
+
+    def start(self, origin_s: float) -> None:
+        self.told.append(("start", origin_s))
+
+    def read(self, now_s: float) -> list[SpeakerFrame]:
+        self.told.append(("read", now_s))
+        return []
+
+
+def test_a_source_starts_once_at_the_first_tick_after_torque_came_on(chain: Chain) -> None:
+    source = Started()
+    ran = run(chain, Nodder(), seconds=0.5, source=source)
+    (_, origin_s), *read = source.told
+    assert origin_s == ORIGIN_S and read[0] == ("read", 0.0) and {what for what, _ in read} == {"read"}
+    assert ran.outcome == "done" and ran.watcher.ticks[0].time_s == 0.0
+
+
+def test_only_what_turns_head_or_eyes_is_by_hand():
+    planned = np.zeros((3, MOTION_DIM), np.float32)
+    assert not turned_by_hand(planned, planned)
+    for channel, turned in (("mouthSmileLeft", False), ("eyeBlinkLeft", False), ("yaw", True), ("eyeLookUpLeft", True)):
+        asked = planned.copy()
+        asked[1, CHANNEL_INDEX[channel]] = 0.3
+        assert turned_by_hand(planned, asked) == turned

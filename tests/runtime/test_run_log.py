@@ -80,3 +80,11 @@ def test_a_log_of_hours_is_as_large_as_one_of_minutes():
     tracemalloc.stop()
     assert grown < 100_000
     assert log.frame_to_wire_ms.report(p50=50)["p50"] == pytest.approx(10.0, rel=0.02)
+
+
+def test_the_share_of_attention_is_of_the_frames_that_tell_it():
+    log = RunLog(["a"], 1 / RATE_HZ, NoAudit())
+    assert log.attention_report() == {"share": None, "frames": 0}
+    for attention in (None, 0.9, 0.6, 0.2, None):
+        log.heard(SpeakerFrame(0.04, np.zeros(0, np.float32), attention=attention))
+    assert log.attention_report() == {"share": 0.6667, "frames": 3}

@@ -10,8 +10,9 @@ from hypothesis import settings
 
 from sfms_robot.config import Bus, Faults, Safety, load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import VirtualTimePort
 
 settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure

@@ -10,8 +10,9 @@ from sfms_robot.errors import BusError
 from sfms_robot.frames import Reading
 from sfms_robot.ports import STOP_S
 from sfms_robot.servo.absent_bus import AbsentBus
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.composite import CompositeBus
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import SerialPort
 
 

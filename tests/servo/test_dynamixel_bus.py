@@ -7,7 +7,8 @@ import pytest
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import SerialPort
 
 RAD_PER_TICK = 2 * math.pi / 4096

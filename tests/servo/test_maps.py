@@ -11,7 +11,7 @@ import yaml
 from typer.testing import CliRunner
 
 from sfms_robot.app.servo.maps import check_maps, list_maps
-from sfms_robot.cli import servo
+from sfms_robot.cli import servo_command
 from sfms_robot.config import FirmwareMap, load, load_firmware_map, map_files, parse, variant
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.registers import Table
@@ -20,7 +20,7 @@ MODELS = [file.stem for file in map_files()]
 FACTS = Path(__file__).parent.parent / "assets" / "servo_addresses.csv"
 
 CLI = typer.Typer()
-CLI.command()(servo.maps)
+CLI.command()(servo_command.maps)
 
 REGISTERS = {
     "id": {"address": 3, "size": 1, "access": "RW", "area": "EEPROM", "unit": "id", "min": 0, "max": 253, "initial": 1},

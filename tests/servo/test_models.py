@@ -6,8 +6,9 @@ import pytest
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.chain.telemetry import common
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
 

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Bus, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.dynamixel2_bus import BusServo, Dynamixel2Bus
+from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.chain.schedule import Rotation, blocks_per_tick, read_s, write_s
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.protocol1 import encode
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import VirtualTimePort
 
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.signals import l2l_mel, mfcc
+from sfms_robot.signals import learning2listen, mfcc
 
 RNG = np.random.default_rng(0)
 NOISE = RNG.normal(0, 0.1, 6400).astype(np.float32)
@@ -64,19 +64,19 @@ def test_lanczos_is_pillows(rows: int, wanted: int):
     image = pytest.importorskip("PIL.Image")
     values = RNG.uniform(0, 1, (rows, 6)).astype(np.float32)
     resized = image.fromarray(values).resize((6, wanted), image.Resampling.LANCZOS)
-    np.testing.assert_allclose(l2l_mel.lanczos(values.astype(float), wanted), np.array(resized), atol=1e-5)
+    np.testing.assert_allclose(learning2listen.lanczos(values.astype(float), wanted), np.array(resized), atol=1e-5)
 
 
 def test_l2l_rows_are_four_a_frame_of_power():
     frames = 12
-    rows = l2l_mel.l2l_mel(NOISE, frames)
+    rows = learning2listen.l2l_mel(NOISE, frames)
     assert rows.shape == (48, 128)
-    np.testing.assert_allclose(l2l_mel.l2l_mel(3 * NOISE, frames), 9 * rows, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(learning2listen.l2l_mel(3 * NOISE, frames), 9 * rows, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("hz", [300.0, 1000.0, 4000.0])
 def test_l2l_tone_is_loudest_in_the_bin_of_its_pitch(hz: float):
     tone = np.sin(2 * np.pi * hz * np.arange(16_000) / 16_000).astype(np.float32)
-    edges = l2l_mel._hz(np.linspace(0, float(l2l_mel._mel(8000.0)), 130))
-    loudest = int(l2l_mel.l2l_mel(tone, 30)[60].argmax())
+    edges = learning2listen._hz(np.linspace(0, float(learning2listen._mel(8000.0)), 130))
+    loudest = int(learning2listen.l2l_mel(tone, 30)[60].argmax())
     assert edges[loudest] - 32 <= hz <= edges[loudest + 2] + 32  # an FFT bin is 31 Hz wide

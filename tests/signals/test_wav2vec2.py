@@ -7,7 +7,7 @@ import pytest
 
 from sfms_robot.errors import MissingExtra, ModelError
 from sfms_robot.signals import wav2vec2
-from sfms_robot.signals.features import MFCC78, Feature, cached, entry
+from sfms_robot.signals.audio_features import MFCC78, Feature, cached, entry
 
 NOISE = np.random.default_rng(0).normal(0, 0.1, 16_000).astype(np.float32)
 

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, FaceFrame, Sighting, SpeakerFrame
 from sfms_robot.ports import Source
-from sfms_robot.sources.paired import ALLOWANCE_S, FACE_S, LONGEST_WAIT_S, JudgedSource, PairedSource
+from sfms_robot.sources.paired import ALLOWANCE_S, FACE_S, LONGEST_WAIT_S, FrameJudge, JudgedSource, PairedSource
 
 # --- what is handed over ---
 
@@ -171,7 +171,9 @@ def test_the_face_is_the_newest_at_the_end_of_its_frame_and_none_when_it_is_old(
         fresh = bool(before) and frame.time_s - max(before) <= FACE_S + 1e-6
         assert (frame.face is not None) == fresh
         if frame.face is not None:
-            assert frame.face.pose[0] == np.float32(max(before) / 100) and frame.face.time_s == frame.time_s
+            assert frame.face.pose[0] == np.float32(max(before) / 100) and frame.face.time_s == pytest.approx(
+                max(before), abs=1e-5
+            )
             assert frame.attention == 0.5
     assert source.statistics()["faces_lost"] == sum(frame.face is None for frame in frames)
 
@@ -197,3 +199,24 @@ def test_all_parts_start_and_close_together():
 def test_latency_is_that_of_the_voice():
     source, _, _ = played(Scripted([0.02] * 9, latency_s=0.03), until_s=0.3)
     assert source.latency_s == 0.03 and source.statistics()["wait_ms"]["p50"] <= 20.0
+
+
+def test_a_face_tells_attention_where_the_source_does_not() -> None:
+    judge, silence = FrameJudge(), np.zeros(0, np.float32)
+    seen = FaceFrame.of(0.0, np.full(58, 0.01))
+    place_m = np.array([1.0, 0.0, 0.0], np.float32)
+    blind = judge.frame(0, silence, None, None)
+    told = judge.frame(1, silence, Sighting(seen), None)
+    given = judge.frame(2, silence, Sighting(seen, 0.25, place_m), None)
+    nowhere = judge.frame(3, silence, Sighting(seen, 0.25, np.full(3, np.nan, np.float32)), None)
+    assert blind.attention is None and blind.place_m is None
+    assert told.attention is not None and told.attention > 0.9 and told.place_m is None
+    assert given.attention == nowhere.attention == 0.25 and nowhere.place_m is None
+    assert given.place_m is not None and np.array_equal(given.place_m, place_m)
+
+
+@pytest.mark.parametrize(("seen_s", "kept_s"), [(0.93, 0.93), (1.0, 1.0), (0.5, 1.0), (1.2, 1.0), (float("nan"), 1.0)])
+def test_a_face_keeps_the_time_that_it_was_seen_where_that_can_be(seen_s: float, kept_s: float) -> None:
+    face = FaceFrame.of(seen_s, np.full(58, 0.01))
+    frame = FrameJudge().frame(24, np.zeros(0, np.float32), Sighting(face), None)
+    assert frame.face is not None and frame.face.time_s == pytest.approx(kept_s)

@@ -51,6 +51,7 @@ def test_pieces_of_any_length_are_heard_whole_and_in_order(rate_hz, piece_s, jit
     steps = (heard(sound)[640:] - heard(sound)[:-640]) * 10 * 25
     assert 0.97 < steps.min() and steps.max() < 1.03
     assert person.source.statistics()["voice"]["delay_ms"] == pytest.approx(1e3 * n / rate_hz, abs=0.1)
+    assert person.voice.latency_s < 0.08
 
 
 @given(st.lists(st.one_of(st.floats(0, 0.5), st.integers(1, 4000), st.none()), max_size=40))
@@ -135,7 +136,7 @@ def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
     source = PairedSource(None, person.sight)
     faces = [frame.face for frame in source.read(0.4)]
     assert [face is not None for face in faces] == [n / 25 <= FACE_S for n in range(1, 11)]
-    assert faces[0].time_s == 0.04 and faces[2].time_s == 0.12
+    assert faces[0].time_s == 0.0 and faces[2].time_s == 0.0  # when it was seen
     person.now_s = 100.42
     person.sight.see(np.zeros(58))
     person.now_s = 100.47

@@ -27,6 +27,7 @@ from sfms_robot.listeners.thread import ListenerThread
 from sfms_robot.ports import Listener, Observer, Source
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
+from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.paired import JudgedSource, PairedSource
@@ -164,13 +165,26 @@ class Robot:
         if self._run is not None:
             self._run.release()
 
+    def halt(self) -> None:
+        """Emergency stop: every joint brakes as fast as its limits allow, from the next tick on; those that bear weight
+        then hold, the others are released. Latched until `resume`. Does not wait, raises nothing.
+        """
+        if self._run is not None:
+            self._run.halt.close("Robot.halt()")
+
+    def resume(self) -> None:
+        """End a halt, whoever began it: torque comes on again, joints ease in from where they stand. Does not wait."""
+        if self._run is not None:
+            self._run.halt.open()
+
     # --- what the robot hears and sees ---
 
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
         """The person's voice: the next piece of sound, of any length. Never blocks.
 
-        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. Sound that has
-        waited for more than a second is left out. Raises ConfigError for another type, shape or rate.
+        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It counts from
+        this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
+        kept. Raises ConfigError for another type, shape or rate.
         """
         self._pushed("hear").voice.hear(pcm, rate_hz)
 
@@ -227,7 +241,8 @@ class Robot:
 
     @property
     def state(self) -> str:
-        """ "starting", "listening", "stopping", "stopped" or "fault" (ended by an error, which `stop` raises)."""
+        """ "starting", "idle", "listening", "speaking", "degraded", "halted", "stopping", "stopped" or "fault" (ended
+        by an error, which `stop` raises): see docs/safety.md."""
         return "stopped" if self._run is None else self._run.state
 
     def report(self) -> dict[str, Any]:
@@ -244,7 +259,7 @@ class Robot:
             "callbacks_detached": dict(self._events.detached),
         }  # fmt: skip
 
-    def _drive(self, interrupt: Interrupt, progress: Observer) -> Report:
+    def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
         with ExitStack() as stack:
             feed = None
             if self._listener is not None:
@@ -258,5 +273,6 @@ class Robot:
                 knobs=lambda _: lambda: self._knobs.now,
                 overlay=self._puppet.overlay,
                 interrupt=interrupt,
+                halt=halt,
                 signals=False,
             )

@@ -4,7 +4,7 @@
 |---|---|---|
 | startup.help, .wrong_port, .wrong_head | until the process is over | the same Python doing nothing |
 | startup.first_goal, .exit, .resident | `run` typed to first goal; last byte to the end; memory | the same |
-| own-voice | own voice taken for the person, person missed, in rooms, double talk and motor noise | what is so in truth |
+| own-voice | own voice taken for the person, person missed, in rooms, over own voice and motors | what is so in truth |
 | memory.growth | resident memory that a run gains per virtual hour, after the first | resident memory after it |
 | bus.write, bus.tick | our sync write; write and read of a head, of each family (CPU time) | the vendor's own calls |
 | bus.cpu_share, bus.wire_use, bus.one_silent | of a core; of the line; ticks with one servo dead | the same |
@@ -12,6 +12,8 @@
 | retarget.stewart | inverse of a six-legged platform | a 6 x 3 matrix product |
 | lead | how late the joints are | the same joints with no lead |
 | listener.plan | one plan on one thread | the time it covers: hop x 40 ms |
+
+`bench webcam` (`webcam_bench.py`), `campaign` and `fuzz` have tables of their own.
 """
 
 from __future__ import annotations
@@ -20,13 +22,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from sfms_robot.app.bench.adversary import adversarial
-from sfms_robot.app.bench.bus import bus
+from sfms_robot.app.bench.bus_bench import bus
 from sfms_robot.app.bench.lead import lead
-from sfms_robot.app.bench.listener import listener
+from sfms_robot.app.bench.listener_bench import listener
 from sfms_robot.app.bench.measure import HEAD, Row, beside
-from sfms_robot.app.bench.memory import HOURS, memory
-from sfms_robot.app.bench.retarget import retarget
-from sfms_robot.app.bench.startup import startup
+from sfms_robot.app.bench.memory_bench import HOURS, memory
+from sfms_robot.app.bench.retarget_bench import retarget
+from sfms_robot.app.bench.startup_bench import startup
 from sfms_robot.errors import ConfigError
 
 PARTS: Mapping[str, Callable[[], dict[str, Row]]] = {

@@ -38,7 +38,7 @@ _ALTERNATE_FRAMES: Final = 100  # own voice goes on and off by this when it talk
 
 @dataclass(frozen=True)
 class Call:
-    """Two people on one clock: samples (n * 640,) and who speaks in each of n frames, by the network on the clean track."""
+    """Two people on one clock: samples (n * 640,); who speaks in each of n frames, by the clean track."""
 
     name: str
     person: Doubles

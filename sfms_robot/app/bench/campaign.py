@@ -18,22 +18,19 @@ A run is the same every time: time is virtual, and the dice are seeded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.bench.campaign_rig import FAMILIES, LIMIT_DEG, RATE_HZ, RECOVERY_S, Judge, Rig, bus_on, head_of
-from sfms_robot.app.session import build_bus
+from sfms_robot.app.bench.campaign_rig import FAMILIES, LIMIT_DEG, RATE_HZ, RECOVERY_S, Judge, Rig, head_of, plugged_in
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.faults import KINDS
-from sfms_robot.emulator.launch import EmulatedServo, launch
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.servo.port import Port
+from sfms_robot.servo.port import Port, WrappedPort
 
 TICKS: Final = 1000
 _QUIET, _FAULTY = 0.1, 0.5  # fraction of the ticks before the fault, and with it
@@ -107,17 +104,11 @@ class Outcome:
 
 
 @dataclass
-class SilencePort:
+class SilencePort(WrappedPort):
     """A port on which silence costs time; what is written arrives at once, and is said."""
 
-    inner: Port
-    clock: VirtualClock
     baud: int
     arrived: Callable[[], None] = field(default=lambda: None)
-
-    @property
-    def name(self) -> str:
-        return self.inner.name
 
     def write(self, data: bytes) -> None:
         self.inner.write(data)
@@ -127,36 +118,8 @@ class SilencePort:
     def read(self, n: int, deadline_s: float) -> bytes:
         data = self.inner.read(n, deadline_s)
         if not data:
-            self.clock.wait_until(deadline_s)
+            self.inner.wait_until(deadline_s)
         return data
-
-    def discard_input(self) -> None:
-        self.inner.discard_input()
-
-    def now_s(self) -> float:
-        return self.inner.now_s()
-
-    def wait_until(self, time_s: float) -> None:
-        self.inner.wait_until(time_s)
-
-    def set_baud(self, baud: int) -> None:
-        self.inner.set_baud(baud)
-
-    def close(self) -> None:
-        self.inner.close()
-
-
-@contextmanager
-def _plugged_in(head: Head, servos: Mapping[str, Sequence[EmulatedServo]]) -> Iterator[Rig]:
-    with ExitStack() as stack:
-        clock = VirtualClock()
-        chains = {name: stack.enter_context(launch(each, virtual=True)) for name, each in servos.items()}
-        rig = Rig(head, chains, clock, build_bus(head, chains, clock, confirmed=True))
-        try:
-            yield rig
-        finally:
-            rig.bus.stop("release")
-            rig.bus.close()
 
 
 def one(family: str, case: str, ticks: int = TICKS) -> Outcome:
@@ -169,7 +132,7 @@ def one(family: str, case: str, ticks: int = TICKS) -> Outcome:
     servos = _found(head, case) if case in STARTS else emulated(head)["main"]
     if servos is None:
         return Outcome(family, case, 0, possible=False)
-    with _plugged_in(head, {"main": servos}) as rig:
+    with plugged_in(head, {"main": servos}) as rig:
         try:
             rig.hold()
         except ServoError as error:
@@ -232,11 +195,12 @@ def _ride(rig: Rig, outcome: Outcome, end_s: float) -> Outcome:
         except Exception as error:  # what escapes is what is looked for
             escaped = f"{type(error).__name__}: {error}"
             return replace(outcome, ticks=tick, escaped=escaped, outside=judge.outside + accepted, stale=judge.stale)
-    since_s = judge.well_since_s
-    recovered_s = None if since_s is None else max(0.0, since_s - end_s)
-    return replace(
-        outcome, outside=judge.outside + accepted, stale=judge.stale, recovered_s=recovered_s, named=judge.named
-    )
+    return _judged(replace(outcome, outside=accepted), judge, end_s)
+
+
+def _judged(outcome: Outcome, judge: Judge, end_s: float) -> Outcome:
+    recovered_s, outside = judge.recovered_s(end_s), outcome.outside + judge.outside
+    return replace(outcome, outside=outside, stale=judge.stale, recovered_s=recovered_s, named=judge.named)
 
 
 def _at_the_end(rig: Rig, outcome: Outcome) -> Outcome:
@@ -250,7 +214,7 @@ def _half_dead(family: str, ticks: int) -> Outcome:
     """Two buses; after a while nobody answers on one of them any more, which is said once; the other goes on."""
     head = head_of(family, _FAILS_AFTER_S)
     outcome, said = Outcome(family, HALF_DEAD, ticks), 0
-    with _plugged_in(head, emulated(head)) as rig:
+    with plugged_in(head) as rig:
         rig.hold()
         judge, dead_s = Judge(rig), rig.clock.now_s() + _QUIET * ticks / RATE_HZ
         rig.chains["other"].inject(f"silent@{dead_s:g}")
@@ -266,40 +230,33 @@ def _half_dead(family: str, ticks: int) -> Outcome:
                     break
         if not said and rig.clock.now_s() > dead_s + _SAID_BY_S:
             outcome = replace(outcome, escaped="nothing: nobody said that a bus has failed")
-        since_s = judge.well_since_s
-        recovered_s = None if since_s is None else max(0.0, since_s - dead_s)
         rig.chains["other"].clear_faults()  # plugged in again: torque off has to reach it
-        return _at_the_end(
-            rig, replace(outcome, outside=judge.outside, stale=judge.stale, recovered_s=recovered_s, named=judge.named)
-        )
+        return _at_the_end(rig, _judged(outcome, judge, dead_s))
 
 
 def _mute_at_stop(family: str) -> Outcome:
     """Everybody hears and nobody answers when `stop` is called, and silence costs time."""
-    head, clock = head_of(family), VirtualClock()
-    servos = emulated(head)["main"]
-    with launch(servos, virtual=True) as chain:
-        ports: list[SilencePort] = []
+    head, ports = head_of(family), list[SilencePort]()
 
-        def wrapped(port: Port) -> Port:
-            ports.append(SilencePort(port, clock, head.buses["main"].baud))
-            return ports[-1]
+    def wrapped(port: Port) -> Port:
+        ports.append(SilencePort(port, head.buses["main"].baud))
+        return ports[-1]
 
-        rig = Rig(head, {"main": chain}, clock, bus_on(head, chain, clock, wrapped))
+    with plugged_in(head, wrap=wrapped) as rig:
         rig.hold()
         for _ in range(round(_QUIET * TICKS)):
             rig.tick()
-        chain.inject("mute")
-        start_s, off_s = clock.now_s(), np.inf
+        rig.chains["main"].inject("mute")
+        start_s, off_s = rig.clock.now_s(), np.inf
 
         def arrived() -> None:
             nonlocal off_s
             if not any(state["torque"] for state in rig.states()):
-                off_s = min(off_s, clock.now_s() - start_s)
+                off_s = min(off_s, rig.clock.now_s() - start_s)
 
         ports[-1].arrived = arrived
         rig.bus.stop("release")
-        stop_s = clock.now_s() - start_s
+        stop_s = rig.clock.now_s() - start_s
         ports[-1].arrived = lambda: None
         return _at_the_end(rig, Outcome(family, MUTE_AT_STOP, 0, off_s=float(off_s), stop_s=stop_s))
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.app.session import build_bus
+from sfms_robot.app.wiring import calibration_of, emulated, firmware_maps, port_of
 from sfms_robot.config import Head, load_firmware_map
-from sfms_robot.emulator.launch import Chain
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Reading
-from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.ports import Bus
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port, VirtualTimePort
+from sfms_robot.servo.port import Port
 
 RATE_HZ: Final = 100.0
 LIMIT_DEG: Final = 40.0
@@ -76,8 +77,7 @@ class Rig:
         self.chains, self.clock, self.bus = chains, clock, bus
         self.ids = [joint.id for joint in head.joints.values()]
         self._wires = [chains[joint.bus] for joint in head.joints.values()]
-        turns = np.array([load_firmware_map(j.model).ticks_per_revolution for j in head.joints.values()])
-        self.conversion = Calibration(head.joints, turns)
+        self.conversion = calibration_of(head.joints)
         self._limiter = JerkLimiter(JointLimits.of(head), 1.0 / RATE_HZ)
         self.tells_position = all("position" in told for told in self.bus.capabilities.values())
 
@@ -171,6 +171,10 @@ class Judge:
         elif self.well_since_s is None:
             self.well_since_s = rig.clock.now_s()
 
+    def recovered_s(self, end_s: float) -> float | None:
+        """From `end_s`, when the trouble was over, until all was well for good; None where it is not."""
+        return None if self.well_since_s is None else max(0.0, self.well_since_s - end_s)
+
     def _see_goal(self, index: int, goal: float) -> None:
         self.outside += not self._low[index] <= goal <= self._high[index]
         self._low[index] = max(self._low[index], min(goal, self._rig.conversion.low_ticks[index]))
@@ -192,17 +196,33 @@ class Judge:
         return told and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
 
 
-def bus_on(head: Head, chain: Chain, clock: VirtualClock, wrap: Callable[[Port], Port]) -> Bus:
-    """The bus `main` of a head, alone, on a port that is wrapped in another one."""
-    config = head.buses["main"]
-    maps = {joint.model: load_firmware_map(joint.model) for joint in head.joints.values()}
-    servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in head.joints.items()]
-    turns = np.array([maps[joint.model].ticks_per_revolution for joint in head.joints.values()])
-    open_port = partial(VirtualTimePort, chain.device, chain.control, config.baud, clock)
-    family = family_named(config.family)
+@contextmanager
+def plugged_in(
+    head: Head,
+    servos: Mapping[str, Sequence[EmulatedServo]] | None = None,
+    wrap: Callable[[Port], Port] | None = None,
+) -> Iterator[Rig]:
+    """The head's servos, as they are found or those given by bus; `wrap` puts the port of a lone bus into another."""
+    clock = VirtualClock()
+    with ExitStack() as stack:
+        plugged = (emulated(head) if servos is None else servos).items()
+        chains = {name: stack.enter_context(launch(each, virtual=True)) for name, each in plugged}
+        bus = build_bus(head, chains, clock, confirmed=True) if wrap is None else _bus_on(head, chains, clock, wrap)
+        try:
+            yield Rig(head, chains, clock, bus)
+        finally:
+            bus.stop("release")
+            bus.close()
+
+
+def _bus_on(head: Head, chains: Mapping[str, Chain], clock: VirtualClock, wrap: Callable[[Port], Port]) -> Bus:
+    [(name, config)] = head.buses.items()
+    maps = firmware_maps(head.joints)
+    servos = [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad) for key, j in head.joints.items()]
+    open_port, family = port_of(chains[name], config, clock), family_named(config.family)
     more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
     bus: Bus = family.bus_class()(
-        "main", servos, Calibration(head.joints, turns), lambda: wrap(open_port()), config.baud, _DEADLINE_S,
+        name, servos, calibration_of(head.joints), lambda: wrap(open_port()), config.baud, _DEADLINE_S,
         config=config, **more,
     )  # fmt: skip
     return bus

@@ -14,11 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from sfms_robot.app import wiring
-from sfms_robot.app.bench.campaign_rig import FAMILIES, RECOVERY_S, Judge, Rig, bus_on, head_of
-from sfms_robot.emulator.launch import launch
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.servo.port import Port
+from sfms_robot.app.bench.campaign_rig import FAMILIES, RECOVERY_S, Judge, Rig, head_of, plugged_in
+from sfms_robot.servo.port import WrappedPort
 
 BYTES: Final = 1_000_000
 MEMORY_MIB: Final = 64.0  # more than this is growth
@@ -76,51 +73,25 @@ class Noise:
 
 
 @dataclass
-class NoisyPort:
+class NoisyPort(WrappedPort):
     """A port that gives noise before what comes in."""
 
-    inner: Port
     noise: Noise
 
-    @property
-    def name(self) -> str:
-        return self.inner.name
-
-    def write(self, data: bytes) -> None:
-        self.inner.write(data)
-
     def read(self, n: int, deadline_s: float) -> bytes:
-        return self.noise.take(n) if self.noise.waiting else self.inner.read(n, deadline_s)
+        return self.noise.take(n) if self.noise.waiting else super().read(n, deadline_s)
 
     def discard_input(self) -> None:
         self.noise.discard()
-        self.inner.discard_input()
-
-    def now_s(self) -> float:
-        return self.inner.now_s()
-
-    def wait_until(self, time_s: float) -> None:
-        self.inner.wait_until(time_s)
-
-    def set_baud(self, baud: int) -> None:
-        self.inner.set_baud(baud)
-
-    def close(self) -> None:
-        self.inner.close()
+        super().discard_input()
 
 
 def fuzz_one(family: str, count: int = BYTES, seed: int = 0) -> Fuzzed:
     """`count` bytes at the bus of one family, and then calm."""
-    head, clock = head_of(family), VirtualClock()
-    with launch(wiring.emulated(head)["main"], virtual=True) as chain:
-        noise = Noise(random.Random(seed))
-        rig = Rig(head, {"main": chain}, clock, bus_on(head, chain, clock, lambda port: NoisyPort(port, noise)))
-        try:
-            rig.hold()
-            return _storm(rig, family, noise, count)
-        finally:
-            rig.bus.stop("release")
-            rig.bus.close()
+    noise = Noise(random.Random(seed))
+    with plugged_in(head_of(family), wrap=lambda port: NoisyPort(port, noise)) as rig:
+        rig.hold()
+        return _storm(rig, family, noise, count)
 
 
 def _storm(rig: Rig, family: str, noise: Noise, count: int) -> Fuzzed:
@@ -143,9 +114,7 @@ def _storm(rig: Rig, family: str, noise: Noise, count: int) -> Fuzzed:
             break
         slowest_s = max(slowest_s, time.perf_counter() - began_s)
         judge.see(readings)
-    since_s = judge.well_since_s
-    recovered_s = None if since_s is None else max(0.0, since_s - end_s)
-    grown_mib = _memory_mib() - before_mib
+    recovered_s, grown_mib = judge.recovered_s(end_s), _memory_mib() - before_mib
     return Fuzzed(
         family, noise.count, ticks, escaped, judge.outside, recovered_s, judge.named, 1e3 * slowest_s, grown_mib
     )

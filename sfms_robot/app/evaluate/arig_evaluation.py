@@ -17,11 +17,12 @@ from sfms_robot.app.train.train_runs import TrainOptions, run_of, train_settings
 from sfms_robot.config import find, parse_training
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.corpora.states import UNKNOWN
+from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import interaction as scores
 from sfms_robot.evaluation.paper import arig_tables as tables
 from sfms_robot.evaluation.paper.listener_clips import spread
+from sfms_robot.evaluation.paper.listener_tables import cut
 from sfms_robot.evaluation.rollout import Rollout, rollouts
 from sfms_robot.learning.arig.features import open_scenes
 from sfms_robot.learning.arig.trainer import train_arig
@@ -76,7 +77,7 @@ def _states(played: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips:
     said = np.concatenate([said for said, _, _ in labelled])
     truth = np.concatenate([states for _, _, states in labelled])
     truth = np.where(said < 0, UNKNOWN, truth).astype(np.int8)  # the first frame of a stream is given
-    voices = np.concatenate([scores.heard_voices(dyad) for _, dyad, _ in labelled])
+    voices = np.concatenate([scores.voice_tracks(dyad) for _, dyad, _ in labelled])
     tables_of = {"state": scores.confusion(said, truth)}
     tables_of |= {name: scores.confusion(answers, truth) for name, answers in _by_rule(voices, data, clips).items()}
     found: dict[str, Any] = {}
@@ -93,7 +94,7 @@ def _by_rule(voices: scores.Bools, data: Path, clips: int | None) -> dict[str, s
     if not (states >= 0).any():
         return {}
     majority = np.full(len(voices), np.bincount(states[states >= 0]).argmax(), np.int8)
-    rule = scores.VoiceRule.of(np.concatenate([scores.heard_voices(dyad) for dyad in learned]), states)
+    rule = scores.VoiceRule.of(np.concatenate([scores.voice_tracks(dyad) for dyad in learned]), states)
     return {"majority": majority, "voice_rule": rule(voices)}
 
 
@@ -134,11 +135,12 @@ def arig_table(
     folders = {one: find("listeners", one, "config.yaml") for one in names}
     if number != 2:
         folders = _ablated(number, data, ablations)
-    truth, speaker = (tables.cut(each) for each in ([d.listener for d in held_out], [d.speaker for d in held_out]))
+    truth = cut([dyad.listener for dyad in held_out], tables.CLIP_FRAMES)
+    speaker = cut([dyad.speaker for dyad in held_out], tables.CLIP_FRAMES)
     answers = {}
     for label, folder in folders.items():
         played = _played(label, load_listener(folder), {scene: held_out}, seed)[scene]
-        answers[label] = tables.cut([one.motion[0] for one in played])
+        answers[label] = cut([one.motion[0] for one in played], tables.CLIP_FRAMES)
     rows = (
         tables.table_2(truth, speaker, answers)
         if number == 2

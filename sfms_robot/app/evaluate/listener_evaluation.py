@@ -67,12 +67,12 @@ def evaluate_listener(names: Sequence[str], data: Path, seed: int, order: Order 
             task = progress.add_task(name, total=len(dyads))
             motions = [one.motion[0] for one in rollouts(listener, dyads, seed, partial(progress.advance, task))]
             figures = asdict(behaviour(motions, dyads)) | _keyframe_scores(listener, dyads)
-            rows.append({"name": name, **_told(figures)})
-    rows.append({"name": "dyads", **_told(asdict(behaviour([dyad.listener for dyad in dyads], dyads)))})
+            rows.append({"name": name, **_nulls_for_nan(figures)})
+    rows.append({"name": "dyads", **_nulls_for_nan(asdict(behaviour([dyad.listener for dyad in dyads], dyads)))})
     return {"listeners": list(names), "dyads": len(dyads), "rows": rows}
 
 
-def _told(figures: Mapping[str, float]) -> dict[str, float | None]:
+def _nulls_for_nan(figures: Mapping[str, float]) -> dict[str, float | None]:
     """None for what there was nothing to measure by: NaN is no JSON."""
     return {key: value if math.isfinite(value) else None for key, value in figures.items()}
 

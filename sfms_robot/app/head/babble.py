@@ -14,11 +14,11 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.app.head.pose import NobodyThere
+from sfms_robot.app.head.pose import NobodyThere, WholeTimeline
 from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head
-from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats, Plan
+from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.runtime.recorder import FullPolicy, Recorder
 from sfms_robot.runtime.safety import EASE_S, Interrupt, smooth
 
@@ -53,7 +53,7 @@ def babble(name: str, port: str, record: Path, *, minutes: float = 2.0, seed: in
     return Babbled(opened.config, drove.outcome, faces.duration_s, drove.log.audited.violations)
 
 
-class Faces:
+class Faces(WholeTimeline):
     """A timeline through faces (K, 52) at rising times (K,), by smooth steps."""
 
     def __init__(self, times_s: Doubles, shapes: Floats) -> None:
@@ -77,15 +77,6 @@ class Faces:
         times.append(times[-1] + TOGETHER_S)
         shapes.append(np.zeros(len(BLENDSHAPES)))
         return cls(np.array(times), np.array(shapes, dtype=np.float32))
-
-    def start(self) -> None:
-        return None
-
-    def accept(self, plan: Plan, state: None) -> None:
-        return None
-
-    def lead_limit_s(self, state: None) -> float:
-        return float("inf")
 
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
         """Motion (N, 58) at each of (N,) instants."""

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from sfms_robot.corpora.compose.motions import load
+from sfms_robot.corpora.takes import face_stretches, folder_takes
 from sfms_robot.data import data_dir
-from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, MOTION_DIM, POSE_CHANNELS, Floats
-from sfms_robot.signals.tracks import read_track, resample
+from sfms_robot.frames import MOTION_DIM, POSE_CHANNELS, Floats
 
 SHORTEST = 4  # frames that a curve can be laid through
 _POSE = len(POSE_CHANNELS)
@@ -35,14 +34,14 @@ def recorded_faces(folder: Path | None = None) -> list[Floats]:
 
 def named_faces(folder: Path | None = None) -> list[tuple[str, Floats]]:
     """As `recorded_faces`, each clip with the name of its track or its kind of motion."""
-    found = _bundled() if folder is None else _tracks(folder)
+    found = _bundled() if folder is None else [(take.name, take.motion) for take in folder_takes(folder)]
     return [(name, clip) for name, clip in found if len(clip) >= SHORTEST]
 
 
 def _bundled() -> list[tuple[str, Floats]]:
     sim = data_dir("sim")
     speakers = sorted(sim.glob("speakers/*/face.csv.gz"))
-    clips = [(track.parent.name, clip) for track in speakers for clip in _seen(track)]
+    clips = [(take.name, take.motion) for track in speakers for take in face_stretches(track, track.parent.name)]
     for motions in load(sim / "listeners" / "motions.npz").values():
         for kind, columns in _PARTS.items():
             for piece in getattr(motions, kind):
@@ -51,18 +50,3 @@ def _bundled() -> list[tuple[str, Floats]]:
                 clip[:, _POSE:] = np.clip(clip[:, _POSE:], 0.0, 1.0)
                 clips.append((kind, clip))
     return clips
-
-
-def _tracks(folder: Path) -> list[tuple[str, Floats]]:
-    files = sorted([*folder.rglob("*.csv"), *folder.rglob("*.csv.gz")])
-    if not files:
-        raise ConfigError(f"--data {str(folder)!r}: no face tracks (*.csv, *.csv.gz) below it")
-    return [(str(file.relative_to(folder)), clip) for file in files for clip in _seen(file)]
-
-
-def _seen(file: Path) -> list[Floats]:
-    """The stretches of a track in which a face was seen."""
-    motion = resample(read_track(file), FRAME_HZ).motion
-    seen = np.isfinite(motion).all(axis=1)
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
-    return [motion[first:last] for first, last in zip(ends[::2], ends[1::2], strict=True)]

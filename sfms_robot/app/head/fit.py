@@ -181,10 +181,3 @@ def virtual_tracker(head: Head, skin: Skin, noise: float = 0.0) -> Tracker:
 def showing(head: Head) -> Doubles:
     """(J, 52) the value that every blendshape, alone and at 1, asks of every joint."""
     return looks_like(head, np.eye(len(BLENDSHAPES), dtype=np.float32)).T
-
-
-def with_drives(head: Head, responses: Sequence[Response | None]) -> Head:
-    """The head with its responses made up for."""
-    found = fitted_drives(head, responses)
-    joints = {n: j.model_copy(update={"drive": found[n]}) if n in found else j for n, j in head.joints.items()}
-    return head.model_copy(update={"joints": joints})

@@ -113,13 +113,8 @@ def pose_head(options: PoseOptions) -> dict[str, Any]:
     }
 
 
-class HeldFace:
-    """A timeline of one face: torque comes on and settles, the face rises, stays for `hold_s`, and falls."""
-
-    def __init__(self, face: Floats, hold_s: float) -> None:
-        self._face = face
-        self._falls_s = EASE_S + RISE_S + hold_s
-        self.duration_s = self._falls_s + RISE_S
+class WholeTimeline:
+    """A `ports.Timeline` whose future is known: it takes no plans, and there is nothing to remember."""
 
     def start(self) -> None:
         return None
@@ -130,6 +125,15 @@ class HeldFace:
     def lead_limit_s(self, state: None) -> float:
         return float("inf")
 
+
+class HeldFace(WholeTimeline):
+    """A timeline of one face: torque comes on and settles, the face rises, stays for `hold_s`, and falls."""
+
+    def __init__(self, face: Floats, hold_s: float) -> None:
+        self._face = face
+        self._falls_s = EASE_S + RISE_S + hold_s
+        self.duration_s = self._falls_s + RISE_S
+
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
         """Motion (N, 58) at each of (N,) instants."""
         share = smooth((times_s - EASE_S) / RISE_S) - smooth((times_s - self._falls_s) / RISE_S)
@@ -138,6 +142,8 @@ class HeldFace:
 
 class NobodyThere(Source):
     """The empty source and the empty feed: nobody speaks, nobody listens."""
+
+    lost = False
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
         return ()

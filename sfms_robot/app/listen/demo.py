@@ -47,7 +47,7 @@ def demo(options: DemoOptions, progress: Callable[[float | None], Observer] | No
     """
     folder = options.folder if options.folder is not None else free_folder(Path(FOLDER))
     report = session.run(options.run(options.seed, folder), progress)
-    told = {**_seen(options, report), "folder": str(folder), "pictures": [], "missing": None, "report": report}
+    told = {**_summary(options, report), "folder": str(folder), "pictures": [], "missing": None, "report": report}
     if report["exit"] == "failed" or not report["ticks"]:  # interrupted before it began: nothing to draw
         return told
     from sfms_robot.app.replay import replay_run  # scipy: not while servos move
@@ -64,7 +64,7 @@ def compare_seeds(options: DemoOptions, seeds: int, each: Callable[[dict[str, An
     """Seeds 0 to `seeds` - 1 one after the other, nothing recorded; `each` hears of every one. Raises RobotError."""
     rows = []
     for seed in range(seeds):
-        rows.append(_seen(options, session.run(options.run(seed, None))) | {"seed": seed})
+        rows.append(_summary(options, session.run(options.run(seed, None))) | {"seed": seed})
         each(rows[-1])
         if rows[-1]["exit"] != "done":
             break
@@ -77,7 +77,7 @@ def free_folder(folder: Path) -> Path:
     return next(each for each in chain([folder], numbered) if not each.exists())
 
 
-def _seen(options: DemoOptions, report: dict[str, Any]) -> dict[str, Any]:
+def _summary(options: DemoOptions, report: dict[str, Any]) -> dict[str, Any]:
     """What a person in front of the head would have seen."""
     head = load_head(options.head)
     retargeter = HeadRetargeter(head)

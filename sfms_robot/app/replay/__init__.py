@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sfms_robot.app.evaluate.plot_style import checked_png
+from sfms_robot.app.plot_style import checked_png
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.app.replay.run_plot import plot
 from sfms_robot.app.replay.run_sheet import sheet

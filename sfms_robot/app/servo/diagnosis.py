@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 from sfms_robot.app.servo.budget import Budget
 from sfms_robot.app.servo.register_view import State
-from sfms_robot.app.servo.serial_line import Seen
+from sfms_robot.app.servo.serial_line import FoundServo
 from sfms_robot.servo.discovery import Holder, SerialDevice
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
@@ -166,8 +166,8 @@ def udev_rule(device: SerialDevice) -> str | None:
 
 def judge_presence(
     wanted: Mapping[int, Wanted],
-    here: Mapping[int, Seen],
-    elsewhere: Mapping[int, Seen],
+    here: Mapping[int, FoundServo],
+    elsewhere: Mapping[int, FoundServo],
     baud: int,
     command: Command,
     hint: str = "",
@@ -206,7 +206,7 @@ def judge_presence(
             )
 
 
-def _judge_model(seen: Seen, want: Wanted, command: Command) -> Iterator[Finding]:
+def _judge_model(seen: FoundServo, want: Wanted, command: Command) -> Iterator[Finding]:
     if want.model_number is not None and seen.model_number not in (None, want.model_number):
         yield Finding(
             "error",
@@ -340,7 +340,7 @@ def _as_it_is(values: Mapping[str, int], table: Table) -> JointNeeds:
     return JointNeeds(low, high) if low < high else JointNeeds(table.center_ticks, table.center_ticks)
 
 
-def _own_registers(seen: Seen) -> list[str]:
+def _own_registers(seen: FoundServo) -> list[str]:
     return [name for name, field in seen.table.fields.items() if field.writable] if seen.table is not None else []
 
 

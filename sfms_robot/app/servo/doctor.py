@@ -32,7 +32,7 @@ from sfms_robot.app.servo.diagnosis import (
 )
 from sfms_robot.app.servo.protocol_hint import protocol_hint
 from sfms_robot.app.servo.register_view import State, read_all
-from sfms_robot.app.servo.serial_line import SIM, Seen, Wire, only_port, table_of
+from sfms_robot.app.servo.serial_line import SIM, FoundServo, Wire, only_port, table_of
 from sfms_robot.app.servo.single_servo import Confirm, Progress, field_named, guard, has_duplicate, put, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay
@@ -252,7 +252,7 @@ def _fix(wire: Wire, state: State, want: Wanted | None, confirm: Confirm) -> lis
     return done
 
 
-def _clear_turns(wire: Wire, seen: Seen) -> None:
+def _clear_turns(wire: Wire, seen: FoundServo) -> None:
     """Forget whole turns; the shaft stays where it is."""
     answer = cast(Dynamixel2Link, wire.link).clear_turns(seen.id)
     if answer is None or (refusal := wire.link.refusal(answer)):
@@ -285,7 +285,7 @@ def _first_baud(line: Line) -> int:
     return line.baud or servo_families()[line.family].bauds[0]
 
 
-def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, Seen], dict[int, Seen]]:
+def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, FoundServo], dict[int, FoundServo]]:
     """(at the line's rate, at others), by id. With a head, other rates are looked at only for ids that are missing."""
     if line.baud is None and not line.wanted:
         found = scan(wire, None, progress)
@@ -293,7 +293,7 @@ def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, S
         return {s.id: s for s in found if s.baud == usual}, {s.id: s for s in found if s.baud != usual}
     wanted = list(line.wanted)
     here = _at_this_rate(wire, wanted)
-    elsewhere: dict[int, Seen] = {}
+    elsewhere: dict[int, FoundServo] = {}
     for step, _ in enumerate(wire.reachable()):
         missing = [servo for servo in wanted if servo not in here and servo not in elsewhere]
         if not missing:
@@ -306,7 +306,7 @@ def _who(wire: Wire, line: Line, progress: Progress | None) -> tuple[dict[int, S
     return here, elsewhere
 
 
-def _as_wanted(seen: Seen, line: Line) -> Seen:
+def _as_wanted(seen: FoundServo, line: Line) -> FoundServo:
     """The head knows better than the number which map holds: some models have none of their own, or share one."""
     want = line.wanted.get(seen.id)
     if want is None or want.model_number not in (None, seen.model_number):
@@ -316,11 +316,11 @@ def _as_wanted(seen: Seen, line: Line) -> Seen:
     return replace(seen, table=table_of(line.family, seen.model_number, seen.firmware, want.model))
 
 
-def _at_this_rate(wire: Wire, ids: Sequence[int]) -> dict[int, Seen]:
+def _at_this_rate(wire: Wire, ids: Sequence[int]) -> dict[int, FoundServo]:
     """Who answers: to a question to everybody where there is one, and those of `ids` that are asked once more."""
-    found: dict[int, Seen] = {}
+    found: dict[int, FoundServo] = {}
     if wire.kind.broadcast:
-        found = {servo: wire.seen(servo, each) for servo, each in sorted(wire.link.broadcast_ping().items())}
+        found = {servo: wire.identified(servo, each) for servo, each in sorted(wire.link.broadcast_ping().items())}
     if found or not wire.kind.broadcast:
         for servo in ids:
             if servo not in found and (seen := wire.ping(servo)) is not None:
@@ -328,7 +328,7 @@ def _at_this_rate(wire: Wire, ids: Sequence[int]) -> dict[int, Seen]:
     return found
 
 
-def _speak_again(seen: Seen, command: Command) -> str:
+def _speak_again(seen: FoundServo, command: Command) -> str:
     level = seen.table.role("status_level") if seen.table else None
     return command.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
 

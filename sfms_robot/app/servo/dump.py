@@ -8,7 +8,7 @@ from typing import Any, Literal
 import yaml
 
 from sfms_robot.app.servo.register_view import read_all
-from sfms_robot.app.servo.serial_line import Seen, Wire
+from sfms_robot.app.servo.serial_line import FoundServo, Wire
 from sfms_robot.app.servo.single_servo import Confirm, guard, put, set_baud, set_id
 from sfms_robot.config.base import Model, load
 from sfms_robot.errors import ConfigError
@@ -31,7 +31,7 @@ class Dump(Model):
     servos: tuple[DumpedServo, ...]
 
 
-def dump(wire: Wire, servos: list[Seen]) -> Dump:
+def dump(wire: Wire, servos: list[FoundServo]) -> Dump:
     """Every register of `servos` as it stands. Raises ConfigError for a model without a firmware map, ServoError."""
     found = []
     for seen in servos:
@@ -59,7 +59,7 @@ def load_dump(file: Path) -> Dump:
     return load(Dump, file)
 
 
-def differences(wire: Wire, seen: Seen, was: DumpedServo) -> list[tuple[str, int, int]]:
+def differences(wire: Wire, seen: FoundServo, was: DumpedServo) -> list[tuple[str, int, int]]:
     """(register, value now, value then) of what lasts and is another, without id and rate. Raises ConfigError for
     another model, ServoError.
     """
@@ -72,7 +72,9 @@ def differences(wire: Wire, seen: Seen, was: DumpedServo) -> list[tuple[str, int
     return [(n, now[n], was.registers[n]) for n in lasting if n in was.registers and now.get(n) != was.registers[n]]
 
 
-def restore(wire: Wire, seen: Seen, was: DumpedServo, confirm: Confirm, identity: bool = False) -> list[dict[str, Any]]:
+def restore(
+    wire: Wire, seen: FoundServo, was: DumpedServo, confirm: Confirm, identity: bool = False
+) -> list[dict[str, Any]]:
     """Write what lasts of a dumped servo into `seen`, each register verified; rows of what was changed.
 
     The changes are shown in one question. With `identity` the servo gets id and rate of the file as well, last.

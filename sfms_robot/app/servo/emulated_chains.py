@@ -30,7 +30,7 @@ _START: Final = re.compile(r"(?P<ids>[0-9,-]+)=(?P<value>-?\d+)")
 
 @dataclass(frozen=True)
 class EmulateOptions:
-    """What to plug in (a head or a list of servos), and how it behaves. See `cli.emulate` for the meaning of each."""
+    """What to plug in (a head or a list of servos), and how it behaves. Each as in `cli.emulate_command`."""
 
     head: str | None = None
     servo: str | None = None

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from sfms_robot.app.servo.serial_line import Seen, Wire
+from sfms_robot.app.servo.serial_line import FoundServo, Wire
 from sfms_robot.app.servo.single_servo import field_named, put, read
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.chain.slow_profile import WayInside, slow_profile, way_inside
@@ -27,7 +27,7 @@ STILL_TICKS: Final = 1  # between two looks: it stands
 CLOSE_DEG: Final = 1.5  # a loaded servo without integral gain stops that short
 
 
-def move(wire: Wire, seen: Seen, to: str | None, by: str | None) -> dict[str, Any]:
+def move(wire: Wire, seen: FoundServo, to: str | None, by: str | None) -> dict[str, Any]:
     """Move a servo to a place or by a way: raw ticks, or degrees of its shaft as `-5deg`.
 
     Its own profile is limited and its goal goes in steps of at most `SPEED_DEG_S`; torque comes on where it stands.
@@ -59,7 +59,7 @@ def move(wire: Wire, seen: Seen, to: str | None, by: str | None) -> dict[str, An
     return {"id": seen.id, "from": start, "to": target, "reached": reached}
 
 
-def _limits(wire: Wire, seen: Seen, table: Table) -> tuple[int, int]:
+def _limits(wire: Wire, seen: FoundServo, table: Table) -> tuple[int, int]:
     """Those that it has stored, or a turn where it has none or they are the same."""
     turn = 0, math.ceil(table.ticks_per_revolution) - 1
     names = limit_names(table)
@@ -69,7 +69,7 @@ def _limits(wire: Wire, seen: Seen, table: Table) -> tuple[int, int]:
     return (low, high) if low < high else turn
 
 
-def _target(seen: Seen, table: Table, limits: tuple[int, int], start: int, to: str | None, by: str | None) -> int:
+def _target(seen: FoundServo, table: Table, limits: tuple[int, int], start: int, to: str | None, by: str | None) -> int:
     if (to is None) == (by is None):
         raise ConfigError("servo move: say --to TICKS or --by TICKS, one of them (or degrees: --by -5deg)")
     target = _parsed(table, to) if to is not None else start + _parsed(table, by or "")
@@ -86,7 +86,7 @@ def _parsed(table: Table, text: str) -> int:
     return round(_ticks(table, float(match[1]))) if match[2] else int(match[1])
 
 
-def _in_position_mode(wire: Wire, seen: Seen) -> None:
+def _in_position_mode(wire: Wire, seen: FoundServo) -> None:
     table = seen.registers()
     mode = table.role("operating_mode")
     if mode is None or table.position_mode is None:
@@ -99,7 +99,7 @@ def _in_position_mode(wire: Wire, seen: Seen) -> None:
 
 
 @contextmanager
-def _torque_as_found(wire: Wire, seen: Seen) -> Iterator[None]:
+def _torque_as_found(wire: Wire, seen: FoundServo) -> Iterator[None]:
     """Torque goes off again afterwards where it was off."""
     torque = field_named(seen.registers(), "torque_enable")
     was_on = read(wire, seen, torque)
@@ -111,7 +111,7 @@ def _torque_as_found(wire: Wire, seen: Seen) -> Iterator[None]:
 
 
 @contextmanager
-def _gently(wire: Wire, seen: Seen, start: int) -> Iterator[None]:
+def _gently(wire: Wire, seen: FoundServo, start: int) -> Iterator[None]:
     """Torque on at `start` with a slow profile, which is as before afterwards."""
     table = seen.registers()
     torque, goal = field_named(table, "torque_enable"), field_named(table, "goal_position")
@@ -129,7 +129,7 @@ def _gently(wire: Wire, seen: Seen, start: int) -> Iterator[None]:
             put(wire, seen, speed, was_fast)
 
 
-def _brought_in(wire: Wire, seen: Seen, start: int, limits: tuple[int, int]) -> int:
+def _brought_in(wire: Wire, seen: FoundServo, start: int, limits: tuple[int, int]) -> int:
     """Move a servo inside its limits by its own slow profile; where it stands then, with torque.
 
     Raises ServoError, torque off, where it does not come in twice the time that the way should take.
@@ -162,7 +162,7 @@ def _brought_in(wire: Wire, seen: Seen, start: int, limits: tuple[int, int]) -> 
     return here
 
 
-def _arrived_inside(wire: Wire, seen: Seen, way: WayInside, limits: tuple[int, int]) -> int | None:
+def _arrived_inside(wire: Wire, seen: FoundServo, way: WayInside, limits: tuple[int, int]) -> int | None:
     """Where it stands still inside `limits`; None where it does not in time."""
     present, end_s = field_named(seen.registers(), "present_position"), wire.clock.now_s() + way.bound_s
     before = None
@@ -181,14 +181,14 @@ def _slow(speed: Field) -> int:
     return min(speed.high, max(1, round(2.0 * SPEED_DEG_S / per_unit / speed.scale)))
 
 
-def _in_the_way(wire: Wire, seen: Seen, goal: int, present: int) -> None:
+def _in_the_way(wire: Wire, seen: FoundServo, goal: int, present: int) -> None:
     table = seen.registers()
     if abs(goal - present) > _ticks(table, BEHIND_DEG):
         put(wire, seen, field_named(table, "goal_position"), present)
         raise ServoError(f"id {seen.id} stays at {present} while its goal is {goal}: something is in the way")
 
 
-def _settled(wire: Wire, seen: Seen, present: Field, target: int) -> int:
+def _settled(wire: Wire, seen: FoundServo, present: Field, target: int) -> int:
     """Where it stands once it is close. Raises ServoError."""
     end_s = wire.clock.now_s() + SETTLE_S
     while True:

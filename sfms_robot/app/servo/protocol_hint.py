@@ -42,9 +42,9 @@ def protocol_hint(wire: Wire) -> str:
 
 def _speaks(port: Port, wire: Wire, baud: int) -> str | None:
     """The family that answers at the port's rate."""
-    if _DXL2_HEADER in _heard(port, dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING)):
+    if _DXL2_HEADER in _reply(port, dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING)):
         return "dynamixel2"
-    frames = protocol1.salvage(bytearray(_heard(port, protocol1.encode(protocol1.BROADCAST, protocol1.PING))))
+    frames = protocol1.salvage(bytearray(_reply(port, protocol1.encode(protocol1.BROADCAST, protocol1.PING))))
     if not frames and baud in servo_families()["dynamixel1"].bauds[:2]:  # these answer only to their own id
         link = Wire(port, "dynamixel1", wire.clock, baud, fixed=True).link
         link.silence_s = _ID_S
@@ -58,7 +58,7 @@ def _speaks(port: Port, wire: Wire, baud: int) -> str | None:
     return None
 
 
-def _heard(port: Port, request: bytes) -> bytes:
+def _reply(port: Port, request: bytes) -> bytes:
     """What comes back within `LISTEN_S`, without the echo of an adapter that hears itself."""
     port.discard_input()
     port.write(request)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sfms_robot.app.servo.serial_line import TRIES, Seen, Wire
+from sfms_robot.app.servo.serial_line import TRIES, FoundServo, Wire
 from sfms_robot.app.servo.single_servo import read_block
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
@@ -28,7 +28,7 @@ class State:
         error: error byte of the last answer.
     """
 
-    seen: Seen
+    seen: FoundServo
     start: int
     table: bytes
     error: int
@@ -78,7 +78,7 @@ class State:
         }
 
 
-def read_all(wire: Wire, seen: Seen) -> State:
+def read_all(wire: Wire, seen: FoundServo) -> State:
     """The whole table of a known model. Raises ServoError for a servo that pings and tells nothing."""
     if seen.table is None:
         return State(seen, 0, b"", 0)
@@ -90,13 +90,13 @@ def read_all(wire: Wire, seen: Seen) -> State:
     return State(seen, 0, data, _error_byte(wire, seen))
 
 
-def watch(wire: Wire, servos: Sequence[Seen]) -> list[dict[str, Any]]:
+def watch(wire: Wire, servos: Sequence[FoundServo]) -> list[dict[str, Any]]:
     """One row per servo: where it is, how it is; `silent` for one that does not answer."""
     return [_watched(wire, seen) for seen in servos]
 
 
 def samples(
-    wire: Wire, servos: Sequence[Seen], period_s: float, count: int | None = None
+    wire: Wire, servos: Sequence[FoundServo], period_s: float, count: int | None = None
 ) -> Iterator[list[dict[str, Any]]]:
     """`watch`, every `period_s`, `count` times or for ever."""
     due_s = wire.clock.now_s()
@@ -106,7 +106,7 @@ def samples(
         due_s = max(due_s + period_s, wire.clock.now_s())
 
 
-def _watched(wire: Wire, seen: Seen) -> dict[str, Any]:
+def _watched(wire: Wire, seen: FoundServo) -> dict[str, Any]:
     fields = [] if seen.table is None else [f for role in _WATCHED if (f := seen.table.role(role)) is not None]
     if not fields:
         return {**State(seen, 0, b"", 0).row(), "faults": "no firmware map"}
@@ -118,7 +118,7 @@ def _watched(wire: Wire, seen: Seen) -> dict[str, Any]:
     return State(seen, start, answer.data, answer.error).row()
 
 
-def _error_byte(wire: Wire, seen: Seen) -> int:
+def _error_byte(wire: Wire, seen: FoundServo) -> int:
     """Of an answer that asked for nothing special: what it says then is about the servo."""
     for _ in range(TRIES):
         answer = wire.link.read(seen.id, 0, 2)

@@ -30,7 +30,7 @@ TRIES: Final = 3
 
 
 @dataclass(frozen=True)
-class Seen:
+class FoundServo:
     """A servo that answered. `table` is None for a model without a firmware map; `twice`: there seem to be two."""
 
     id: int
@@ -99,15 +99,15 @@ class Wire:
             self.link = self._link(baud)
         return self.link
 
-    def ping(self, servo: int, tries: int = TRIES) -> Seen | None:
+    def ping(self, servo: int, tries: int = TRIES) -> FoundServo | None:
         """The servo at the rate of now, or None."""
         for _ in range(tries):
             found = self.link.ping(servo)
             if found is not None:
-                return self.seen(servo, found)
+                return self.identified(servo, found)
         return None
 
-    def find(self, servo: int) -> Seen:
+    def find(self, servo: int) -> FoundServo:
         """The servo, at whatever rate it answers; the wire stays at that rate. Raises BusError."""
         self.check_id(servo)
         for _ in self.reachable():
@@ -128,10 +128,10 @@ class Wire:
                 continue
             yield baud
 
-    def seen(self, servo: int, found: Found) -> Seen:
+    def identified(self, servo: int, found: Found) -> FoundServo:
         """What answered, with its firmware map."""
         table = self._taken_for or table_of(self.family, found.model_number, found.firmware)
-        return Seen(servo, self.baud, found.model_number, found.firmware, table)
+        return FoundServo(servo, self.baud, found.model_number, found.firmware, table)
 
     def check_id(self, servo: int, what: str = "id") -> None:
         if not 0 <= servo <= self.kind.max_id:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from sfms_robot.app.servo.serial_line import PATIENCE_S, TRIES, Seen, Wire
+from sfms_robot.app.servo.serial_line import PATIENCE_S, TRIES, FoundServo, Wire
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.duplicate_ids import ping_replies
@@ -52,7 +52,7 @@ class Value:
 # --- finding ----------------------------------------------------------------------------------------------------
 
 
-def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress | None = None) -> list[Seen]:
+def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress | None = None) -> list[FoundServo]:
     """Everybody who answers at any of the wire's rates, by rate and id.
 
     `ids` are asked one by one; None asks all at once where the family can, else every id there is.
@@ -60,14 +60,14 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress | None
     for servo in ids or ():
         wire.check_id(servo)
     asked = ids if ids is not None else None if wire.kind.broadcast else range(wire.kind.max_id + 1)
-    found: list[Seen] = []
+    found: list[FoundServo] = []
     total = len(wire.bauds) * (len(asked) if asked is not None else 1)
     for baud in wire.reachable():
         done = wire.bauds.index(baud) * (total // len(wire.bauds))
         if asked is None:
             if progress:
                 progress(done, total, f"{baud} baud, {len(found)} found")
-            here = [wire.seen(servo, each) for servo, each in sorted(wire.link.broadcast_ping().items())]
+            here = [wire.identified(servo, each) for servo, each in sorted(wire.link.broadcast_ping().items())]
             found += [replace(seen, twice=has_duplicate(wire, seen.id)) for seen in here]
             continue
         for step, servo in enumerate(asked):
@@ -102,7 +102,7 @@ def field_named(table: Table, name: str) -> Field:
     return field
 
 
-def read_registers(wire: Wire, seen: Seen, names: Sequence[str]) -> list[Value]:
+def read_registers(wire: Wire, seen: FoundServo, names: Sequence[str]) -> list[Value]:
     """Registers by name, or `all` of them. Raises ServoError when the servo does not tell one."""
     table = seen.registers()
     if "all" in names:
@@ -112,7 +112,7 @@ def read_registers(wire: Wire, seen: Seen, names: Sequence[str]) -> list[Value]:
     return [Value(field, read(wire, seen, field)) for field in fields]
 
 
-def write_register(wire: Wire, seen: Seen, name: str, text: str, confirm: Confirm) -> tuple[Value | None, Value]:
+def write_register(wire: Wire, seen: FoundServo, name: str, text: str, confirm: Confirm) -> tuple[Value | None, Value]:
     """Write one register; (before, after). `text` is a raw number, or one with the register's unit: 90deg.
 
     The status return level is written without a look at what was there: a servo at level 0 does not tell.
@@ -148,12 +148,12 @@ def parse_value(model: str, field: Field, text: str) -> int:
     return raw
 
 
-def read(wire: Wire, seen: Seen, field: Field) -> int:
+def read(wire: Wire, seen: FoundServo, field: Field) -> int:
     """One register. Raises ServoError when the servo refuses or stays silent."""
     return field.from_bytes(read_block(wire, seen, field.address, field.size, field.name))
 
 
-def read_block(wire: Wire, seen: Seen, address: int, length: int, what: str) -> bytes:
+def read_block(wire: Wire, seen: FoundServo, address: int, length: int, what: str) -> bytes:
     """Bytes of the control table. Raises ServoError."""
     for _ in range(TRIES):
         answer = wire.link.read(seen.id, address, length)
@@ -164,7 +164,7 @@ def read_block(wire: Wire, seen: Seen, address: int, length: int, what: str) -> 
     raise ServoError(f"id {seen.id} does not answer when asked for {what} (status return level 0?)")
 
 
-def put(wire: Wire, seen: Seen, field: Field, raw: int) -> None:
+def put(wire: Wire, seen: FoundServo, field: Field, raw: int) -> None:
     """A verified write, through the lock of the EEPROM where there is one. Raises ServoError."""
     finish(verified_write(wire.link, seen.id, field, raw, lock=_lock(seen), tries=TRIES))
 
@@ -172,7 +172,7 @@ def put(wire: Wire, seen: Seen, field: Field, raw: int) -> None:
 # --- id, rate, start over ---------------------------------------------------------------------------------------
 
 
-def set_id(wire: Wire, seen: Seen, new: int, confirm: Confirm, in_chain: bool = False) -> Seen:
+def set_id(wire: Wire, seen: FoundServo, new: int, confirm: Confirm, in_chain: bool = False) -> FoundServo:
     """Give a servo another id. With other servos on the wire only when `in_chain` says that this is meant:
     two new servos with one id can look like one, and both would be changed.
 
@@ -201,7 +201,7 @@ def set_id(wire: Wire, seen: Seen, new: int, confirm: Confirm, in_chain: bool = 
     return changed
 
 
-def set_baud(wire: Wire, seen: Seen, baud: int, confirm: Confirm) -> Seen:
+def set_baud(wire: Wire, seen: FoundServo, baud: int, confirm: Confirm) -> FoundServo:
     """Give a servo another rate, and meet it there. Raises ConfigError, PortError, ServoError."""
     codes = {rate: code for code, rate in seen.registers().baud_codes.items()}
     if baud not in codes:
@@ -220,7 +220,7 @@ def set_baud(wire: Wire, seen: Seen, baud: int, confirm: Confirm) -> Seen:
     return changed
 
 
-def reboot(wire: Wire, seen: Seen, confirm: Confirm) -> Seen:
+def reboot(wire: Wire, seen: FoundServo, confirm: Confirm) -> FoundServo:
     """Start a servo over: torque goes off, hardware errors are forgotten. Back once it answers again."""
     torque = seen.table.role("torque_enable") if seen.table else None
     if torque is not None and read(wire, seen, torque):
@@ -234,7 +234,7 @@ def reboot(wire: Wire, seen: Seen, confirm: Confirm) -> Seen:
     return back
 
 
-def factory_reset(wire: Wire, seen: Seen, keep: str, confirm: Confirm) -> Seen:
+def factory_reset(wire: Wire, seen: FoundServo, keep: str, confirm: Confirm) -> FoundServo:
     """Back to what it was when new. `keep`: all (keeps nothing), keep-id, keep-id-and-baud."""
     if keep not in _RESETS:
         raise ConfigError.at("servo", "factory reset", keep, "is unknown", _RESETS)
@@ -267,27 +267,27 @@ def has_duplicate(wire: Wire, servo: int) -> bool:
     return all(ping_replies(wire.port, wire.kind.protocol, servo, PATIENCE_S).duplicate for _ in range(TRIES))
 
 
-def _neighbours(wire: Wire) -> list[Seen]:
+def _neighbours(wire: Wire) -> list[FoundServo]:
     """Everybody at the rate of now, without the patience of a scan where all have to be asked one by one."""
     if wire.kind.broadcast:
-        return [wire.seen(servo, found) for servo, found in wire.link.broadcast_ping().items()]
+        return [wire.identified(servo, found) for servo, found in wire.link.broadcast_ping().items()]
     asked = (wire.ping(servo, tries=1) for servo in range(wire.kind.max_id + 1))
     return [seen for seen in asked if seen is not None]
 
 
-def _register(seen: Seen, role: str) -> Field:
+def _register(seen: FoundServo, role: str) -> Field:
     field = seen.registers().role(role)
     if field is None:
         raise ServoError(f"id {seen.id}: {seen.model} has no register for its {role}")
     return field
 
 
-def _lock(seen: Seen) -> Field | None:
+def _lock(seen: FoundServo) -> Field | None:
     """The register that opens EEPROM. Not that of Dynamixel 1.0: closed once, it stays closed until power is off."""
     return seen.registers().role("lock")
 
 
-def guard(wire: Wire, seen: Seen, what: str, confirm: Confirm, mute: bool = False) -> None:
+def guard(wire: Wire, seen: FoundServo, what: str, confirm: Confirm, mute: bool = False) -> None:
     """Before EEPROM: torque off (which a `mute` servo cannot say), and somebody wants it.
 
     Raises ServoError, ConfigError.
@@ -305,7 +305,9 @@ def _ask(question: str, confirm: Confirm) -> None:
         raise ConfigError(f"nothing was written: {question} (not confirmed)")
 
 
-def _put_in_eeprom_and_go(wire: Wire, seen: Seen, field: Field, raw: int, new_id: int, baud: int | None = None) -> None:
+def _put_in_eeprom_and_go(
+    wire: Wire, seen: FoundServo, field: Field, raw: int, new_id: int, baud: int | None = None
+) -> None:
     """As `put`, for a register after which the servo is elsewhere: the lock has to be closed there."""
     lock = _lock(seen)
     if lock is not None:
@@ -317,7 +319,7 @@ def _put_in_eeprom_and_go(wire: Wire, seen: Seen, field: Field, raw: int, new_id
         wire.at(baud or wire.baud).write(new_id, lock.address, lock.to_bytes(1))
 
 
-def _wait_for(wire: Wire, servo: int) -> Seen | None:
+def _wait_for(wire: Wire, servo: int) -> FoundServo | None:
     """The servo once it answers, within `BACK_S`."""
     end_s = wire.clock.now_s() + BACK_S
     while True:

@@ -15,7 +15,7 @@ import numpy as np
 
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Clip, ClipError, Dataset, Layout, Order
-from sfms_robot.corpora.reading import collect, dyad, frames_of, heard, npz_shapes, track
+from sfms_robot.corpora.reading import collect, dyad, frames_of, npz_shapes, track, voices_of
 from sfms_robot.frames import Floats
 
 FPS: Final = 25.0
@@ -77,7 +77,7 @@ def _face(file: Path, frames: int, gaps: bool) -> Floats:
 
 def _read(name: str, faces: list[Path], voices: list[Path], frames: int) -> Dyad:
     speaker, listener = _face(faces[0], frames, True), _face(faces[1], frames, False)
-    return dyad(name, speaker, listener, "deca56", FPS, **heard(voices, frames, FPS))
+    return dyad(name, speaker, listener, "deca56", FPS, **voices_of(voices, frames, FPS))
 
 
 LAYOUT: Final = Layout(

@@ -22,7 +22,7 @@ from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem
 from sfms_robot.corpora.reading import dyad, npy, pose_last, track
 from sfms_robot.frames import Floats
-from sfms_robot.signals.l2l import l2l_bilateral
+from sfms_robot.signals.learning2listen import l2l_bilateral
 from sfms_robot.signals.mel import FLOOR, LN_PER_DB, MEL_BINS, ROWS_PER_FRAME
 
 FPS: Final = 30.0

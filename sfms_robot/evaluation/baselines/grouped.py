@@ -2,7 +2,7 @@
 
 Ng et al. 2022, "Learning to Listen", as its published configuration describes it (evonneng/learning2listen @ a0825d58):
 three stages halve the time, one by a strided convolution and two by pooling, transformers stand on both sides of the
-codes, and 200 vectors are learned (the SFMS paper compares with 256).
+codes. Its authors learn 200 vectors, the SFMS paper compares with 256.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Listeners that learn nothing: what tables 1 and 2 measure everybody against.
 
-Random, Mime, MeanSeq and MeanFr as the REACT challenge's `run_baselines` has them (baseline_react2023 @ c5a8ff85),
+Random, Mime and MeanFr as the REACT challenge's `run_baselines` has them (baseline_react2023 @ c5a8ff85),
 Median as Learning2Listen names it. Each gives (N, K, T, D): K times the same but for Random.
 """
 
@@ -53,11 +53,6 @@ def mean_frame(given: Heuristic) -> Doubles:
     return _still(given, given.train.mean(axis=(0, 1)))
 
 
-def mean_sequence(given: Heuristic) -> Doubles:
-    """MeanSeq: the mean of the training set at every frame of a clip."""
-    return _repeated(given, np.broadcast_to(given.train.mean(axis=0), given.speaker.shape))
-
-
 def mime(given: Heuristic) -> Doubles:
     """Mime: what the speaker does."""
     return _repeated(given, given.speaker)
@@ -77,5 +72,4 @@ HEURISTICS: Final[Mapping[str, Callable[[Heuristic], Doubles]]] = {
     "Median": median,
     "Mime": mime,
     "MeanFr": mean_frame,
-    "MeanSeq": mean_sequence,
 }

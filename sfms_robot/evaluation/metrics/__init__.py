@@ -26,7 +26,7 @@ from sfms_robot.evaluation.metrics.react_metrics import (
     reactface_frc,
     reactface_frd,
 )
-from sfms_robot.signals.l2l import faceverse_rotation, l2l_bilateral, l2l_mean_std
+from sfms_robot.signals.learning2listen import faceverse_rotation, l2l_bilateral, l2l_mean_std
 
 __all__ = [
     "ccc",

@@ -8,14 +8,14 @@ sent: shapes to compare with. Table 1 and 4 of the paper give RPCC, SID and Var 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
 from sfms_robot.evaluation import metrics
 from sfms_robot.evaluation.paper.listener_tables import centres_of
-from sfms_robot.frames import POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import POSE, SHAPES, Doubles
 
 CLIP_FRAMES: Final = 250
 PARTS: Final[Mapping[str, slice]] = {"exp": SHAPES, "pose": POSE}
@@ -55,14 +55,6 @@ ABLATIONS: Final[Mapping[int, Mapping[str, Mapping[str, Any]]]] = {
         "w/o bidirectional-integrated learning": {"interaction": "linear"},
     },
 }
-
-
-def cut(motions: Sequence[Floats], frames: int = CLIP_FRAMES) -> Doubles:
-    """(N_i, 58) -> (M, frames, 58), one clip behind the other. Raises ValueError when none is that long."""
-    clips = [one[at : at + frames] for one in motions for at in range(0, len(one) - frames + 1, frames)]
-    if not clips:
-        raise ValueError(f"no motion is as long as a clip of {frames} frames")
-    return np.stack(clips).astype(np.float64)
 
 
 def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str, Doubles]) -> dict[str, float]:

@@ -17,7 +17,7 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import metrics
 from sfms_robot.evaluation.baselines.heuristics import HEURISTICS, Heuristic
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Doubles, Floats
 
 PARTS: Final[Mapping[str, Mapping[str, slice]]] = {
     "arkit58": {"expression": slice(6, 58), "rotation": slice(0, 3)},
@@ -68,7 +68,7 @@ class Clips:
     train: Doubles
 
 
-def cut(motions: Sequence[Doubles], frames: int) -> Doubles:
+def cut(motions: Sequence[Doubles] | Sequence[Floats], frames: int) -> Doubles:
     """Motions (..., N_i, D) -> clips (M, ..., frames, D), one behind the other; what is left over is not used.
 
     Raises ConfigError when no motion is that long.

@@ -18,7 +18,7 @@ from sfms_robot.config import parse
 SizeName = Literal["small", "paper"]
 
 KEYFRAMES: Final = (3, 7, 10)  # of table III
-FSQ_256: Final = (4, 4, 4, 4)  # of many channels
+FSQ_256: Final = (4, 4, 4, 4)  # of all channels
 FSQ_256_SCALAR: Final = (256,)  # of one: four coarse digits of one number are harder to learn, and end twice as far off
 FSQ_1024: Final = (8, 5, 5, 5)
 
@@ -70,12 +70,10 @@ def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, con
         sparse(f"sparse-all-k{k}", "all", FSQ_256_SCALAR, k)
         sparse(f"sparse-all-k{k}-static", "all", FSQ_256_SCALAR, k, "static")
         sparse(f"sparse-all-k{k}-static_paper", "all", FSQ_256_SCALAR, k, "static_paper")
-    for preset in ("one", "four"):
-        sparse(f"sparse-{preset}-k10", preset, FSQ_256, 10)
-        sparse(f"sparse-{preset}-k10-static_paper", preset, FSQ_256, 10, "static_paper")
+    sparse("sparse-one-k10", "one", FSQ_256, 10)
+    sparse("sparse-one-k10-static_paper", "one", FSQ_256, 10, "static_paper")
     baseline("dense-vq-1024", "dense", "vq", (1024,))
     baseline("l2l-vq-256", "grouped", "vq", (256,))  # table IV
-    baseline("l2l-vq-200", "grouped", "vq", (200,))
     baseline("dense-fsq-1024", "dense", "fsq", FSQ_1024)
     sparse("sparse-all-k10-vq-256", "all", FSQ_256_SCALAR, 10, quantizer="vq")
     return found

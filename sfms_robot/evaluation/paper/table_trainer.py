@@ -17,9 +17,9 @@ from sfms_robot.evaluation.paper.compared_tokenizer import TableModel, save
 from sfms_robot.evaluation.paper.score_history import ScoreHistory
 from sfms_robot.learning.corpus import first_frames, windows
 from sfms_robot.learning.job import Job, Run
-from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import checkpoint_file
 from sfms_robot.learning.sfms.tokenizer_trainer import amplified, loss_of_steps, optimizers_of
+from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners.sfms.model import Tokenizer
 
 GAIN: Final = 0.4  # of windows while learning (`amplified`): six minutes of faces are few

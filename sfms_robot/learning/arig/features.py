@@ -15,8 +15,8 @@ from torch import Tensor
 
 from sfms_robot.corpora.clips import Dyad as Conversation
 from sfms_robot.corpora.collection import Dataset
+from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.corpora.formats import open_dataset
-from sfms_robot.corpora.states import UNKNOWN
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning import corpus as dyads
@@ -71,8 +71,8 @@ def frames_of(dyad: Conversation, space: MotionSpace, width: int) -> LabelledDya
     frames = len(dyad.listener)
     face = in_space(dyad, dyad.speaker, space)
     seen = face.isfinite().all(-1)
-    user, user_voiced, heard = _heard(dyad, "user", width)
-    agent, agent_voiced, says = _heard(dyad, "agent", width)
+    user, user_voiced, heard = _audio_features(dyad, "user", width)
+    agent, agent_voiced, says = _audio_features(dyad, "agent", width)
     states = np.full(frames, UNKNOWN) if dyad.states is None else dyad.states
     return LabelledDyad(
         user_sound=user,
@@ -87,7 +87,7 @@ def frames_of(dyad: Conversation, space: MotionSpace, width: int) -> LabelledDya
     )
 
 
-def _heard(dyad: Conversation, track: str, width: int) -> tuple[Tensor, Tensor, bool]:
+def _audio_features(dyad: Conversation, track: str, width: int) -> tuple[Tensor, Tensor, bool]:
     """Features (N, A) in half precision, speech (N,), and whether the track is there at all.
 
     A user's track of zeros is no microphone; an agent's is a robot that says nothing. wav2vec2 features come with the

@@ -15,7 +15,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
 from sfms_robot.learning.arig.losses import Parts, Student, augment, loss_parts, previous_states
 from sfms_robot.learning.job import Job, Run
-from sfms_robot.learning.loop import fit, optimizer
+from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.space import MotionSpace

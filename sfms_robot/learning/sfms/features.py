@@ -62,7 +62,7 @@ def frames_of(dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = N
     """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one."""
     face = in_space(dyad, dyad.speaker, space)
     known = face.isfinite().all(-1)
-    sound, phase = _heard(dyad, frontend)
+    sound, phase = _audio_features(dyad, frontend)
     return SfmsFrames(
         motion=in_space(dyad, dyad.listener, space),
         face=torch.where(known[:, None], face, 0.0),
@@ -73,7 +73,7 @@ def frames_of(dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = N
     )
 
 
-def _heard(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
+def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
     """Sound (N, R, bins) in half precision and phase (N, F): zeros without sound, which then nobody hears."""
     frames = len(dyad.listener)
     if frontend is None:

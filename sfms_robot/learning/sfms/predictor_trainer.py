@@ -16,13 +16,13 @@ from sfms_robot.corpora.collection import Order
 from sfms_robot.corpora.formats import open_for
 from sfms_robot.learning.corpus import windows
 from sfms_robot.learning.job import Job, Run
-from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.resume import digest_of
 from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
 from sfms_robot.learning.sfms.losses import next_tokens
 from sfms_robot.learning.sfms.soft_dtw import keyframe_dtw
 from sfms_robot.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
 from sfms_robot.learning.sfms.tokens import tokenise
+from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel

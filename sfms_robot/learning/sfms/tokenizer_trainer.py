@@ -17,11 +17,11 @@ from sfms_robot.corpora.formats import open_for
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.learning.corpus import first_frames, windows
 from sfms_robot.learning.job import Job, Run
-from sfms_robot.learning.loop import fit, optimizer
 from sfms_robot.learning.sfms.features import SfmsCorpus, fit_scales, gather
 from sfms_robot.learning.sfms.imitation import imitation, lively
 from sfms_robot.learning.sfms.losses import masking, reconstruction
 from sfms_robot.learning.sfms.masks import batches
+from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
 from sfms_robot.listeners.sfms.placement import Strategy, place_learned

@@ -88,7 +88,7 @@ class ArigListener:
     def build_graphs(self) -> ArigListener:
         """The weights stay as they are from now on: what a frame computes becomes graphs. Itself."""
         memory = self.start(0)
-        told, _ = self._told(SpeakerFrame(0.0, np.zeros(0, np.float32)), memory)
+        told, _ = self._frame_inputs(SpeakerFrame(0.0, np.zeros(0, np.float32)), memory)
         z, *_ = self._frame(*told)
         noise = torch.zeros(1, *self.model.noise_shape)
         self._frame = graph(Frame(self.model), told)
@@ -136,7 +136,7 @@ class ArigListener:
     @torch.inference_mode()
     def condition(self, speaker: SpeakerFrame, memory: Memory) -> tuple[Tensor, Memory]:
         """What the sampler is told of the next frame, z (1, D), and the memory but for the motion to be drawn."""
-        told, now = self._told(speaker, memory)
+        told, now = self._frame_inputs(speaker, memory)
         z, logits, made, agent_sound, agent_behaviour, user_behaviour, sound_keys = self._frame(*told)
         whole = now.frames % self.settings.chunk_frames == 0
         after = replace(
@@ -150,7 +150,7 @@ class ArigListener:
         )
         return z, after
 
-    def _told(self, speaker: SpeakerFrame, memory: Memory) -> tuple[tuple[Tensor, ...], Memory]:
+    def _frame_inputs(self, speaker: SpeakerFrame, memory: Memory) -> tuple[tuple[Tensor, ...], Memory]:
         """What `Frame` takes, and memory with both tracks heard."""
         user, heard, user_voice = audio_frontend.hear(speaker.audio, memory.user_voice)
         agent, says, agent_voice = audio_frontend.hear(

@@ -12,7 +12,7 @@ Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -22,7 +22,6 @@ from sfms_robot.listeners.sfms.exact import best_frames, segments
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks
 
 Strategy = Literal["exact", "static", "static_paper", "learned_paper", "learned"]
-STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 EPSILON = 1e-20  # a chosen frame falls back by 46: more than any two scores differ
 
 

@@ -13,22 +13,16 @@ Source: Pololu Maestro Servo Controller User's Guide, pololu.com/docs/0J40, sect
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
-from sfms_robot.config import Bus as BusConfig
-from sfms_robot.frames import Doubles
-from sfms_robot.ports import TickConversion
 from sfms_robot.servo.boards.board_protocol import BoardStatus, Exchange, pulses_beyond
 from sfms_robot.servo.boards.pulse_bus import PulseBus
 from sfms_robot.servo.codecs import maestro
-from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)
 
-READ_DEADLINE_S: Final = 0.02
 _MICRO: Final = 6  # channels of the one board without "set multiple targets"
 
 
@@ -88,23 +82,8 @@ def _runs(channels: Sequence[int]) -> list[list[int]]:
 class MaestroBus(PulseBus):
     """One Maestro with the compact protocol, as `ports.Bus`; see `pulse_bus.PulseBus` for what is true of it."""
 
-    def __init__(
-        self,
-        name: str,
-        servos: Sequence[BusServo],
-        conversion: TickConversion,
-        open_port: Callable[[], Port],
-        baud: int,
-        read_deadline_s: float = READ_DEADLINE_S,
-        *,
-        confirmed: bool = False,
-        rest_rad: Doubles | None = None,
-        config: BusConfig | None = None,
-    ) -> None:
-        table = Table.of(servos[0].map)
-        super().__init__(
-            name, servos, conversion, open_port, baud, read_deadline_s,
-            protocol=_Maestro(table), confirmed=confirmed, rest_rad=rest_rad, config=config,
-        )  # fmt: skip
-        if wide := pulses_beyond(servos, conversion, table, maestro.FACTORY_PULSE_US):
-            log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, ", ".join(wide))
+    def _protocol_of(self, table: Table) -> _Maestro:
+        if wide := pulses_beyond(self._servos, self._conversion, table, maestro.FACTORY_PULSE_US):
+            joints = ", ".join(wide)
+            log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", self.name, joints)
+        return _Maestro(table)

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import logging
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -35,6 +36,7 @@ from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +62,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         servos: in joint order; `id` is the channel.
         conversion: joint angles (J,) <-> ticks (J,) of pulse width.
         read_deadline_s: silence after which a question counts as unanswered; at least 20 ms is granted.
-        protocol: of the board.
         confirmed: somebody knows that servos jump when their pulses come on.
         rest_rad: (J,) where a joint goes first when nobody knows better; 0 rad, inside the limits, unless told.
         config: what the head says of this bus.
@@ -75,9 +76,8 @@ class PulseBus(WireBus[RateLimitedPort]):
         conversion: TickConversion,
         open_port: Callable[[], Port],
         baud: int,
-        read_deadline_s: float,
+        read_deadline_s: float = _LEAST_PATIENCE_S,
         *,
-        protocol: BoardProtocol,
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
         config: BusConfig | None = None,
@@ -86,7 +86,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
         super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
         self._channels = [servo.id for servo in servos]
-        self._protocol = protocol
         self._confirmed = confirmed
         self._lowest = np.array([servo.min_rad for servo in servos])
         self._highest = np.array([servo.max_rad for servo in servos])
@@ -94,6 +93,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self.model = table.model
         if beyond := pulses_beyond(servos, conversion, table, table.pulse_us or (0.0, 0.0)):
             raise ConfigError(f"bus {name!r}: a {table.model} does not make the pulses of {', '.join(beyond)}")
+        self._protocol = self._protocol_of(table)
         rest = np.zeros(len(servos)) if rest_rad is None else np.asarray(rest_rad, np.float64)
         self._ticks = conversion.to_ticks(np.clip(rest, self._lowest, self._highest))  # goals; before any, the rest
         self._warned = False  # that servos jump
@@ -102,6 +102,10 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._off: tuple[int, ...] | None = None  # since torque off: channels that stay off; None: armed
         self._off_unsent = False  # they could not be told
         self._forget()
+
+    @abstractmethod
+    def _protocol_of(self, table: Table) -> BoardProtocol:
+        """What the board speaks; pulses that its own settings may keep from it are logged."""
 
     def _forget(self) -> None:
         """What holds for one connection only."""
@@ -116,6 +120,8 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._switched_off: list[int] = []  # enabled, but the board has switched them off
         self._next_on_s = -math.inf  # when the next of them may come on
         self._faults: dict[int, str] = {}
+        self._resting: frozenset[int] = frozenset()  # channels that `release` has switched off
+        self._rest_due = False  # and that are to be told so again
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
@@ -190,6 +196,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _switch_on(self, wire: RateLimitedPort, index: int) -> float:
         """Pulses on for one joint; the angle it was sent to, rad. Raises BusError when `torque_off` comes meanwhile."""
         servo = self._servos[index]
+        self._resting -= {servo.id}
         self._take_over(index)
         self._send(wire, {servo.id: int(self._ticks[index])})
         if self._pulses.get(servo.id) != self._ticks[index] and index not in self._enabled:
@@ -214,6 +221,26 @@ class PulseBus(WireBus[RateLimitedPort]):
         ticks[index] = pulse
         angle = self._conversion.to_rad(ticks)
         self._ticks = self._conversion.to_ticks(np.clip(angle, self._lowest, self._highest))
+
+    def release(self, joints: Sequence[str]) -> None:
+        """End the pulses of `joints` now; the others go on. Said once more by the next `poll`. From any thread."""
+        indices = {self.joints.index(joint) for joint in joints}
+        if not indices:
+            return
+        channels = frozenset(self._servos[index].id for index in indices)
+        self._resting, self._rest_due = self._resting | channels, True
+        self._enabled = [index for index in self._enabled if index not in indices]
+        self._switched_off = [index for index in self._switched_off if index not in indices]
+        for sent in (self._pulses, self._sent):
+            for channel in channels:
+                sent.pop(channel, None)
+        self._say_resting()
+
+    def _say_resting(self) -> None:
+        wire = self._link
+        if wire is not None:
+            data = self._protocol.encode_off(tuple(self._resting), self._silent)
+            self._rest_due |= self._attempt(lambda: wire.send(data)) is None
 
     def torque_off(self, policy: StopPolicy) -> None:
         """End the pulses now, but of joints whose safety says hold; goals are withheld until the next `enable`.
@@ -292,7 +319,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         Raises ValueError, with nothing sent, before `enable` and after `stop`, for a goal that is not finite, or one
         out of range. While the port is gone, and after `torque_off`, nothing is sent and nothing is raised.
         """
-        self._check(bool(self._enabled))
+        self._check(bool(self._enabled or self._resting))
         if self._off is not None:
             return
         self._ticks = self._goals.ticks(goals_rad, np.array(self._enabled, np.intp))
@@ -312,6 +339,9 @@ class PulseBus(WireBus[RateLimitedPort]):
         if self._off_unsent:  # over a port that was gone, and nobody had noticed: this finds out, and opens it again
             wire.send(self._protocol.encode_off(self._off or (), restarted=True))
             self._off_unsent = False
+        if self._rest_due:
+            self._rest_due = False
+            self._say_resting()
         if self._status_due_s is None:
             self._status_due_s = now_s + _STATUS_EVERY_S
         if wire.awaiting:
@@ -357,12 +387,17 @@ class PulseBus(WireBus[RateLimitedPort]):
         """Send goals, unless torque is off; where it was switched off while these bytes left, switch it off again."""
         if self._off is not None:
             return
+        ticks = {channel: each for channel, each in ticks.items() if channel not in self._resting}
+        if not ticks:
+            return
         interval_s = max(wire.port.now_s(), wire.busy_until_s) - self._sent_at_s if self._sent else 0.0
         self._sent_at_s = wire.send(self._protocol.encode_goals(ticks, interval_s))
         self._sent.update(ticks)
         if self._off is not None:
             self._sent = {}
             self._send_off()
+        elif self._resting & ticks.keys():
+            self._say_resting()
 
     # --- the port ----------------------------------------------------------------------------------------------
 
@@ -372,6 +407,7 @@ class PulseBus(WireBus[RateLimitedPort]):
 
     def _returned(self, wire: RateLimitedPort, now_s: float) -> None:
         self._status_due_s = now_s  # the board is asked before it gets any goal
+        self._rest_due = bool(self._resting)
         self._send_off()
 
     # --- the board ----------------------------------------------------------------------------------------------
@@ -404,6 +440,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._sent = {}  # whatever it does now, it is not what it was told
         if was_silent or status.went_home:
             self._send_off()
+            self._rest_due |= bool(self._resting)
         if status.faults:
             self._counts["errors"] += not status.lasting
             self._report_fault(range(len(self.joints)), status.faults, shown=status.lasting)

@@ -6,19 +6,14 @@ therefore given the time since the one before it: the board draws a straight lin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
-from sfms_robot.config import Bus as BusConfig
-from sfms_robot.frames import Doubles
-from sfms_robot.ports import TickConversion
 from sfms_robot.servo.boards.board_protocol import BoardStatus, Exchange
 from sfms_robot.servo.boards.pulse_bus import PulseBus
 from sfms_robot.servo.codecs import ssc32
-from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
 
-READ_DEADLINE_S: Final = 0.02
 _PULSE_FRAME_S: Final = 0.02  # a servo hears a pulse this often: no need to draw lines within
 _LONGEST_LINE_S: Final = 0.5
 
@@ -51,20 +46,5 @@ class _Ssc32:
 class Ssc32Bus(PulseBus):
     """One SSC-32, as `ports.Bus`; see `pulse_bus.PulseBus` for what is true of it."""
 
-    def __init__(
-        self,
-        name: str,
-        servos: Sequence[BusServo],
-        conversion: TickConversion,
-        open_port: Callable[[], Port],
-        baud: int,
-        read_deadline_s: float = READ_DEADLINE_S,
-        *,
-        confirmed: bool = False,
-        rest_rad: Doubles | None = None,
-        config: BusConfig | None = None,
-    ) -> None:
-        super().__init__(
-            name, servos, conversion, open_port, baud, read_deadline_s,
-            protocol=_Ssc32(), confirmed=confirmed, rest_rad=rest_rad, config=config,
-        )  # fmt: skip
+    def _protocol_of(self, table: Table) -> _Ssc32:
+        return _Ssc32()

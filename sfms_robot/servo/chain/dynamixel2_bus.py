@@ -8,22 +8,17 @@ the goals themselves, and switched off after the torque at the end.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config import Bus as BusConfig
-from sfms_robot.config import Faults
 from sfms_robot.errors import ConfigError
-from sfms_robot.ports import TickConversion
-from sfms_robot.servo.chain.chain_bus import BUS_WATCHDOG, READ_DEADLINE_S, ChainBus
+from sfms_robot.servo.chain.chain_bus import BUS_WATCHDOG, ChainBus
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.policy import BusServo as BusServo
-from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field
 
 _WATCHDOG_TICK_S: Final = 0.02
@@ -36,23 +31,12 @@ class Dynamixel2Bus(ChainBus[Dynamixel2Link]):
     family = "dynamixel"
     protocol = 2
 
-    def __init__(
-        self,
-        name: str,
-        servos: Sequence[BusServo],
-        conversion: TickConversion,
-        open_port: Callable[[], Port],
-        baud: int,
-        read_deadline_s: float = READ_DEADLINE_S,
-        config: BusConfig | None = None,
-        faults: Faults | None = None,
-    ) -> None:
-        super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, config, faults)
+    def _set_up(self) -> None:
         goal = self._telemetry.goal
         if goal.sign not in ("no", "twos_complement"):
-            raise ConfigError(f"bus {name!r}: goal_position of {self._tables[0].model} is no two's complement")
+            raise ConfigError(f"bus {self.name!r}: goal_position of {self._tables[0].model} is no two's complement")
         self._goal_type = np.dtype(f"<{'i' if goal.signed else 'u'}{goal.size}")
-        self._ids = np.array([servo.id for servo in servos])
+        self._ids = np.array([servo.id for servo in self._servos])
         self._streamed: tuple[NDArray[np.intp], tuple[int, ...]] = (self._places, ())
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf

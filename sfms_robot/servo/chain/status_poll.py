@@ -110,14 +110,6 @@ class StatusPoll:
         self._group = group if self._group is not None else None
         self._fast = fast if self._fast is not None else None
 
-    @property
-    def has_fast(self) -> bool:
-        return self._fast is not None
-
-    @property
-    def has_group(self) -> bool:
-        return self._group is not None
-
     def _plan(self) -> None:
         """How many whole blocks fit into a tick, and the budget of a poll."""
         telemetry, config, count = self._telemetry, self._config, len(self._ids)

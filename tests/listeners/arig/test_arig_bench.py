@@ -1,15 +1,13 @@
 """The parts of `sfms-robot bench listener` that judge rather than time."""
 
-from importlib import import_module
-
 import pytest
 from tiny_arig import arig_listener, talk
 
+from sfms_robot.app.bench import listener_bench as bench
 from sfms_robot.app.bench.in_run import in_run
 from sfms_robot.app.bench.samplers import WAYS, samplers
 from sfms_robot.listeners import checkpoint
 
-bench = import_module("sfms_robot.app.bench.listener")  # the package's own `listener` is the function
 MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8}
 
 

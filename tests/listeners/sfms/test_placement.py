@@ -1,5 +1,6 @@
 import itertools
 from functools import cache
+from typing import get_args
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from sfms_robot.listeners.sfms.choice import choose, sweep
 from sfms_robot.listeners.sfms.exact import completion_errors, mask_cost, segments
 from sfms_robot.listeners.sfms.neighbours import Neighbours
 from sfms_robot.listeners.sfms.placement import (
-    STRATEGIES,
+    Strategy,
     place,
     place_exact,
     place_learned,
@@ -47,7 +48,7 @@ def scores(strategy: str) -> ScoreNetwork | ConditionalScore:
     return (ScoreNetwork(3, 2, 8, 2) if strategy == "learned_paper" else ConditionalScore(2, 8, 2, 1)).eval()
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("strategy", get_args(Strategy))
 @pytest.mark.parametrize("k", [(1, 1), (3, 7), (48, 10)])
 def test_every_strategy_places_exactly_k(strategy, k):
     motion = torch.randn(3, 48, 3)

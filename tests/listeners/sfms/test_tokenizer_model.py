@@ -1,3 +1,5 @@
+from typing import get_args
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -6,7 +8,7 @@ from tiny_sfms import tiny_settings
 
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.neighbours import Neighbours
-from sfms_robot.listeners.sfms.placement import STRATEGIES
+from sfms_robot.listeners.sfms.placement import Strategy
 
 
 def test_tokens_mark_exactly_the_keyframes(tiny):
@@ -58,7 +60,7 @@ def test_restoring_undoes_standardising_within_range(tiny):
 
 
 @pytest.mark.parametrize("quantizer", ["fsq", "vq"])
-@pytest.mark.parametrize("placement", STRATEGIES)
+@pytest.mark.parametrize("placement", get_args(Strategy))
 def test_every_kind_of_tokenizer_encodes_and_decodes(placement, quantizer):
     torch.manual_seed(0)
     settings = tiny_settings(placement=placement, quantizer=quantizer, scores={"width": 8, "layers": 1, "heads": 2})

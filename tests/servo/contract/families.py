@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ import numpy as np
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.ports import Bus
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
@@ -23,7 +23,9 @@ STARTS_RAD = (-0.2, 0.0, 0.4, 0.1)
 
 @dataclass(frozen=True)
 class Family:
-    """`other`: a model that is not `model`, and says so when it is asked; None where nobody can tell."""
+    """`bus`: its name in `servo.families`. `other`: a model that is not `model`, and says so when it is asked; None
+    where nobody can tell.
+    """
 
     bus: str
     model: str
@@ -49,12 +51,13 @@ class Family:
     def start_ticks(self) -> list[int]:
         return [int(t) for t in self.conversion.to_ticks(np.array(STARTS_RAD)[: len(self.ids)])]
 
+    def bus_class(self) -> Any:
+        return family_named(self.bus).bus_class()
+
     def build(self, open_port: Callable[[], Port], deadline_s: float) -> Bus:
-        module, _, name = self.bus.partition(":")
-        kind = getattr(importlib.import_module(f"sfms_robot.servo.{module}"), name)
         firmware_map = load_firmware_map(self.model)
         servos = [BusServo(f"joint{i}", i, firmware_map, -LIMIT_RAD, LIMIT_RAD) for i in self.ids]
-        bus: Bus = kind("face", servos, self.conversion, open_port, self.baud, deadline_s, **self.options)
+        bus: Bus = self.bus_class()("face", servos, self.conversion, open_port, self.baud, deadline_s, **self.options)
         return bus
 
     def on(self, servos: str) -> Family:
@@ -84,11 +87,11 @@ class Linear:
 
 SURE = {"confirmed": True}  # hobby servos jump to their first pose, and the tests know it
 FAMILIES = {
-    "dynamixel2": Family("chain.dynamixel2_bus:Dynamixel2Bus", "xl330-m288", other="xl330-m077"),
-    "dynamixel1": Family("chain.dynamixel1_bus:Dynamixel1Bus", "ax-12a", other="ax-18a"),
-    "dynamixel1-mx": Family("chain.dynamixel1_bus:Dynamixel1Bus", "mx-28-1.0", other="mx-64-1.0"),
-    "sts": Family("chain.feetech_bus:FeetechBus", "sts3215", other="sts3250"),
-    "scs": Family("chain.feetech_bus:FeetechBus", "scs0009"),
-    "maestro": Family("boards.maestro_bus:MaestroBus", "maestro-24", (0, 1, 2, 5), 115200, options=SURE),
-    "ssc32": Family("boards.ssc32_bus:Ssc32Bus", "ssc-32", (0, 1, 2, 5), 115200, options=SURE),
+    "dynamixel2": Family("dynamixel2", "xl330-m288", other="xl330-m077"),
+    "dynamixel1": Family("dynamixel1", "ax-12a", other="ax-18a"),
+    "dynamixel1-mx": Family("dynamixel1", "mx-28-1.0", other="mx-64-1.0"),
+    "sts": Family("feetech", "sts3215", other="sts3250"),
+    "scs": Family("feetech", "scs0009"),
+    "maestro": Family("maestro", "maestro-24", (0, 1, 2, 5), 115200, options=SURE),
+    "ssc32": Family("ssc32", "ssc-32", (0, 1, 2, 5), 115200, options=SURE),
 }

@@ -12,7 +12,7 @@ from families import FAMILIES, Family
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort, WrappedPort
 
 TICK_S = 0.02
 EASE_RAD_S = 0.5  # as slowly as a limiter begins: a joint that rejoins takes goals only where it stands
@@ -27,42 +27,22 @@ class Line:
 
 
 @dataclass
-class Tapped:
+class Tapped(WrappedPort):
     """A port that notes what goes out, and gives noise before what comes in."""
 
-    inner: Port
     line: Line
-
-    @property
-    def name(self) -> str:
-        return self.inner.name
 
     def write(self, data: bytes) -> None:
         self.line.sent.append(bytes(data))
-        self.inner.write(data)
+        super().write(data)
 
     def read(self, n: int, deadline_s: float) -> bytes:
         if not self.line.noise:
-            return self.inner.read(n, deadline_s)
+            return super().read(n, deadline_s)
         chunk = self.line.noise.pop(0)
         if len(chunk) > n:
             self.line.noise.insert(0, chunk[n:])
         return chunk[:n]
-
-    def discard_input(self) -> None:
-        self.inner.discard_input()
-
-    def now_s(self) -> float:
-        return self.inner.now_s()
-
-    def wait_until(self, time_s: float) -> None:
-        self.inner.wait_until(time_s)
-
-    def set_baud(self, baud: int) -> None:
-        self.inner.set_baud(baud)
-
-    def close(self) -> None:
-        self.inner.close()
 
 
 @dataclass

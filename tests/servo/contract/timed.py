@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections import deque
 from collections.abc import Callable
@@ -17,9 +16,10 @@ from sfms_robot.emulator.device import Device, replies_of
 from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
 from sfms_robot.emulator.protocol1_chain import Protocol1Chain
 from sfms_robot.servo.chain.chain_bus import ChainBus
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 
-CHAINS = [name for name, family in FAMILIES.items() if family.bus.startswith("chain")]
+CHAINS = [name for name, family in FAMILIES.items() if not family_named(family.bus).board]
 READ_DEADLINE_S = 0.003
 
 
@@ -159,12 +159,12 @@ def timed(
     rows = [{**row, "id": i, "supply_v": None} for i in range(1, count + 1)]
     kind = Dynamixel2Chain if table.protocol == 2 else Protocol1Chain
     port = TimedPort(kind.from_rows(rows, {table.model: table}), clock, baud)
-    module, _, of = family.bus.partition(":")
-    build = getattr(importlib.import_module(f"sfms_robot.servo.{module}"), of)
     firmware_map = load_firmware_map(family.model)
     servos = [
         BusServo(f"joint{i}", i, firmware_map, -LIMIT_RAD, LIMIT_RAD, safety or Safety()) for i in range(1, count + 1)
     ]
     options = BusConfig(family="dynamixel", baud=baud, **config)
-    bus = build("face", servos, family.conversion, lambda: port, baud, READ_DEADLINE_S, config=options, faults=faults)
+    bus = family.bus_class()(
+        "face", servos, family.conversion, lambda: port, baud, READ_DEADLINE_S, config=options, faults=faults
+    )
     return Timed(family, bus, port, clock, count, 1 / options.rate_hz)

@@ -1,0 +1,155 @@
+"""`sfms-robot evaluate`: what a listener's parts are worth on held-out dyads, and a head's joints on faces."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+
+import typer
+
+from sfms_robot.cli.data_command import Order
+from sfms_robot.cli.run_command import MAX_SEED
+from sfms_robot.cli.train_command import ORDER, interruptible
+
+app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
+
+
+class Size(StrEnum):
+    small = "small"
+    paper = "paper"
+
+
+class Table(StrEnum):
+    """1 and 2 of SFMS; those of ARIG."""
+
+    one = "1"
+    two = "2"
+    arig_1 = "arig-1"
+    arig_2 = "arig-2"
+    arig_4 = "arig-4"
+
+
+LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
+JSON = typer.Option(False, "--json", help="Print one JSON object.")
+
+
+@app.command()
+def tokenizer(
+    listener: str = LISTENER,
+    table: str | None = typer.Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
+    data: Path | None = typer.Option(
+        None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
+    ),
+    models: Path | None = typer.Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
+    train: bool = typer.Option(False, "--train", help="Train the table's tokenizers anew, into --models."),
+    size: Size = typer.Option(Size.small, help="Of what is trained; paper: for a GPU."),
+    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the size's."),
+    jobs: int = typer.Option(1, min=1, help="Tokenizers trained at once."),
+    plots: Path | None = typer.Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
+    order: Order | None = ORDER,
+    json: bool = JSON,
+) -> None:
+    """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
+    from sfms_robot.cli.show_learning import print_figures, print_tokenizer_tables, show
+
+    if table is None:
+        from sfms_robot.app.evaluate.listener_evaluation import evaluate_tokenizer
+
+        if data is None:
+            raise typer.BadParameter("--data is needed without --table")
+        show(evaluate_tokenizer(listener, data, order.value if order else None), json, print_figures)
+        return
+    from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
+
+    options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
+    show(interruptible(lambda: evaluate_table(options)), json, print_tokenizer_tables)
+
+
+@app.command("listener")
+def listener_(
+    listener: list[str] = typer.Option(["sfms-small"], metavar="NAME|DIR", help="May be given often."),
+    data: Path = typer.Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
+    table: Table | None = typer.Option(
+        None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
+    ),
+    samples: int = typer.Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
+    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, for --table; all of them."),
+    models: Path | None = typer.Option(None, help="Folder of the ablations' listeners; those missing are trained."),
+    config: Path | None = typer.Option(None, help="How ablations are trained: configs/training/arig.yaml."),
+    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    order: Order | None = ORDER,
+    json: bool = JSON,
+) -> None:
+    """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
+    from sfms_robot.app.evaluate.listener_evaluation import evaluate_listener, listener_table
+    from sfms_robot.cli.show_learning import print_figures, print_listener_table, show
+
+    if table is None:
+        show(evaluate_listener(listener, data, seed, order.value if order else None), json, print_figures)
+        return
+    if table.value.startswith("arig"):
+        if order is not None:
+            raise typer.BadParameter("--order is for --table 1 and 2, or none")
+        from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
+
+        ablations = AblationOptions(models, config, steps)
+        found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
+        show(found, json, print_figures)
+        return
+    result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None)
+    show(result, json, print_listener_table)
+
+
+@app.command()
+def timing(
+    listener: str = LISTENER,
+    data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
+    seeds: int = typer.Option(8, min=1, help="How often each person's meeting is played."),
+    people: int | None = typer.Option(12, min=1, help="At most this many people, spread over the meetings."),
+    minutes: float | None = typer.Option(5.0, min=0.5, help="Of each, from the middle of the meeting."),
+    everything: bool = typer.Option(False, "--all", help="All people, whole meetings: many hours."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices and sampling."),
+    jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    fit_table: Path | None = typer.Option(
+        None, metavar="FILE", help="Only fit the table of nod rates on DIR and write it."
+    ),
+    json: bool = JSON,
+) -> None:
+    """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
+    from sfms_robot.app.evaluate import meetings as command
+    from sfms_robot.cli.show_learning import print_figures, show
+
+    if fit_table is not None:
+        show(command.fit_table(data, fit_table), json, print_figures)
+        return
+    limits = (None, None) if everything else (people, minutes)
+    show(command.evaluate_timing(listener, data, seeds, *limits, seed, jobs), json, print_figures)
+
+
+@app.command()
+def interaction(
+    listener: str = typer.Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
+    data: Path = typer.Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
+    clips: int | None = typer.Option(None, min=1, help="At most this many dyads of each set; all of them."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    json: bool = JSON,
+) -> None:
+    """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
+    from sfms_robot.app.evaluate.arig_evaluation import evaluate_interaction
+    from sfms_robot.cli.show_learning import print_interaction, show
+
+    show(evaluate_interaction(listener, data, clips, seed), json, print_interaction)
+
+
+@app.command()
+def fidelity(
+    head: list[str] = typer.Option([], "--head", metavar="NAME|DIR", help="May be given often; all shipped heads."),
+    data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    json: bool = JSON,
+) -> None:
+    """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""
+    from sfms_robot.app.head.fidelity import fidelity as measure
+    from sfms_robot.cli.show_learning import print_figures, show
+
+    show(measure(head, data), json, print_figures)

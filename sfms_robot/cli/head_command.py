@@ -1,0 +1,153 @@
+"""`sfms-robot head`: the heads at hand, whether one is sound, what this build of it measures, and how it moves."""
+
+from __future__ import annotations
+
+import csv
+import json as json_module
+import sys
+from pathlib import Path
+
+import typer
+
+from sfms_robot.cli.head_fit import fit
+from sfms_robot.errors import ConfigError
+
+INTERRUPTED = 130
+
+app = typer.Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_args_is_help=True)
+app.command("fit")(fit)
+
+
+@app.command("list")
+def list_heads(json: bool = typer.Option(False, "--json", help="Print as one JSON object.")) -> None:
+    """Shipped heads, with joints and buses."""
+    from sfms_robot.app.session import shipped_heads
+
+    heads = shipped_heads()
+    if json:
+        print(json_module.dumps({"heads": heads}))
+        return
+    from sfms_robot.cli.show_head import print_heads
+
+    print_heads(heads)
+
+
+@app.command("check")
+def check(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    plot: Path | None = typer.Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
+    listener: str | None = typer.Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
+    """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
+    from sfms_robot.app.head.head_check import check as check_head
+    from sfms_robot.app.plot_style import checked_png
+
+    if plot is not None:
+        checked_png(plot, "--plot")
+    checked = check_head(name, data, listener)
+    if plot is not None and not checked.problems:
+        from sfms_robot.app.head.head_plot import plot as draw
+
+        draw(checked, plot)
+    if json:
+        print(json_module.dumps(checked.as_dict()))
+    else:
+        from sfms_robot.cli.show_head import print_check
+
+        print_check(checked)
+    if checked.problems:
+        raise typer.Exit(ConfigError.exit_code)
+
+
+@app.command("show")
+def show(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    joint: str | None = typer.Option(None, "--joint", metavar="JOINT", help="Only this joint."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
+    """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
+    from sfms_robot.config.provenance import provenance, refusals
+
+    joints, refused = provenance(name), refusals(name)
+    if joint is not None:
+        if joint not in joints:
+            raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", joints)
+        joints = {joint: joints[joint]}
+    if json:
+        told = {j: {key: {"value": v, "from": o} for key, (v, o) in values.items()} for j, values in joints.items()}
+        print(json_module.dumps({"name": name, "joints": told, "refused": refused}))
+        return
+    from sfms_robot.cli.show_head import print_provenance
+
+    print_provenance(name, joints, refused)
+
+
+@app.command("calibrate")
+def calibrate(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    port: str = typer.Option(..., "--port", help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
+    joint: list[str] = typer.Option([], "--joint", metavar="JOINT", help="Only this joint; may be given often."),
+    again: bool = typer.Option(False, "--again", help="Also joints that are measured already."),
+    json: bool = typer.Option(False, "--json", help="Print the outcome as one JSON object, last line of stdout."),
+) -> None:
+    """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
+    from sfms_robot.app.head.calibrate import calibrate as lead_through
+    from sfms_robot.cli.show_head import Terminal, print_calibration
+
+    outcome = lead_through(name, port, Terminal(), joint, again)
+    if json:
+        print(json_module.dumps(outcome.as_dict()))
+    else:
+        print_calibration(outcome)
+    if outcome.problems:
+        raise typer.Exit(ConfigError.exit_code)
+    if outcome.exit == "interrupted":
+        raise typer.Exit(INTERRUPTED)
+
+
+@app.command("pose")
+def pose(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    face: list[str] = typer.Argument(..., metavar="EXPRESSION|CHANNEL=VALUE...", help="smile, blink, jawOpen=0.5 ..."),
+    port: str = typer.Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
+    hold: float = typer.Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="How long the pose is held."),
+    fast: bool = typer.Option(False, help="Virtual time, on emulated servos."),
+    yes: bool = typer.Option(False, "--yes", help="Hobby servos may jump to rest when they come on."),
+    json: bool = typer.Option(False, "--json", help="Print what moved as one JSON object, last line of stdout."),
+) -> None:
+    """Move one expression or channel under the head's limits, hold it, and go back to rest."""
+    from sfms_robot.app.head.pose import PoseOptions, pose_head
+    from sfms_robot.cli.show_head import print_pose
+
+    told = pose_head(PoseOptions(name, tuple(face), port, hold, fast, yes))
+    if json:
+        print(json_module.dumps(told))
+    else:
+        print_pose(told)
+    if told["exit"] == "interrupted":
+        raise typer.Exit(INTERRUPTED)
+
+
+@app.command("solve")
+def solve(
+    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    poses: Path = typer.Option(
+        ...,
+        "--poses",
+        metavar="FILE.csv",
+        help="Columns x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad and, if wanted, body_yaw_rad.",
+    ),
+    residual: bool = typer.Option(False, "--residual", help="Also print what is missing: residual_rad,residual_m."),
+) -> None:
+    """The neck's joints for each pose, as CSV in rad, and whether the pose is reached (1) or only approached (0)."""
+    from sfms_robot.app.head.head_solve import solve_poses
+
+    table = solve_poses(name, poses)
+    solved = table.solved
+    rest = [solved.residual_rad, solved.residual_m] if residual else []
+    rows = csv.writer(sys.stdout, lineterminator="\n")
+    rows.writerow([*table.joints, "reached", *("residual_rad", "residual_m")[: len(rest)]])
+    for angles, reached, *missing in zip(solved.angles_rad, solved.reached, *rest, strict=True):
+        rows.writerow([*(f"{angle:.12f}" for angle in angles), int(reached), *(f"{value:.3e}" for value in missing)])

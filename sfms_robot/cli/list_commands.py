@@ -1,0 +1,59 @@
+"""`sfms-robot listener|speaker|port list`: what there is to choose from."""
+
+from __future__ import annotations
+
+import json as json_module
+
+import typer
+
+listener = typer.Typer(help="Listeners: list.", no_args_is_help=True)
+speaker = typer.Typer(help="Recorded people: list.", no_args_is_help=True)
+port = typer.Typer(help="Serial ports and microphones: list.", no_args_is_help=True)
+JSON = typer.Option(False, "--json", help="Print as one JSON object.")
+
+
+@listener.callback()
+@speaker.callback()
+@port.callback()
+def _group() -> None: ...
+
+
+@listener.command("list")
+def list_listeners(json: bool = JSON) -> None:
+    """Shipped listeners: kind, whether it has weights, what it is."""
+    from sfms_robot.app.catalogue import shipped_listeners
+    from sfms_robot.cli.show import print_list
+
+    print_list("listeners", shipped_listeners(), json)
+
+
+@speaker.command("list")
+def list_speakers(json: bool = JSON) -> None:
+    """Shipped speakers: seconds, whether there is a face, what it is."""
+    from sfms_robot.app.catalogue import shipped_speakers
+    from sfms_robot.cli.show import print_list
+
+    print_list("speakers", shipped_speakers(), json)
+
+
+@port.command("list")
+def list_ports(json: bool = JSON) -> None:
+    """Serial ports that servos may hang on, with what speaks against using them; and devices that record sound."""
+    from sfms_robot.app.catalogue import microphones, serial_ports
+    from sfms_robot.cli.show import print_list, screen
+    from sfms_robot.errors import RobotError
+
+    ports, problem = serial_ports(), None
+    try:
+        devices = microphones()
+    except RobotError as error:
+        devices, problem = [], str(error)
+    if json:
+        told = {"version": 1, "ports": ports, "microphones": devices, "microphone_problem": problem}
+        print(json_module.dumps(told))
+        return
+    print_list("serial ports", ports, json=False)
+    if problem:
+        screen(highlight=False).print(problem, style="dim")
+    else:
+        print_list("microphones", devices, json=False)

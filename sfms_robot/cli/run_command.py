@@ -1,0 +1,158 @@
+"""`sfms-robot run`: drive a head."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import typer
+
+from sfms_robot.cli import names
+
+MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
+HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
+
+
+def run(
+    head: str = typer.Option(
+        "face28", autocompletion=names.heads, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
+    ),
+    port: str = typer.Option(
+        "sim",
+        rich_help_panel=HEAD,
+        help="'sim' for emulated servos, 'auto' for the adapter that is plugged in, a device, or NAME=DEVICE per bus.",
+    ),
+    intensity: list[str] = typer.Option(
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="How far a region goes, 0 to 2; may be repeated."
+    ),
+    style: list[str] = typer.Option(
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="How much of its small motions shows, 0 to 2."
+    ),
+    audio: str = typer.Option(
+        "default",
+        autocompletion=names.speakers,
+        rich_help_panel=PERSON,
+        metavar="mic[:DEVICE]|FILE.wav|NAME|none",
+        help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, 'none'. "
+        "Default: the microphone, with emulated servos a shipped speaker.",
+    ),
+    face: str = typer.Option(
+        "auto",
+        rich_help_panel=PERSON,
+        help="The speaker's face: FILE.csv or .csv.gz, 'none', or 'auto': the shipped speaker's own, else none.",
+    ),
+    agent_audio: str = typer.Option(
+        "none",
+        autocompletion=names.speakers,
+        rich_help_panel=PERSON,
+        metavar="FILE.wav|device:DEVICE|NAME|none",
+        help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, "
+        "'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
+    ),
+    duration: float | None = typer.Option(
+        None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."
+    ),
+    listener: str = typer.Option(
+        "sfms-small",
+        autocompletion=names.listeners,
+        rich_help_panel=LISTENER,
+        help="Shipped listener, or a folder with config.yaml and weights.",
+    ),
+    seed: int = typer.Option(
+        0,
+        min=0,
+        max=MAX_SEED,
+        rich_help_panel=LISTENER,
+        help="Two seeds listen differently, one seed repeats (with --fast).",
+    ),
+    fast: bool = typer.Option(
+        False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
+    ),
+    record: Path | None = typer.Option(
+        None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
+    ),
+    overwrite: bool = typer.Option(
+        False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
+    ),
+    json: bool = typer.Option(
+        False, "--json", rich_help_panel=OUTPUT, help="Print the report as one JSON object, last line of stdout."
+    ),
+    check: bool = typer.Option(
+        False, "--check", rich_help_panel=PERSON, help="Say how good the sound of --audio is, for 3 s; no servo moves."
+    ),
+    status: int | None = typer.Option(
+        None,
+        min=0,
+        max=65535,
+        metavar="PORT",
+        rich_help_panel=OUTPUT,
+        help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port).",
+    ),
+    dry_run: bool = typer.Option(
+        False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
+    ),
+    yes: bool = typer.Option(
+        False,
+        "--yes",
+        rich_help_panel=SAFETY,
+        help="Hobby servos may jump when they come on: they report no position to begin from.",
+    ),
+    halt_on: str | None = typer.Option(
+        None,
+        metavar="FILE|/dev/gpiochipN:LINE",
+        rich_help_panel=SAFETY,
+        help="Emergency stop when this file appears, or this GPIO line is pulled to ground.",
+    ),
+    without: list[str] = typer.Option(
+        [],
+        metavar="JOINT",
+        rich_help_panel=SAFETY,
+        help="Leave a joint's servo alone (broken, or not there); may be repeated.",
+    ),
+) -> None:
+    """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
+    from sfms_robot.app.listen.preflight import begin_listening, check_names
+
+    check_names(head, listener, port, audio, face, agent_audio)
+    if check:
+        _check(audio, duration, json)
+        return
+    with ExitStack() as stack:
+        # The listener loads from here on, in a process of its own, while this one imports what drives a head.
+        feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(listener, seed)))
+        from sfms_robot.app import session
+        from sfms_robot.app.listen.progress import RunProgress
+
+        options = session.RunOptions(
+            head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
+            tuple(intensity), tuple(style), tuple(without), halt_on, status,
+        )  # fmt: skip
+        report = session.run(options, RunProgress, feed=feed)
+    if json:
+        print(json_module.dumps(report))
+    else:
+        from sfms_robot.cli.show import print_dry_run, print_run
+
+        if dry_run:
+            print_dry_run(report)
+        else:
+            print_run(report, record)
+    if report.get("error"):
+        print(f"sfms-robot: {report['error']}", file=sys.stderr)
+    raise typer.Exit(report.get("exit_code", 0))
+
+
+def _check(audio: str, duration_s: float | None, json: bool) -> None:
+    from sfms_robot.app.listen.sound_check import CHECK_S, check_sound
+    from sfms_robot.cli.meter import LevelMeter
+
+    with LevelMeter() as meter:
+        told = check_sound("mic" if audio == "default" else audio, duration_s or CHECK_S, None if json else meter)
+    if json:
+        print(json_module.dumps(told))
+        return
+    from sfms_robot.cli.show import print_sound_check
+
+    print_sound_check(told)

@@ -1,0 +1,125 @@
+"""An emulated phone: packets of a real one, recorded, sent again at their pace. Also as a command:
+
+    python -m sfms_robot.emulator.phone [[HOST:]PORT]
+
+sends to port 11111 of this machine until Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+
+RATE_HZ: Final = 60.0
+PORT: Final = 11111
+_LENGTH: Final = struct.Struct(">I")
+
+
+def recorded_packets(path: Path | None = None) -> list[bytes]:
+    """Packets of Live Link Face as the phone sent them; those that ship with the package by default.
+
+    A file is gzip of one byte, a big-endian uint32 count, and per packet its uint32 length and bytes. Raises
+    ConfigError for another.
+    """
+    file = data_dir("sim") / "phones" / "llv" / "packets.gesichter" if path is None else path
+    try:
+        data = gzip.decompress(file.read_bytes())
+        (count,) = _LENGTH.unpack_from(data, 1)
+        packets, start = [], 1 + _LENGTH.size
+        for _ in range(count):
+            (length,) = _LENGTH.unpack_from(data, start)
+            start += _LENGTH.size + length
+            packets.append(data[start - length : start])
+    except (OSError, EOFError, struct.error) as error:
+        raise ConfigError(f"{file}: not recorded packets of a phone: {error}") from error
+    return packets
+
+
+def renumbered(packet: bytes, number: int) -> bytes:
+    """The packet with another frame number."""
+    start = 1
+    for _ in ("device", "subject"):
+        start += _LENGTH.size + _LENGTH.unpack_from(packet, start)[0]
+    return packet[:start] + struct.pack(">i", number) + packet[start + 4 :]
+
+
+class EmulatedPhone:
+    """Packet i is due at i / rate_hz. A recording is played to its end and back, for ever, its numbers going on.
+
+    Holds no time of its own: `send_until` is told it.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = PORT,
+        packets: Sequence[bytes] | None = None,
+        rate_hz: float = RATE_HZ,
+    ) -> None:
+        self.sent = 0
+        self._packets = recorded_packets() if packets is None else list(packets)
+        self._rate_hz = rate_hz
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._target = (host, port)
+
+    def packet(self, number: int) -> bytes:
+        """Packet `number` of the endless stream."""
+        last = len(self._packets) - 1
+        place = number % (2 * last) if last else 0
+        return renumbered(self._packets[min(place, 2 * last - place) if last else 0], number)
+
+    def send_until(self, now_s: float) -> int:
+        """Send what is due by `now_s` and not sent yet; how many that were. Does not wait."""
+        due = math.floor(now_s * self._rate_hz + 1e-6) + 1
+        before = self.sent
+        while self.sent < due:
+            self._socket.sendto(self.packet(self.sent), self._target)
+            self.sent += 1
+        return self.sent - before
+
+    def play(
+        self,
+        duration_s: float = math.inf,
+        now_s: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Send at the phone's pace for so long. Blocks."""
+        start_s = now_s()
+        while (elapsed_s := now_s() - start_s) < duration_s:
+            self.send_until(elapsed_s)
+            sleep(max(0.0, self.sent / self._rate_hz - (now_s() - start_s)))
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Send to `[HOST:]PORT` until interrupted. Raises ConfigError."""
+    target = arguments[0] if arguments else str(PORT)
+    host, _, port = target.rpartition(":")
+    if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise ConfigError(f"{target!r} is no place to send to (PORT, HOST:PORT)")
+    phone = EmulatedPhone(host or "127.0.0.1", int(port))
+    try:
+        phone.play()
+    finally:
+        phone.close()
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except KeyboardInterrupt:
+        pass
+    except ConfigError as problem:
+        sys.exit(str(problem))

@@ -1,0 +1,111 @@
+"""Does a person look at the head? From the direction of their eyes and head, relative to their neutral.
+
+Gaze is head plus eyes. Somebody who looks at the camera from the side turns to it, so where the place of their eyes is
+known the direction to the camera is taken off first. What is left has a neutral of its own: a phone that stands aside,
+a tracker's offset, a camera beside the head. It is learnt as a running median (every look moves it by the same small
+step, however far it goes), quickly in the first seconds of a face and slowly after, so that a person may look aside
+for less than half of the time without becoming somebody who looks at the head from there.
+
+Laws: a blink changes nothing; 30 degrees aside is under 0.2 within 0.3 s; never more attention for a larger angle; no
+face, no number, nor from one that has neither shown a head nor eyes that turn (a tracker of the mouth alone).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import CHANNEL_INDEX, Doubles, FaceFrame, Floats
+from sfms_robot.signals.eye_angles import directions
+
+HALF_RAD: Final = math.radians(10.0)  # attention 0.5: about twice what a gaze from a face tracker scatters
+SLOPE_RAD: Final = math.radians(2.0)
+SMOOTH_S: Final = 0.1
+CLOSED: Final = 0.5  # of eyeBlink; the eye channels of a closed eye mean nothing
+BLINK_S: Final = 0.5  # closed for longer, eyes look at nothing
+NEUTRAL_START_RAD_S: Final = math.radians(6.0)
+NEUTRAL_RAD_S: Final = math.radians(0.3)
+SETTLE_S: Final = 4.0
+FORGET_S: Final = 10.0  # whoever comes after so long is somebody else
+_FULL_RAD: Final = np.radians([30.0, 20.0])  # an eye's yaw and pitch for a channel of 1
+_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
+_HEAD: Final = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
+
+
+@dataclass(frozen=True)
+class AttentionState:
+    """What is remembered of a face.
+
+    Attributes:
+        time_s: of the last one; None before the first.
+        seen_s: for how long it has been seen with open eyes.
+        neutral_rad: (2,) yaw and pitch of the gaze that is at the head.
+        eyes_rad: (2,) of the last open eyes; `open_s` is when.
+        attention: the last one.
+        turns: head or eyes have been anywhere but at zero.
+    """
+
+    time_s: float | None = None
+    seen_s: float = 0.0
+    neutral_rad: Doubles = field(default_factory=lambda: np.zeros(2))
+    eyes_rad: Doubles = field(default_factory=lambda: np.zeros(2))
+    open_s: float = -math.inf
+    attention: float = 0.0
+    turns: bool = False
+
+
+def attend(
+    face: FaceFrame | None, place_m: Floats | None, state: AttentionState
+) -> tuple[float | None, AttentionState]:
+    """The attention (0..1) of a face, and the state after it; None where that cannot be told.
+
+    `place_m` (3,): see `frames.Sighting`. A face that is not newer than the last one changes nothing.
+    """
+    if face is None:
+        return None, state
+    if state.time_s is not None and face.time_s <= state.time_s:
+        return state.attention if state.turns else None, state
+    first = state.time_s is None or face.time_s - state.time_s > FORGET_S
+    before = AttentionState(open_s=face.time_s) if first else state
+    dt_s = 0.0 if before.time_s is None else face.time_s - before.time_s
+    motion = face.motion
+    closed = float(motion[_BLINKS].mean()) > CLOSED
+    eyes_rad = before.eyes_rad if closed else directions(motion, _FULL_RAD).mean(axis=0)
+    gaze_rad = motion[_HEAD] + eyes_rad - _to_camera(place_m)
+    neutral_rad, seen_s, open_s = before.neutral_rad, before.seen_s, before.open_s
+    if not closed:
+        neutral_rad = _learnt(neutral_rad, gaze_rad, dt_s, seen_s)
+        seen_s, open_s = seen_s + dt_s, face.time_s
+    looks = _at(float(np.hypot(*(gaze_rad - neutral_rad)))) if face.time_s - open_s <= BLINK_S else 0.0
+    attention = looks if first else looks + (before.attention - looks) * math.exp(-dt_s / SMOOTH_S)
+    turns = before.turns or bool(motion[_HEAD].any() or directions(motion, _FULL_RAD).any())
+    after = AttentionState(face.time_s, seen_s, neutral_rad, eyes_rad, open_s, attention, turns)
+    return attention if turns else None, after
+
+
+def _to_camera(place_m: Floats | None) -> Doubles:
+    """Yaw and pitch (2,) with which a person at that place looks into the camera; that of its axis if unknown.
+
+    Who stands at the camera's left turns to their own left, and who is above it looks down.
+    """
+    if place_m is None:
+        return np.zeros(2)
+    x, y, z = (float(value) for value in place_m)
+    return np.array([math.atan2(y, x), math.atan2(z, math.hypot(x, y))])
+
+
+def _learnt(neutral_rad: Doubles, gaze_rad: Doubles, dt_s: float, seen_s: float) -> Doubles:
+    """The neutral, nearer to this look by one step of a running median."""
+    speed_rad_s = NEUTRAL_RAD_S + (NEUTRAL_START_RAD_S - NEUTRAL_RAD_S) * math.exp(-seen_s / SETTLE_S)
+    off_rad = gaze_rad - neutral_rad
+    far_rad = float(np.hypot(*off_rad))
+    learnt: Doubles = neutral_rad + off_rad * min(1.0, speed_rad_s * dt_s / max(far_rad, 1e-9))
+    return learnt
+
+
+def _at(angle_rad: float) -> float:
+    """Attention of a gaze that is `angle_rad` away from the head, falling."""
+    return 1.0 / (1.0 + math.exp((angle_rad - HALF_RAD) / SLOPE_RAD))

@@ -1,0 +1,58 @@
+"""What stands in `--face KIND[:PLACE][,flip=CHANNEL+CHANNEL]`, for every kind that sees a live person.
+
+PLACE is the kind's own: a UDP port, a camera. `flip` turns the sign of pose channels that a tracker has the other way
+round: `live-link:11111,flip=yaw+roll`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import POSE_CHANNELS, Floats
+
+_OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
+_HIGHEST_PORT: Final = 65535
+
+
+@dataclass(frozen=True)
+class FaceArgument:
+    """PLACE, "" where none is given, and the pose channels to flip."""
+
+    place: str
+    flip: tuple[str, ...] = ()
+
+    @property
+    def signs(self) -> Floats:
+        """(6,) -1 for every pose channel that is flipped, 1 for the others."""
+        return np.array([-1.0 if name in self.flip else 1.0 for name in POSE_CHANNELS], dtype=np.float32)
+
+
+def parse_face_argument(kind: str, argument: str) -> FaceArgument:
+    """What stands behind `KIND:`. Raises ConfigError for another option and a channel that is none."""
+    place, flip = argument, ()
+    while option := _OPTION.search(place):
+        name, value = option.groups()
+        channels = tuple(value.split("+"))
+        if name != "flip":
+            raise ConfigError(f"--face {kind}: option {name!r} is not known (flip)")
+        for channel in channels:
+            if channel not in POSE_CHANNELS:
+                raise ConfigError(f"--face {kind}: flip = {channel!r} is no pose channel ({', '.join(POSE_CHANNELS)})")
+        place, flip = place[: option.start()], (*channels, *flip)
+    return FaceArgument(place, flip)
+
+
+def parse_endpoint(kind: str, place: str, host: str, port: int) -> tuple[str, int]:
+    """PORT or HOST:PORT ([HOST]:PORT for IPv6) -> host and port, those given where PLACE is "". Raises ConfigError."""
+    if not place:
+        return host, port
+    named, colon, number = place.rpartition(":")
+    if not (number.isascii() and number.isdigit() and 0 < int(number) <= _HIGHEST_PORT) or (colon and not named):
+        choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT; PORT 1 to {_HIGHEST_PORT}"
+        raise ConfigError(f"--face {kind}:{place}: {place!r} is no UDP port ({choices})")
+    return (named.strip("[]") if colon else host), int(number)

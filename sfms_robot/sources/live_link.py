@@ -1,0 +1,202 @@
+"""Live Link Face, Epic's app for iPhones with a depth camera: `--face live-link[:[HOST:]PORT]`.
+
+One packet a frame, big-endian:
+
+    uint8   version, 6
+    int32   length n, then n bytes: device id          (n < 0: -n characters of UTF-16)
+    int32   length n, then n bytes: subject name
+    int32   frame number, counted from midnight; float32 part of a frame
+    int32   frame rate: numerator, denominator
+    uint8   number of values: 61, or 0 while no face is seen
+    float32 52 blendshapes in the order "live_link_udp"; head yaw, pitch, roll; yaw, pitch, roll of each eye [rad]
+
+What the signs of the head's angles mean is in `signals.tracks.SOURCES`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from sfms_robot.errors import PacketError
+from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
+from sfms_robot.signals.tracks import SOURCES
+from sfms_robot.sources.face_argument import parse_endpoint, parse_face_argument
+from sfms_robot.sources.live_face import LiveFace
+from sfms_robot.sources.udp_sight import DatagramSocket, UdpSight, addresses_of_this_machine
+
+PORT: Final = 11111  # what the app suggests
+VERSION: Final = 6
+LATE_S: Final = 0.5  # a frame number further back than this, or after so long a silence: the count began anew
+
+_LENGTH: Final = struct.Struct(">i")
+_FRAME: Final = struct.Struct(">ifiiB")
+_LONGEST_NAME: Final = 512  # bytes
+_COUNT: Final = 61
+_SHAPES: Final = ORDERS["live_link_udp"]
+_VALUES: Final = (*_SHAPES, "yaw", "pitch", "roll", *(f"eye{i}" for i in range(6)))
+# A tracker may overshoot 0..1, and is clipped; another unit is refused.
+_LOWEST: Final = np.array([-0.5] * 52 + [-2 * np.pi] * 9, dtype=np.float32)
+_HIGHEST: Final = np.array([2.0] * 52 + [2 * np.pi] * 9, dtype=np.float32)
+# Of each of our channels: where it stands in a packet, and its sign; a packet has no position.
+_COLUMNS: Final = np.array([_VALUES.index(name) if name in _VALUES else 0 for name in CHANNELS])
+_FACTORS: Final = np.array([*SOURCES["live_link"].angles, 0, 0, 0, *[1] * 52], dtype=np.float32)
+
+
+class LiveLinkPacket(NamedTuple):
+    """One packet.
+
+    Attributes:
+        number: of the frame; what it counts is frames of `rate_hz` since midnight, or anything.
+        values: (61,) as the phone sent them, or None: no face is seen.
+    """
+
+    device: str
+    subject: str
+    number: int
+    part: float
+    rate_hz: float
+    values: Floats | None
+
+
+def parse_packet(data: bytes) -> LiveLinkPacket:
+    """Raises PacketError, in one line, for everything else than a whole packet of version 6 with finite values."""
+    if not data:
+        raise PacketError("an empty packet")
+    if data[0] != VERSION:
+        raise PacketError(_other_version(data))
+    device, start = _name(data, 1)
+    subject, start = _name(data, start)
+    if len(data) < start + _FRAME.size:
+        raise PacketError("a packet that is cut off")
+    number, part, numerator, denominator, count = _FRAME.unpack_from(data, start)
+    if count not in (0, _COUNT):
+        raise PacketError(f"a packet of another number of values than {_COUNT}")
+    if len(data) != start + _FRAME.size + 4 * count:
+        raise PacketError("a packet that is cut off, or too long")
+    if numerator <= 0 or denominator <= 0:
+        raise PacketError("a frame rate that is none")
+    values = None if count == 0 else _values(data, start + _FRAME.size)
+    return LiveLinkPacket(device, subject, number, part, numerator / denominator, values)
+
+
+def _values(data: bytes, start: int) -> Floats:
+    values = np.frombuffer(data, dtype=">f4", count=_COUNT, offset=start).astype(np.float32)
+    if not ((values >= _LOWEST) & (values <= _HIGHEST)).all():  # NaN fails both
+        raise PacketError("values that are not finite, not within 0..1 or not in radians")
+    return values
+
+
+def _name(data: bytes, start: int) -> tuple[str, int]:
+    """A text and where it ends."""
+    if len(data) < start + _LENGTH.size:
+        raise PacketError("a packet that is cut off")
+    (length,) = _LENGTH.unpack_from(data, start)
+    wide = length < 0
+    size, start = (-2 * length if wide else length), start + _LENGTH.size
+    if size > _LONGEST_NAME or start + size > len(data):
+        raise PacketError("a name that is longer than its packet")
+    text = data[start : start + size].decode("utf-16-be" if wide else "utf-8", "replace")
+    return text.rstrip("\0"), start + size
+
+
+def _other_version(data: bytes) -> str:
+    """Why a packet that does not begin with our version is not read."""
+    if any(_is_animator(data, order) for order in "<>"):
+        return (
+            "the app is in MetaHuman Animator mode, which sends no blendshapes: choose Live Link (ARKit) as its "
+            "capture mode"
+        )
+    if 0 < data[0] < VERSION:
+        return f"an older version of the app (its packets are version {data[0]}, not {VERSION}): update it"
+    return "no packets of Live Link Face"
+
+
+def _is_animator(data: bytes, order: str) -> bool:
+    """uint16 version, text, frame time, uint16 values, 6 floats of pose; nothing else has exactly this length."""
+    head = struct.Struct(order + "HH")
+    if len(data) < head.size:
+        return False
+    version, length = head.unpack_from(data)
+    counted = head.size + length + 16
+    if not 0 < version < 256 or len(data) < counted + 2:
+        return False
+    (count,) = struct.unpack_from(order + "H", data, counted)
+    return bool(count > 0 and len(data) == counted + 2 + 2 * count + 24)
+
+
+def motion_of(values: Floats) -> Floats:
+    """Values (61,) of a packet -> motion (58,); the packet has no position, which stays 0."""
+    motion: Floats = values[_COLUMNS] * _FACTORS
+    shapes = motion[SHAPES]
+    np.minimum(np.maximum(shapes, 0.0, out=shapes), 1.0, out=shapes)
+    return motion
+
+
+class LiveLinkDecoder:
+    """`Decoder` of one phone: the order of its packets is judged by their frame numbers.
+
+    A number a little back is late, one far back a new count: midnight, or the app was started again. Phones count in
+    steps of one, or of two where they send every other frame: lost is what is missing between steps.
+    """
+
+    def __init__(self) -> None:
+        self._counts = dict.fromkeys(("lost", "doubled", "late", "recounted", "no_face"), 0)
+        self._subject: str | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        self._number: int | None = None
+        self._data = b""
+        self._time_s = 0.0
+        self._step: int | None = None
+
+    def decode(self, data: bytes, time_s: float) -> Floats | None:
+        packet = parse_packet(data)
+        self._subject = packet.subject
+        if not self._is_next(packet, data, time_s):
+            return None
+        self._number, self._data, self._time_s = packet.number, data, time_s
+        if packet.values is None:
+            self._counts["no_face"] += 1
+            return None
+        return motion_of(packet.values)
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Frames lost on the way, doubled, late, without a face; how often the phone's count began anew; its name."""
+        return {**self._counts, "subject": self._subject}
+
+    def _is_next(self, packet: LiveLinkPacket, data: bytes, time_s: float) -> bool:
+        if self._number is None:
+            return True
+        if data == self._data:
+            self._counts["doubled"] += 1
+            return False
+        forward = packet.number - self._number
+        if time_s - self._time_s > LATE_S or abs(forward) > LATE_S * packet.rate_hz:
+            self._counts["recounted"] += forward < 0
+            return True
+        if forward < 0:
+            self._counts["late"] += 1
+            return False
+        if forward > 0:  # not every program that sends these packets counts
+            self._step = forward if self._step is None else min(self._step, forward)
+            self._counts["lost"] += forward // self._step - 1
+        return True
+
+
+def open_live_link(argument: str) -> UdpSight:
+    """`[[HOST:]PORT][,flip=...]`; a phone is another machine, so every address of this one is listened on by default.
+
+    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
+    """
+    given = parse_face_argument("live-link", argument)
+    host, port = parse_endpoint("live-link", given.place, "0.0.0.0", PORT)
+    opened = DatagramSocket("live-link", host, port)
+    own = addresses_of_this_machine() if host in ("0.0.0.0", "::") else [host]
+    target = f"{' or '.join(own) or 'this machine'}, port {opened.address[1]}"
+    hint = f"in the app, capture mode Live Link (ARKit), enter the target {target}"
+    return UdpSight("live-link", opened, LiveLinkDecoder(), LiveFace(given.signs), hint)

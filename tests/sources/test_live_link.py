@@ -1,0 +1,283 @@
+"""Live Link Face: what a packet holds, what becomes of those that hold none, and the order of those that do."""
+
+import csv
+import gzip
+import socket
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
+from sfms_robot.errors import PacketError, PortError
+from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
+from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
+from sfms_robot.sources.udp_sight import Datagram
+
+PACKETS = recorded_packets()
+DECODED = Path(__file__).parents[1] / "assets" / "live_link_llv.csv.gz"
+REAL_HEAD = bytes.fromhex(  # of an iPhone, by name: kaffeeklatsch's test of the same protocol
+    "06 00 00 00 24 35 39 30 34 41 41 34 42 2d 41 44 39 44 2d 34 33 45 35 2d 39 38 41 42 2d 38 39 41"
+    "41 45 42 38 41 42 32 37 37 00 00 00 06 69 50 68 6f 6e 65 00 0a 3f d9 3f 07 02 80 00 00 00 3c 00 00 00 01 3d"
+)
+
+
+def decoded():
+    with gzip.open(DECODED, "rt") as file:
+        return list(csv.DictReader(file))
+
+
+def packet(number=100, values=(0.25,) * 61, version=6, device=b"id", subject=b"phone", rate=(60, 1)):
+    """As the app writes one."""
+    names = b"".join(struct.pack(">i", len(name)) + name for name in (device, subject))
+    frame = struct.pack(">ifii", number, 0.5, *rate)
+    return bytes([version]) + names + frame + struct.pack(f">B{len(values)}f", len(values), *values)
+
+
+# --- one packet -------------------------------------------------------------------------------------------------
+
+
+def test_every_recorded_packet_says_what_another_program_read_in_it():
+    rows = decoded()
+    assert len(rows) == len(PACKETS) == 180
+    for data, row in zip(PACKETS, rows, strict=True):
+        parsed = parse_packet(data)
+        told = [float(value) for name, value in row.items() if name != "t_s"]
+        assert parsed.values == pytest.approx(told, abs=1e-6)
+        assert (parsed.subject, parsed.rate_hz) == ("LLV Default Device", 60)
+
+
+def test_motion_of_every_recorded_packet_goes_by_name():
+    for data, row in zip(PACKETS, decoded(), strict=True):
+        motion = motion_of(parse_packet(data).values)
+        for name in ORDERS["apple"]:
+            expected = min(max(float(row[name[0].upper() + name[1:]]), 0), 1)
+            assert motion[CHANNEL_INDEX[name]] == pytest.approx(expected, abs=1e-6)
+        angles = [float(row[name]) for name in ("HeadRoll", "HeadPitch", "HeadYaw")]
+        assert motion[:3] == pytest.approx(angles, abs=1e-6)  # radians, as they are
+        assert not motion[3:6].any()
+
+
+def test_what_the_recording_itself_has_lost_is_counted():
+    decoder = LiveLinkDecoder()
+    for number, data in enumerate(PACKETS):
+        assert decoder.decode(data, number / 60) is not None
+    counted = {name: count for name, count in decoder.statistics().items() if count and name != "subject"}
+    assert counted == {"lost": 7}
+
+
+def test_the_head_of_a_packet_of_an_iphone():
+    parsed = parse_packet(REAL_HEAD + bytes(61 * 4))
+    assert parsed.device == "5904AA4B-AD9D-43E5-98AB-89AAEB8AB277"
+    assert (parsed.subject, parsed.number, parsed.rate_hz) == ("iPhone", 0x0A3FD9, 60)
+    assert parsed.part == pytest.approx(0.52738, abs=1e-5)
+
+
+def test_names_of_any_script():
+    assert parse_packet(packet(subject="電話".encode())).subject == "電話"
+    wide = struct.pack(">i", -2) + "電話".encode("utf-16-be")
+    plain = packet(subject=b"")
+    assert parse_packet(plain[:7] + wide + plain[11:]).subject == "電話"
+
+
+def test_no_face_is_a_packet_without_values():
+    assert parse_packet(packet(values=())).values is None
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "empty"),
+        (packet()[:-1], "cut off"),
+        (packet() + b"\0", "too long"),
+        (packet()[:3], "cut off"),
+        (packet(values=(0.0,) * 52), "number of values than 61"),
+        (packet(rate=(60, 0)), "frame rate"),
+        (packet(values=(float("nan"),) * 61), "not finite"),
+        (packet(values=(float("inf"),) * 61), "not finite"),
+        (packet(values=(50.0,) * 61), "not within 0..1"),
+        (packet(values=(0.0,) * 52 + (20.0,) * 9), "not in radians"),
+        (packet(version=5), "version 5, not 6.*update"),
+        (packet(subject=b"x" * 600), "longer than its packet"),
+        (b"\x06\x7f\xff\xff\xff", "longer than its packet"),
+        (b"GET / HTTP/1.1\r\n\r\n", "no packets of Live Link Face"),
+        (struct.pack(">HH", 1, 5) + b"phone" + bytes(16) + struct.pack(">H", 130) + bytes(284), "MetaHuman Animator"),
+        (struct.pack("<HH", 1, 5) + b"phone" + bytes(16) + struct.pack("<H", 130) + bytes(284), "MetaHuman Animator"),
+    ],
+)
+def test_what_is_no_packet_is_refused_in_one_line(data, reason):
+    with pytest.raises(PacketError, match=reason) as told:
+        parse_packet(data)
+    assert "\n" not in str(told.value)
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=400))
+def test_any_bytes_are_a_packet_or_refused(data):
+    try:
+        parse_packet(b"\x06" + data)
+    except PacketError:
+        pass
+
+
+@settings(deadline=None)
+@given(st.integers(0, 179), st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20))
+def test_a_damaged_packet_is_refused_or_finite(which, damage):
+    data = bytearray(PACKETS[which])
+    for place, value in damage:
+        data[place] = value
+    try:
+        values = parse_packet(bytes(data)).values
+    except PacketError:
+        return
+    assert values is None or (np.isfinite(values).all() and np.isfinite(motion_of(values)).all())
+
+
+# --- their order ------------------------------------------------------------------------------------------------
+
+
+def decode(numbers, decoder=None, start_s=0.0, step_s=1 / 60):
+    """Which of these frame numbers become faces, and what is counted."""
+    decoder = decoder or LiveLinkDecoder()
+    seen = [n for i, n in enumerate(numbers) if decoder.decode(packet(n), start_s + i * step_s) is not None]
+    return seen, {name: count for name, count in decoder.statistics().items() if count and name != "subject"}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "seen", "counts"),
+    [
+        ([1, 2, 3], [1, 2, 3], {}),
+        ([1, 2, 5], [1, 2, 5], {"lost": 2}),
+        ([1, 2, 2, 3], [1, 2, 3], {"doubled": 1}),
+        ([1, 3, 2, 4], [1, 3, 4], {"late": 1, "lost": 0}),
+        ([2, 4, 6, 8], [2, 4, 6, 8], {}),  # 30 a second, counted at 60
+        ([5183998, 5183999, 0, 1], [5183998, 5183999, 0, 1], {"recounted": 1}),  # midnight
+        ([2**31 - 1, -(2**31), 1 - 2**31], [2**31 - 1, -(2**31), 1 - 2**31], {"recounted": 1}),
+        ([900, 901, 0, 1], [900, 901, 0, 1], {"recounted": 1}),  # the app was started again
+        ([1, 2, 70000, 3, 4], [1, 2, 70000, 3, 4], {"recounted": 1}),  # one number that was wrong
+    ],
+)
+def test_frame_numbers_tell_what_was_lost(numbers, seen, counts):
+    got, counted = decode(numbers)
+    assert got == seen
+    assert counted == {name: count for name, count in counts.items() if count}
+
+
+def test_after_a_silence_any_number_will_do():
+    decoder = LiveLinkDecoder()
+    decode([100, 101], decoder)
+    assert decode([95, 96], decoder, start_s=1.0) == ([95, 96], {"recounted": 1})
+
+
+@settings(deadline=None)
+@given(st.permutations(range(12)))
+def test_faces_are_always_in_order_whatever_the_network_does(numbers):
+    seen, _ = decode(numbers)
+    assert seen == sorted(seen) and seen[-1] == 11
+
+
+def test_who_does_not_count_is_seen_all_the_same():
+    decoder = LiveLinkDecoder()
+    for number, value in enumerate((0.1, 0.2, 0.3)):
+        assert decoder.decode(packet(0, (value,) * 61), number / 60) is not None
+    assert decoder.statistics()["doubled"] == decoder.statistics()["lost"] == 0
+
+
+def test_a_packet_without_a_face_is_counted_and_shows_none():
+    decoder = LiveLinkDecoder()
+    assert decoder.decode(packet(1, values=()), 0.0) is None
+    assert decoder.statistics()["no_face"] == 1
+
+
+# --- over a socket ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sight():
+    opened = open_live_link("127.0.0.1:" + str(free_port()))
+    opened.start(0.0)
+    yield opened
+    opened.close()
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def phone(sight):
+    emulated = EmulatedPhone(*sight.address)
+    yield emulated
+    emulated.close()
+
+
+def test_an_emulated_phone_is_seen(sight, phone):
+    assert sight.at(1e9) is None
+    phone.send_until(10 / 60)
+    while sight.statistics()["packets"] < 11:  # a slow call leaves some to the next
+        sight.at(1e9)
+    face = sight.at(1e9).face
+    expected = motion_of(parse_packet(PACKETS[10]).values)[SHAPES]
+    assert face.time_s > 0
+    assert face.blendshapes.max() <= expected.max()
+    assert sight.statistics()["faces"] == 11 and sight.statistics()["lost"] == 0
+
+
+def test_a_port_that_is_taken_is_one_line(sight):
+    with pytest.raises(PortError, match=r"live-link: UDP port \d+ on 127.0.0.1 is used by another program"):
+        open_live_link(f"127.0.0.1:{sight.address[1]}")
+
+
+@pytest.mark.parametrize("host", ["a..b", "203.0.113.7"])
+def test_an_address_that_is_not_this_machines_is_one_line(host):
+    with pytest.raises(PortError, match=f"live-link: UDP port 11111 on {host}: ") as told:
+        open_live_link(f"{host}:11111")
+    assert "\n" not in str(told.value)
+
+
+def test_a_port_is_free_again_after_close(sight):
+    sight.close()
+    sight.close()
+    open_live_link(f"127.0.0.1:{sight.address[1]}").close()
+
+
+def test_pose_channels_are_flipped_on_request():
+    values = np.zeros(61, np.float32)
+    poses = {}
+    for flip in ("", ",flip=yaw+roll"):
+        opened = open_live_link(f"127.0.0.1:{free_port()}{flip}")
+        opened.feed(Datagram(packet(1, values), ("192.0.2.1", 1), 0.0))  # straight ahead
+        assert opened.at(0.0).face.pose[:3] == pytest.approx([0, 0, 0])
+        opened.feed(Datagram(packet(2, (*values[:52], 0.3, 0.2, 0.1, *values[55:])), ("192.0.2.1", 1), 0.02))
+        poses[flip] = opened.at(0.02).face.pose[:3]
+        opened.close()
+    assert poses[""] == pytest.approx([0.1, 0.2, 0.3], abs=0.02)
+    assert poses[",flip=yaw+roll"] == pytest.approx([-0.1, 0.2, -0.3], abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_million_packets_of_noise_never_raise(sight):
+    """Through a real socket: whole, damaged, cut, random; what is left of them are counts."""
+    random = np.random.default_rng(0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for number in range(1_000_000):
+            data = bytearray(renumbered(PACKETS[number % 180], number & 0x7FFFFFFF))
+            kind = number % 4
+            if kind == 1:
+                data[random.integers(len(data))] = random.integers(256)
+            elif kind == 2:
+                del data[random.integers(len(data)) :]
+            elif kind == 3:
+                data = bytearray(random.bytes(int(random.integers(600))))
+            out.sendto(data, sight.address)
+            while number % 16 == 15 and sight.statistics()["packets"] <= number:
+                sight.at(1e9)
+    counts = sight.statistics()
+    assert counts["packets"] == 1_000_000
+    assert 450_000 < counts["malformed"] < 750_000
+    assert np.isfinite(sight.at(1e9).face.motion).all()

@@ -1,0 +1,318 @@
+"""Avatar software: OSC as python-osc writes it, names and presets, bones in our axes, and whatever else comes."""
+
+import math
+import socket
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
+from scipy.spatial.transform import Rotation
+
+from sfms_robot.errors import ConfigError, PacketError, PortError
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, SHAPES
+from sfms_robot.signals.spaces import turned_by
+from sfms_robot.sources.vmc import VmcDecoder, angles_of_unity, elements, open_vmc, parse_message
+
+LEVEL = (0.0, 0.0, 0.0)
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
+UNITY_TO_OURS = np.array([[0, 0, 1], [-1, 0, 0], [0, 1, 0]])  # x right, y up, z forward -> x forward, y left, z up
+
+
+def message(address, *values):
+    builder = OscMessageBuilder(address)
+    for value in values:
+        builder.add_arg(*value) if isinstance(value, tuple) else builder.add_arg(value)
+    return builder.build()
+
+
+def bundle(*messages):
+    builder = OscBundleBuilder(IMMEDIATELY)
+    for each in messages:
+        builder.add_content(each)
+    return builder.build().dgram
+
+
+def blend(name, value):
+    return message("/VMC/Ext/Blend/Val", name, value)
+
+
+def bone(name, quaternion):
+    return message("/VMC/Ext/Bone/Pos", name, *LEVEL, *map(float, quaternion))
+
+
+APPLY = message("/VMC/Ext/Blend/Apply")
+
+
+def shown(*messages, decoder=None):
+    return (decoder or VmcDecoder()).decode(bundle(*messages), 0.0)
+
+
+# --- names ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("written", [str, str.upper, str.lower, lambda name: name[0].upper() + name[1:]])
+def test_every_arkit_name_in_any_case(written):
+    values = np.linspace(0.1, 0.9, 52).astype(np.float32)
+    motion = shown(
+        *(blend(written(name), float(value)) for name, value in zip(BLENDSHAPES, values, strict=True)), APPLY
+    )
+    assert motion[SHAPES] == pytest.approx(values)
+
+
+def test_values_hold_from_apply_on():
+    decoder = VmcDecoder()
+    assert shown(blend("jawOpen", 0.5), decoder=decoder) is None
+    assert shown(APPLY, decoder=decoder)[CHANNEL_INDEX["jawOpen"]] == 0.5
+
+
+def test_a_frame_may_come_in_many_packets_and_without_bundles():
+    decoder = VmcDecoder()
+    assert decoder.decode(blend("jawOpen", 0.5).dgram, 0.0) is None
+    assert decoder.decode(blend("eyeBlinkLeft", 1.0).dgram, 0.0) is None
+    motion = decoder.decode(APPLY.dgram, 0.0)
+    assert {name for name in BLENDSHAPES if motion[CHANNEL_INDEX[name]]} == {"jawOpen", "eyeBlinkLeft"}
+
+
+@pytest.mark.parametrize(
+    ("preset", "moves"),
+    [
+        ("Blink_L", {"eyeBlinkLeft"}),
+        ("blinkRight", {"eyeBlinkRight"}),
+        ("A", {"jawOpen"}),
+        ("ou", {"jawOpen", "mouthPucker"}),
+        ("Joy", {"mouthSmileLeft", "mouthSmileRight", "cheekSquintLeft", "cheekSquintRight"}),
+        ("lookLeft", {"eyeLookOutLeft", "eyeLookInRight"}),
+        ("Neutral", set()),
+    ],
+)
+def test_a_preset_moves_the_shapes_nearest_to_it(preset, moves):
+    motion = shown(blend(preset, 1.0), APPLY)
+    assert {name for name in BLENDSHAPES if motion[CHANNEL_INDEX[name]]} == moves
+
+
+def test_who_sends_arkit_shapes_is_believed_in_these():
+    motion = shown(blend("mouthSmileLeft", 0.2), blend("Joy", 1.0), APPLY)
+    assert motion[CHANNEL_INDEX["mouthSmileLeft"]] == pytest.approx(0.2)
+    assert motion[CHANNEL_INDEX["mouthSmileRight"]] == 0
+
+
+def test_arkit_names_that_never_move_leave_the_presets():
+    motion = shown(*(blend(name, 0.0) for name in BLENDSHAPES), blend("Blink", 1.0), APPLY)
+    assert motion[CHANNEL_INDEX["eyeBlinkLeft"]] == 1
+
+
+def test_names_that_say_nothing_are_counted():
+    decoder = VmcDecoder()
+    shown(blend("Ahoge", 1.0), blend("Ahoge", 0.5), blend("Tail", 1.0), APPLY, decoder=decoder)
+    assert decoder.statistics()["unknown_names"] == 2
+
+
+# --- bones ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("axis", "pose"),
+    [
+        ((1, 0, 0), (0, 1, 0)),  # about the avatar's right, left-handed: nose down
+        ((0, 1, 0), (0, 0, -1)),  # about up, left-handed: to its own right
+        ((0, 0, 1), (-1, 0, 0)),  # about forward, left-handed: left ear down
+    ],
+)
+def test_a_turn_about_each_of_unitys_axes(axis, pose):
+    quaternion = (*(math.sin(0.15) * part for part in axis), math.cos(0.15))
+    assert shown(bone("Head", quaternion))[:3] == pytest.approx(np.array(pose) * 0.3, abs=1e-6)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_any_rotation_turns_our_axes_as_it_turns_unitys(seed):
+    """R_ours = A R A^T, A a reflection: it takes left-handed axes to right-handed ones."""
+    turn = Rotation.random(random_state=np.random.RandomState(seed))
+    ours = turned_by(np.array([angles_of_unity(tuple(turn.as_quat()))]))[0]
+    assert ours == pytest.approx(UNITY_TO_OURS @ turn.as_matrix() @ UNITY_TO_OURS.T, abs=1e-6)
+
+
+def test_the_head_goes_with_its_neck():
+    neck, head = Rotation.from_euler("xyz", [0.1, 0.3, -0.2]), Rotation.from_euler("xyz", [-0.2, 0.1, 0.3])
+    apart = shown(bone("Neck", neck.as_quat()), bone("Head", head.as_quat()))
+    whole = shown(bone("head", (neck * head).as_quat()))
+    assert apart[:3] == pytest.approx(whole[:3], abs=1e-6)
+
+
+def test_other_bones_show_nothing():
+    assert shown(bone("Hips", IDENTITY), bone("LeftEye", IDENTITY)) is None
+
+
+def test_lost_tracking_shows_nothing_until_it_is_back():
+    decoder = VmcDecoder()
+    assert shown(message("/VMC/Ext/OK", 1, 3, 0, 0), APPLY, decoder=decoder) is None
+    assert shown(APPLY, decoder=decoder) is None
+    assert shown(message("/VMC/Ext/OK", 1, 3, 0, 1), APPLY, decoder=decoder) is not None
+    assert decoder.statistics()["lost_tracking"] == 1
+    assert shown(message("/VMC/Ext/OK", 1), APPLY, decoder=decoder) is not None
+
+
+# --- other types, and what is none ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [1, (0.25, "d"), (1, "h")])
+def test_numbers_of_other_types_are_read(value):
+    motion = shown(blend("jawOpen", value), APPLY)
+    assert motion[CHANNEL_INDEX["jawOpen"]] == (value[0] if isinstance(value, tuple) else value)
+
+
+def test_a_bone_of_doubles_is_read():
+    numbers = [(part, "d") for part in (*LEVEL, 0.0, math.sin(0.15), 0.0, math.cos(0.15))]
+    motion = shown(message("/VMC/Ext/Bone/Pos", "Head", *numbers))
+    assert motion[:3] == pytest.approx([0, 0, -0.3], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        message("/VMC/Ext/Blend/Val", 1.0, "jawOpen"),
+        message("/VMC/Ext/Blend/Val", "jawOpen"),
+        message("/VMC/Ext/Blend/Val", "jawOpen", "wide"),
+        message("/VMC/Ext/Blend/Val", "jawOpen", True),
+        message("/VMC/Ext/Blend/Val", "jawOpen", math.nan),
+        message("/VMC/Ext/Blend/Val", "jawOpen", math.inf),
+        message("/VMC/Ext/Blend/Val", "jawOpen", b"blob"),
+        message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0),
+        message("/VMC/Ext/Bone/Pos", "Head", "a", "b", "c", "d", "e", "f", "g"),
+        bone("Head", (0, 0, 0, 0)),
+        bone("Head", (math.nan, 0, 0, 1)),
+        bone("Head", (0, 0, 0, 5)),
+        message("/VMC/Ext/OK"),
+    ],
+)
+def test_messages_of_wrong_types_are_counted_and_change_nothing(wrong):
+    decoder = VmcDecoder()
+    motion = shown(wrong, APPLY, decoder=decoder)
+    assert not motion.any()
+    assert decoder.statistics()["wrong_messages"] == 1
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "no OSC"),
+        (b"hello", "no OSC"),
+        (b"#bundle\0" + bytes(8) + struct.pack(">i", -4), "cut off"),  # a size that goes nowhere
+        (b"#bundle\0" + bytes(8) + struct.pack(">i", 0) * 3, "cut off"),
+        (bundle(APPLY)[:-4], "cut off"),
+        (bundle(*[APPLY] * 1100), "without end"),
+        (message("/tuio/2Dcur", "alive").dgram, "VMC"),
+    ],
+)
+def test_what_is_no_packet_is_refused(data, reason):
+    with pytest.raises(PacketError, match=reason):
+        VmcDecoder().decode(data, 0.0)
+
+
+def test_of_messages_of_other_types_a_packet_has_so_many_and_no_more():
+    decoder = VmcDecoder()
+    motion = shown(*(blend("jawOpen", 1) for _ in range(64)), blend("eyeBlinkLeft", 1), APPLY, decoder=decoder)
+    assert {name for name in BLENDSHAPES if motion[CHANNEL_INDEX[name]]} == {"jawOpen"}
+
+
+def test_bundles_in_bundles_end_somewhere():
+    data = APPLY.dgram
+    for depth in range(2000):
+        data = b"#bundle\0" + bytes(8) + struct.pack(">i", len(data)) + data
+        if depth == 2:
+            assert list(elements(data)) == [APPLY.dgram]
+    with pytest.raises(PacketError, match="without end"):
+        list(elements(data))
+
+
+@settings(deadline=None)
+@given(
+    st.binary(max_size=300),
+    st.sampled_from([b"", b"/VMC/Ext/Blend/Val\0\0", b"/VMC/Ext/Bone/Pos\0\0\0,sfffffff\0\0\0"]),
+)
+def test_any_bytes_are_taken_or_refused(data, head):
+    decoder = VmcDecoder()
+    for packet in (head + data, b"#bundle\0" + bytes(8) + struct.pack(">i", len(head + data)) + head + data):
+        try:
+            motion = decoder.decode(packet, 0.0)
+        except PacketError:
+            continue
+        assert motion is None or np.isfinite(motion).all()
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=100))
+def test_any_message_is_read_or_refused(data):
+    try:
+        parse_message(b"/VMC/Ext/Blend/Val\0\0" + data)
+    except PacketError:
+        pass
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=20))
+def test_a_damaged_frame_is_refused_or_finite(damage):
+    data = bytearray(bundle(*(blend(name, 0.5) for name in BLENDSHAPES), bone("Head", IDENTITY), APPLY))
+    for place, value in damage:
+        data[place % len(data)] = value
+    try:
+        motion = VmcDecoder().decode(bytes(data), 0.0)
+    except PacketError:
+        return
+    assert motion is None or (np.isfinite(motion).all() and motion[SHAPES].min() >= 0 and motion[SHAPES].max() <= 1)
+
+
+@pytest.mark.slow
+def test_a_million_packets_of_noise_never_raise():
+    random = np.random.default_rng(0)
+    whole = bundle(*(blend(name, 0.5) for name in BLENDSHAPES[:8]), bone("Head", IDENTITY), APPLY)
+    decoder, refused = VmcDecoder(), 0
+    for number in range(1_000_000):
+        data = bytearray(whole)
+        if number % 3 == 0:
+            data[random.integers(len(data))] = random.integers(256)
+        elif number % 3 == 1:
+            del data[random.integers(len(data)) :]
+        else:
+            data[20:] = random.bytes(int(random.integers(300)))
+        try:
+            decoder.decode(bytes(data), 0.0)
+        except PacketError:
+            refused += 1
+    assert 300_000 < refused < 900_000
+
+
+# --- over a socket ----------------------------------------------------------------------------------------------
+
+
+def test_avatar_software_on_this_machine_is_seen():
+    sight = open_vmc(":".join(("127.0.0.1", str(free_port()))))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        out.sendto(bundle(blend("jawOpen", 0.0), APPLY), sight.address)
+        sight.at(1e9)
+        out.sendto(bundle(blend("jawOpen", 0.5), APPLY), sight.address)
+        assert sight.at(1e9).face.blendshapes[BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5, abs=0.01)
+    with pytest.raises(PortError, match="vmc: UDP port .* is used by another program"):
+        open_vmc(str(sight.address[1]))
+    sight.close()
+
+
+def test_only_this_machine_is_heard_unless_told_otherwise():
+    sight = open_vmc(str(free_port()))
+    assert sight.address[0] == "127.0.0.1"
+    sight.close()
+
+
+def test_an_argument_that_cannot_be_used_is_one_line():
+    with pytest.raises(ConfigError, match="is no UDP port"):
+        open_vmc("avatar")
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
