@@ -1,4 +1,6 @@
-"""What there is to choose from: listeners, recorded people, serial ports, microphones. Each row has a name and a description."""
+"""What there is to choose from: listeners, recorded people, serial ports, microphones. Each row has a name and a
+description.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, speakers, voice_file
 
 if TYPE_CHECKING:
-    from sfms_robot.ports import Source
+    from sfms_robot.ports import Source, Voice
 
 GROUP: Final = "sfms_robot.sources"
 _HERE: Final = "sfms_robot.sources"
@@ -81,11 +81,13 @@ def open_source(
     loop: bool = True,
     agent_audio: str = "none",
     kinds: SourceKinds | None = None,
+    agent: Voice | None = None,
 ) -> Source:
     """A person by what a run is told of them.
 
     An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
-    own, else none. `loop`: recordings start again when they end before `duration_s` does.
+    own, else none. `loop`: recordings start again when they end before `duration_s` does. `agent` is what the robot says,
+    instead of `agent_audio`.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
@@ -97,9 +99,8 @@ def open_source(
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     again = loop and duration_s is not None
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
-        agent = None
-        if split_kind(audio)[0] == "mic" and agent_audio != "none":
-            voice, agent = _conversation(audio, agent_audio, known, failed)
+        if split_kind(audio)[0] == "mic" and (agent is not None or agent_audio != "none"):
+            voice, agent = _conversation(audio, agent or agent_audio, known, failed)
         else:
             voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed)
         voice = voice or _recorded_voice(audio, again)
@@ -148,16 +149,16 @@ def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed
     return part
 
 
-def _conversation(audio: str, agent_audio: str, known: SourceKinds, failed: ExitStack) -> tuple[Any, Any]:
+def _conversation(audio: str, agent: Voice | str, known: SourceKinds, failed: ExitStack) -> tuple[Any, Any]:
     """A microphone, and what the robot says: the one has to know of the other, whose echo it hears."""
     from sfms_robot.sources.microphone import open_microphone_and_loudspeaker, open_microphone_beside
 
-    device, (kind, loudspeaker) = split_kind(audio)[1], split_kind(agent_audio)
+    device = split_kind(audio)[1]
     both: tuple[Any, Any]
-    if kind == "device":
-        both = open_microphone_and_loudspeaker(device, loudspeaker)
+    if isinstance(agent, str) and split_kind(agent)[0] == "device":
+        both = open_microphone_and_loudspeaker(device, split_kind(agent)[1])
     else:
-        both = open_microphone_beside(device, _agent(agent_audio, known, failed))
+        both = open_microphone_beside(device, _agent(agent, known, failed) if isinstance(agent, str) else agent)
     failed.callback(both[0].close)
     return both
 

@@ -13,6 +13,7 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.sources.microphone import OwnVoice, open_loudspeaker, open_microphone, sound_devices
 from sfms_robot.sources.microphone_worker import captured_s
+from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
 
@@ -49,8 +50,8 @@ def hear():
     """How to open `--audio` and `--agent-audio` and listen; all is closed afterwards."""
     sources = []
 
-    def opened(audio="mic", agent_audio="none"):
-        source = open_source(audio, "none", agent_audio=agent_audio)
+    def opened(audio="mic", **how):
+        source = open_source(audio, "none", **how)
         sources.append(source)
         return Hearing(source, source._voice)
 
@@ -135,18 +136,21 @@ def test_a_sound_server_that_is_started_again_is_found_again(hear, sound_server)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent_audio", ["device:robot.monitor", "told"])
-def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_server, tmp_path, agent_audio):
+@pytest.mark.parametrize("told_by", ["file", "device", "program"])
+def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_server, tmp_path, told_by):
     """Its loudspeaker is heard by the microphone 50 ms later; nobody else speaks."""
     said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")[: 6 * AUDIO_HZ]
     file = tmp_path / "said.wav"
     soundfile.write(file, said, AUDIO_HZ)
     sound_server.plug("robot")
     sound_server.load("module-loopback", "source=robot.monitor", "sink=person", "latency_msec=50")
+    speech = PushedSpeech()
+    how = {"file": {"agent_audio": str(file)}, "device": {"agent_audio": "device:robot.monitor"}}
     levels = []
     for taken_out in (False, True):
-        told = str(file) if agent_audio == "told" else agent_audio
-        hearing = hear("mic:person.monitor", told if taken_out else "none")
+        hearing = hear("mic:person.monitor", **(how.get(told_by, {"agent": speech}) if taken_out else {}))
+        if taken_out:
+            speech.say(said, AUDIO_HZ)
         play("robot", file)
         frames = hearing.seconds(6.0)
         levels.append(energy_db(heard(frames[75:])))
