@@ -25,6 +25,7 @@ from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import run_report
+from sfms_robot.app.listen.run_teller import RunTeller
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import Head, Joint, load_head
@@ -410,6 +411,7 @@ def run(
         turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
         recorder = _recorder(options, opened.config)
         own = [each for each in (recorder, progress(duration_s) if progress else None) if each is not None]
+        own += [RunTeller(outlet) for outlet in source.outlets]
         for observer in own:
             stack.callback(observer.close)
         programme = Programme(

@@ -97,6 +97,8 @@ def parse_message(data: bytes) -> Message:
         raise PacketError(f"a message of kind {kind}, which a robot is not sent ({_listed(FEEDS)})")
     if not (math.isfinite(sent_s) and math.isfinite(at_s)):
         raise PacketError("a time that is not finite")
+    if at_s and not sent_s:
+        raise PacketError("a time without the time of sending")
     rest = data[_HEADER.size :]
     return _face(rest, sent_s, at_s) if kind == FACE else _sound(kind, rate_hz, rest, sent_s, at_s)
 

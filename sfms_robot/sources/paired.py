@@ -23,7 +23,7 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
-from sfms_robot.ports import Sight, Source, Voice
+from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -109,6 +109,12 @@ class PairedSource:
         for part in self._parts().values():
             part.close()
 
+    @property
+    def outlets(self) -> Sequence[Outlet]:
+        """Those behind its parts, each once."""
+        found = [getattr(part, "outlet", None) for part in self._parts().values()]
+        return list(dict.fromkeys(each for each in found if each is not None))
+
     def _parts(self) -> dict[str, Voice | Sight]:
         parts = {"voice": self._voice, "face": self._sight, "agent_audio": self._agent}
         return {name: part for name, part in parts.items() if part is not None}
@@ -150,6 +156,7 @@ class JudgedSource:
         self.duration_s = inner.duration_s
         self.latency_s = inner.latency_s
         self._inner = inner
+        self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
         self._given = 0
 

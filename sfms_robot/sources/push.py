@@ -271,13 +271,3 @@ def as_floats(pcm: Pcm) -> NDArray[np.float32]:
         return samples.astype(np.float32) / np.float32(32768)
     with np.errstate(over="ignore"):  # what is too large for 32 bits becomes infinite, and is judged as that
         return samples.astype(np.float32)
-
-
-def open_pushed_voice(argument: str) -> PushedVoice:
-    """`--audio push`; it takes no argument."""
-    return PushedVoice()
-
-
-def open_pushed_sight(argument: str) -> PushedSight:
-    """`--face push`; it takes no argument."""
-    return PushedSight()
