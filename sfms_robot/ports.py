@@ -23,7 +23,12 @@ class Voice(Protocol):
     """Somebody's voice, cut into frames: frame i is the 640 samples of 16 kHz of loop time (i x 0.04, (i + 1) x 0.04].
 
     Live voices are filled from another thread or process, whose time stamps are those of `time.monotonic`.
+
+    Attributes:
+        lost: it has told something, and tells nothing any more: a device that is away.
     """
+
+    lost: bool
 
     @property
     def duration_s(self) -> float | None:
@@ -46,7 +51,13 @@ class Voice(Protocol):
 
 
 class Sight(Protocol):
-    """What a camera or a phone sees of a person. Time stamps as `Voice`."""
+    """What a camera or a phone sees of a person. Time stamps as `Voice`.
+
+    Attributes:
+        lost: as of `Voice`. Nobody in the picture is no loss.
+    """
+
+    lost: bool
 
     @property
     def duration_s(self) -> float | None:
@@ -85,11 +96,13 @@ class Source(Protocol):
         duration_s: length of a recording; None for something live.
         latency_s: as of `Voice`.
         outlets: whom the run is to be told to.
+        missing: which parts of it are lost, by name: the run is degraded meanwhile.
     """
 
     duration_s: float | None = None
     latency_s: float = 0.0
     outlets: Sequence[Outlet] = ()
+    missing: tuple[str, ...] = ()
 
     def start(self, origin_s: float) -> None:
         """Loop time 0, the first tick after torque came on, is `origin_s` of `time.monotonic`; drop what was before.
@@ -131,6 +144,10 @@ class Listener(Protocol):
 
 class PlanFeed(Protocol):
     """A listener seen from the loop: frames go in, plans come out when they are ready."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether it does not answer: hung, or being started anew, or given up."""
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None: ...
 
@@ -206,6 +223,13 @@ class Bus(Protocol):
         happens.
         """
 
+    def release(self, joints: Sequence[str]) -> None:
+        """Torque off for `joints` alone: their goals are withheld, until `enable`; the others go on.
+
+        Written at once in one packet per wire, and again in every poll until each servo says that it is off. Never
+        waits for an answer; raises nothing. Called by who calls `write`.
+        """
+
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """Torque off on all buses first, then confirmed and repeated, as far as servos answer; joints whose safety or
         `policy` says hold keep theirs. Goals are refused from now on.
@@ -241,12 +265,15 @@ class Tick:
         motion: (58,) the face asked for at this instant, without lead.
         goals_rad: (J,) what was written.
         readings: freshest reading per joint.
+        state, why: of the run, see docs/safety.md; `why` names what is lost, or who halted.
     """
 
     time_s: float
     motion: Floats
     goals_rad: Doubles
     readings: Mapping[str, Reading]
+    state: str = "starting"
+    why: tuple[str, ...] = ()
 
 
 class Clock(Protocol):
@@ -339,6 +366,9 @@ class Limiter(Protocol):
 
     def step(self, reference_rad: Doubles, state: Any) -> tuple[Doubles, Any]:
         """Reference (3, J): angle, speed, acceleration one tick ahead -> angles (J,) that may be sent."""
+
+    def brake(self, state: Any) -> tuple[Doubles, Any]:
+        """Every joint one tick on its way to a stop, as fast as its limits allow -> angles (J,) that may be sent."""
 
     def restart(self, joints: NDArray[np.bool_], angles_rad: Doubles, state: Any) -> Any:
         """Some `joints` (J,) came back and stand still at `angles_rad` (J,); the others go on."""

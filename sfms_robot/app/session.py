@@ -20,12 +20,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import run_report
 from sfms_robot.app.listen.run_teller import RunTeller
+from sfms_robot.app.listen.status_server import status_server
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import Head, Joint, load_head
@@ -43,10 +45,14 @@ from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.spontaneous import Life
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.halt_switches import halt_signals, halt_switch
+from sfms_robot.runtime.heat import HeatGuard
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
+from sfms_robot.runtime.status import RunStatus
 from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
@@ -66,7 +72,7 @@ INTERRUPTED: Final = 130
 
 @dataclass(frozen=True)
 class Motion:
-    """What lies between a plan and the bus."""
+    """What lies between a plan and the bus. `holds` (J,): joints that keep their torque in an emergency stop."""
 
     timeline: PlanTimeline
     retargeter: HeadRetargeter
@@ -74,6 +80,8 @@ class Motion:
     audit: Audit
     leads_s: Doubles
     rest_rad: Doubles
+    holds: NDArray[np.bool_]
+    heat: HeatGuard
 
 
 @dataclass(frozen=True)
@@ -185,6 +193,9 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     leads_s = np.array([joint.lag_ms / 1e3 for joint in head.joints.values()])
     if len(neck := retargeter.neck_columns):
         leads_s[neck] = leads_s[neck].max()  # its joints show one pose together
+    safety = [head.safety_of(joint) for joint in head.joints]
+    holds = np.array([each.halt == "hold" for each in safety])
+    holds[neck] |= np.array([safety[column].halt is None for column in neck], np.bool_)
     return Motion(
         PlanTimeline(1.0 / rate_hz),
         retargeter,
@@ -192,6 +203,8 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
         Audit(limits, calibration_of(head.joints), 1.0 / rate_hz),
         leads_s,
         np.array([joint.rest_rad for joint in head.joints.values()]),
+        holds,
+        HeatGuard(np.array([each.warm_C for each in safety]), np.array([each.hot_C for each in safety]), neck.tolist()),
     )
 
 
@@ -264,8 +277,7 @@ class Programme:
         timeline: None for that of plans.
         retargeter: None for the head's own.
         life: what the head does of itself; None for nothing.
-        knobs: see `Parts`.
-        overlay: see `Parts`.
+        knobs, overlay, answers, halt: see `Parts`.
         observers: closed by whoever made them.
     """
 
@@ -277,6 +289,8 @@ class Programme:
     life: Life | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
+    answers: bool = False
+    halt: HaltLatch = field(default_factory=HaltLatch)
     observers: Sequence[Observer] = ()
 
 
@@ -308,13 +322,15 @@ def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, 
     parts = Parts(
         programme.source, programme.feed, programme.timeline or motion.timeline,
         programme.retargeter or motion.retargeter, motion.limiter, opened.bus, programme.observers, motion.leads_s,
-        motion.rest_rad, programme.life, programme.knobs, programme.overlay,
+        motion.rest_rad, programme.life, programme.knobs, programme.overlay, programme.answers, programme.halt,
+        motion.holds, motion.heat, frozenset(opened.options.without),
     )  # fmt: skip
     log = RunLog(motion.retargeter.joints, 1.0 / opened.rate_hz, motion.audit)
     duration_s = math.inf if programme.duration_s is None else programme.duration_s
     real = not opened.options.fast
     outcome, error = "failed", None
-    with signals_to(interrupt) if signals else nullcontext(), realtime_priority(wanted=real) as priority:
+    watched = programme.halt.watched(opened.bus) if real else nullcontext()
+    with signals_to(interrupt) if signals else nullcontext(), watched, realtime_priority(wanted=real) as priority:
         interrupt.arm(opened.bus)
         began_s = time.monotonic()
         try:
@@ -328,6 +344,7 @@ def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, 
             if not isinstance(failure, RobotError):
                 logger.exception("the run ends by an error that nobody expected")
         elapsed_s = time.monotonic() - began_s if real else None
+        log.ended(opened.clock.now_s(), error)
     return Drove(outcome, log, elapsed_s, priority, error)
 
 
@@ -353,7 +370,9 @@ class RunOptions:
     yes: bool = False
     intensity: tuple[str, ...] = ()
     style: tuple[str, ...] = ()
-    without: tuple[str, ...] = field(default=())
+    without: tuple[str, ...] = ()
+    halt_on: str | None = None
+    status: int | None = None
 
     @property
     def servos(self) -> HeadOptions:
@@ -371,6 +390,7 @@ def run(
     knobs: Callable[[HeadRetargeter], Callable[[], Any]] | None = None,
     overlay: Callable[[Floats, Doubles], Floats] | None = None,
     interrupt: Interrupt | None = None,
+    halt: HaltLatch | None = None,
     signals: bool = True,
 ) -> dict[str, Any]:
     """Listen until the duration is over or somebody interrupts. Returns the report.
@@ -384,6 +404,7 @@ def run(
         knobs: from the retargeter of the opened head, what is asked at every tick; None: the options' own.
         observers, overlay: see `Programme`.
         interrupt: asked to end the run from another thread.
+        halt: closed and opened from other threads.
 
     Raises RobotError before torque came on.
     """
@@ -393,8 +414,12 @@ def run(
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
     if limited is not None:
         logger.warning("%s: %s", Path(options.listener).name, limited)
-    interrupt = interrupt or Interrupt()
+    interrupt, halt = interrupt or Interrupt(), halt or HaltLatch()
     with signals_to(interrupt) if signals else nullcontext(), ExitStack() as stack:  # until all is closed again
+        if signals:
+            stack.enter_context(halt_signals(halt))
+        if options.halt_on is not None:
+            stack.enter_context(halt_switch(options.halt_on, halt))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         if source is None:
@@ -410,16 +435,26 @@ def run(
             feed.wait_loaded()
         turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
         recorder = _recorder(options, opened.config)
+        status = RunStatus(
+            list(opened.config.joints),
+            {"head": opened.config.name, "port": options.port, "listener": Path(options.listener).name},
+            lambda: {"source": dict(source.statistics()), "listener_state": dict(feed.statistics())},
+        )
         own = [each for each in (recorder, progress(duration_s) if progress else None) if each is not None]
         own += [RunTeller(outlet) for outlet in source.outlets]
         for observer in own:
             stack.callback(observer.close)
+        if options.status is not None:
+            port = stack.enter_context(status_server(options.status, status.document))
+            logger.warning("status: http://127.0.0.1:%d/", port)
         programme = Programme(
             source, feed, duration_s,
             life=Life(opened.config.life, options.seed, opened.config.camera),
             knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
             overlay=overlay,
-            observers=[*observers, *own],
+            answers=True,
+            halt=halt,
+            observers=[status, *observers, *own],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt, signals=False)
         report = run_report(

@@ -75,6 +75,14 @@ def run(
     json: bool = typer.Option(
         False, "--json", rich_help_panel=OUTPUT, help="Print the report as one JSON object, last line of stdout."
     ),
+    status: int | None = typer.Option(
+        None,
+        min=0,
+        max=65535,
+        metavar="PORT",
+        rich_help_panel=OUTPUT,
+        help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port).",
+    ),
     dry_run: bool = typer.Option(
         False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
     ),
@@ -83,6 +91,12 @@ def run(
         "--yes",
         rich_help_panel=SAFETY,
         help="Hobby servos may jump when they come on: they report no position to begin from.",
+    ),
+    halt_on: str | None = typer.Option(
+        None,
+        metavar="FILE|/dev/gpiochipN:LINE",
+        rich_help_panel=SAFETY,
+        help="Emergency stop when this file appears, or this GPIO line is pulled to ground.",
     ),
     without: list[str] = typer.Option(
         [],
@@ -103,7 +117,7 @@ def run(
 
         options = session.RunOptions(
             head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
-            tuple(intensity), tuple(style), tuple(without),
+            tuple(intensity), tuple(style), tuple(without), halt_on, status,
         )  # fmt: skip
         report = session.run(options, RunProgress, feed=feed)
     if json:

@@ -30,6 +30,9 @@ class Safety(Model):
         pinch: something is in the way. By default 60 % of the servo's own current limit for half a second: limp.
         strain: a pose that takes force for long heats the servo and makes it sing. Off by default.
         stop: at the end of a run, once at rest: torque off, or kept.
+        halt: in an emergency stop, once the joint stands: torque off, or kept. By default joints of the neck, which
+            bear its weight, keep it.
+        warm_C, hot_C: temperature from which the joint moves half as far, and from which it stays at rest.
         registers: raw values written before torque comes on: gains, profiles and the like (`register_rules`).
         stored: raw values that have to be stored in the servo; compared before torque comes on, never written.
     """
@@ -40,8 +43,17 @@ class Safety(Model):
     pinch: LoadRule | None = None
     strain: LoadRule | None = None
     stop: Literal["release", "hold"] = "release"
+    halt: Literal["release", "hold"] | None = None
+    warm_C: Positive = 60.0
+    hot_C: Positive = 67.0
     registers: dict[Name, StrictInt] = Field(default_factory=dict)
     stored: dict[Name, StrictInt] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _hot_is_warmer(self) -> Safety:
+        if self.hot_C <= self.warm_C:
+            raise ValueError(f"hot_C: {self.hot_C:g} is not above warm_C ({self.warm_C:g})")
+        return self
 
     def merged(self, other: Safety | None) -> Safety:
         """This, and over it what `other` gives explicitly."""

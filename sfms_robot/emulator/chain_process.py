@@ -13,6 +13,7 @@ control socket says how many there are and what time it is. Control requests and
     kill ID | revive ID              ok          the servo falls silent, or answers again
     fault ID BITS                    ok          latch hardware errors
     turn ID TICKS                    ok          somebody turns the shaft by hand to where its position reads TICKS
+    heat ID DEGREES                  ok          its temperature is this from now on, and goes where its load takes it
     state ID                         json {...}  what an onlooker sees: position, goal, torque, ...
     inject SPEC                      ok          a fault (see `faults`), from now on unless it says
     clear                            ok          no more faults
@@ -217,7 +218,7 @@ class Server:
             wire.advance(now_s)
             self._plug()
             return "ok"
-        if name not in ("kill", "revive", "fault", "turn", "state"):
+        if name not in ("kill", "revive", "fault", "turn", "heat", "state"):
             return f"error unknown request {name}"
         servo = wire.servo(int(words[1]))
         if servo is None:
@@ -229,6 +230,8 @@ class Server:
             servo.dead = name == "kill"
         elif name == "fault":
             servo.fail(int(words[2]), now_s)
+        elif name == "heat":
+            servo.plant.temperature_C = float(words[2])
         elif hasattr(servo, "turn"):
             servo.turn(float(words[2]), now_s)
         else:

@@ -92,6 +92,10 @@ class Chain:
         """Turn the shaft by hand to where its position reads `ticks`; beyond one turn, too."""
         self.ask(f"turn {servo_id} {ticks}")
 
+    def heat(self, servo_id: int, temperature_C: float) -> None:
+        """A servo has this temperature from now on, and goes where its load takes it."""
+        self.ask(f"heat {servo_id} {temperature_C}")
+
     def state(self, servo_id: int) -> dict[str, Any]:
         """What an onlooker sees: position [ticks], goal, torque, faults, temperature_C."""
         return cast("dict[str, Any]", self._json(f"state {servo_id}"))

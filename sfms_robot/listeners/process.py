@@ -101,6 +101,11 @@ class ListenerProcess:
         self._supervise(now_s)
         return plans
 
+    @property
+    def lost(self) -> bool:
+        """Hung, being started anew, or given up."""
+        return self._state in ("hung", "given up") or (self._restarts > 0 and self._state != "listening")
+
     def statistics(self) -> Mapping[str, Any]:
         """`state` (starting, building, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms`."""
         return {

@@ -67,6 +67,11 @@ class ListenerThread:
             self._state = "listening"
         return plans
 
+    @property
+    def lost(self) -> bool:
+        """Hung, or failed."""
+        return self._state != "listening"
+
     def statistics(self) -> Mapping[str, Any]:
         """`state` (listening, hung, or failed and how), `restarts` 0, `skipped_frames`, `step_ms` p50 and p99."""
         return {

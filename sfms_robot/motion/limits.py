@@ -167,6 +167,17 @@ class JerkLimiter:
         still_out = way_in if not self._own.holds(after[0]).all() else None
         return after[0].copy(), LimiterState(after, still_out, state.chased + chased, state.refused + refused)
 
+    def brake(self, state: LimiterState) -> tuple[Doubles, LimiterState]:
+        """Every joint one tick on its way to a stop, as fast as its limits allow; one that stands stays.
+
+        Angles (J,) that may be sent, and the state after the tick. Never leads a joint farther out than it is.
+        """
+        before = state.motion.T.tolist()
+        after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).T
+        reach = self._own.reaching(state.motion[0])
+        np.clip(after[0], reach.low, reach.high, out=after[0])
+        return after[0].copy(), replace(state, motion=after)
+
     def _tick(
         self, reference_rad: Doubles, motion: Doubles, within: _Bounds, outside: Bools | None = None
     ) -> tuple[Doubles, int, int]:

@@ -17,6 +17,8 @@ IDLE_FEED: Final[Mapping[str, Any]] = {
 class InlineFeed:
     """Steps the listener in `push`; its plan becomes visible a fixed `latency_s` later (ports.PlanFeed)."""
 
+    lost = False
+
     def __init__(self, listener: Listener, seed: int, latency_s: float) -> None:
         self._listener = listener
         self._memory = listener.start(seed)

@@ -6,6 +6,7 @@ half minute of three channels are kept.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -18,15 +19,19 @@ from numpy.typing import NDArray
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Audit
 from sfms_robot.runtime.clock import TickTime
+from sfms_robot.runtime.states import RunState
 from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.quantiles import Quantiles
 
 LATE_SHARE: Final = 0.5  # a tick is late when it starts more than this share of a period behind its deadline
 ATTENTIVE: Final = 0.5  # a person with more attention looks at the head
 SPEECH_RMS: Final = 0.01  # a frame louder than this counts as speech when latency is measured
+STATES: Final = 200  # the newest changes of state, for the report
 _REMEMBERED: Final = 250  # frames of speech and plans that wait to be measured: ten seconds
 _BLOCK_S: Final = 20.0  # counted at once
 _MARGIN_S: Final = 8.0  # looked at on both sides of a block; no nod is longer
+
+logger = logging.getLogger(__name__)
 
 FindEvents = Callable[[Doubles, float], Sequence[tuple[float, float, float]]]
 
@@ -98,6 +103,8 @@ class RunLog:
     audited: Any = None
     state: Any = None  # of the loop at its end: timeline and limiter tell what they counted
     detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
+    states: deque[tuple[float, RunState]] = field(default_factory=lambda: deque(maxlen=STATES))
+    state_s: dict[str, float] = field(default_factory=dict)
     _last_rad: Doubles | None = None
     _waiting: deque[Plan] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     _speech_s: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
@@ -124,6 +131,29 @@ class RunLog:
             self.attentive_frames += frame.attention > ATTENTIVE
         if len(frame.audio) and float(np.sqrt(np.mean(frame.audio**2))) > SPEECH_RMS:
             self._speech_s.append(frame.time_s)
+
+    def entered(self, state: RunState, now_s: float) -> None:
+        """The run's state, or what is said of it, is this one from `now_s` on."""
+        if self.states:
+            since_s, before = self.states[-1]
+            self.state_s[before.name] = self.state_s.get(before.name, 0.0) + now_s - since_s
+        self.states.append((now_s, state))
+        level = logging.WARNING if state.why else logging.INFO
+        logger.log(level, "%s%s", state.name, f": {', '.join(state.why)}" if state.why else "")
+
+    def ended(self, now_s: float, error: Exception | None) -> None:
+        """Torque is off."""
+        before = self.states[-1][1] if self.states else RunState("stopping")
+        self.entered(before.ended(now_s, None if error is None else str(error)), now_s)
+
+    def state_report(self) -> dict[str, Any]:
+        """`states` of the report: seconds in each, and the newest changes with what was said of them."""
+        return {
+            "seconds": {name: round(seconds, 3) for name, seconds in self.state_s.items()},
+            "changes": [
+                {"time_s": round(at_s, 3), "state": state.name, "why": list(state.why)} for at_s, state in self.states
+            ],
+        }
 
     def refuse(self) -> None:
         self.refused_plans += 1

@@ -10,14 +10,16 @@ goes); speed and acceleration are central differences, so one sample lies one ti
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sfms_robot.frames import Doubles, Floats, Reading
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
 from sfms_robot.ports import (
     Bus,
     Clock,
@@ -30,21 +32,37 @@ from sfms_robot.ports import (
     StopPolicy,
     Tick,
     Timeline,
-    Watched,
 )
 from sfms_robot.runtime.clock import tick_times
+from sfms_robot.runtime.fade import Fade
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.heat import Heat, HeatGuard, temperatures_C
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
+from sfms_robot.runtime.presence import Presence
 from sfms_robot.runtime.safety import EASE_S, come_to_rest, smooth
-from sfms_robot.runtime.watching import turned_by_hand, watch
+from sfms_robot.runtime.states import RunState, Situation, following
+
+LOOK_S: Final = 0.1  # between two looks at what is lost
+WARMTH_S: Final = 1.0  # and at how warm servos are
+AWAY_S: Final = 1.0  # a position older than this: the servo is away
+PINCH: Final = "pinch"  # a fault that begins so
+_TURNING: Final = [CHANNEL_INDEX[name] for name in CHANNELS if name in ("yaw", "pitch") or name.startswith("eyeLook")]
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Everything a run is made of, put together by `app`. `leads_s` and `rest_rad` are (J,) in joint order.
+    """Everything a run is made of, put together by `app`; (J,) in joint order.
 
-    `knobs` is asked at every tick how much the head is to show; None: what its file says. `overlay` (motion (N, 58),
-    times (N,)) -> motion lays what somebody asks for by hand over what the listener planned.
+    Attributes:
+        leads_s, rest_rad: (J,).
+        knobs: asked at every tick how much the head is to show; None: what its file says.
+        overlay: (motion (N, 58), times (N,)) -> motion lays what somebody asks for by hand over what is planned.
+        answers: what is planned shows only while somebody is there.
+        halt: asked at every tick.
+        holds: (J,) joints that keep their torque when halted; None: no joint does.
+        heat: None: temperatures are nobody's business here.
+        ignored: joints whose faults are known and wanted.
     """
 
     source: Source
@@ -59,11 +77,25 @@ class Parts:
     life: Life | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
+    answers: bool = False
+    halt: HaltLatch = field(default_factory=HaltLatch)
+    holds: NDArray[np.bool_] | None = None
+    heat: HeatGuard | None = None
+    ignored: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
 class State:
-    """What one tick hands to the next: the pose torque came on in and when, and two reference samples (J,) each."""
+    """What one tick hands to the next.
+
+    Attributes:
+        held_rad, since_s: (J,) the pose torque came on in, and when.
+        before_rad, here_rad: (J,) two samples of the reference.
+        goals_rad: (J,) the last command.
+        run: the state of the run; `presence` and `lost_joints` are what it is judged by.
+        answer: how much of the listener's answer shows.
+        released: the halt has let go of the joints that it does not hold.
+    """
 
     timeline: Any
     limiter: Any
@@ -71,9 +103,15 @@ class State:
     since_s: Doubles
     before_rad: Doubles
     here_rad: Doubles
-    life: Any = None
-    retargeter: Any = None
-    watched: Watched = Watched()
+    goals_rad: Doubles
+    life: Any
+    retargeter: Any
+    heat: Heat
+    presence: Presence = field(default_factory=Presence.start)
+    run: RunState = RunState()
+    lost_joints: tuple[str, ...] = ()
+    answer: Fade = Fade()
+    released: bool = False
 
 
 def drive(
@@ -104,16 +142,27 @@ def drive(
                 if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
                     break
                 state = _heard(parts, observers, log, tick.time_s, state)
-                state, command = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
+                state = _judged(parts, log, tick.time_s, state)
+                if state.run.name == "halted":
+                    state, command = _halted(parts, state)
+                else:
+                    if state.released:
+                        state = _resumed(parts, log, clock.now_s() - start_s, state)
+                    state, command = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
                 log.commanded(tick, command.goals_rad, command.asked_rad, command.motion)
                 parts.bus.write(command.goals_rad, tick.time_s)
                 log.wrote(clock.now_s() - start_s, command.reach_s)
                 readings = parts.bus.poll(tick.time_s)
                 state = _rejoined(parts, log, readings, state, tick.time_s)
-                observers.tick(Tick(tick.time_s, command.motion, command.goals_rad, readings))
+                state = _noticed(parts, readings, state, tick.time_s, 1.0 / rate_hz)
+                observers.tick(
+                    Tick(tick.time_s, command.motion, command.goals_rad, readings, state.run.name, state.run.why)
+                )
         finally:
-            way = tick_times(clock, rate_hz, start_s)
-            come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log)
+            state = _ending(log, clock.now_s() - start_s, state)
+            if parts.halt.by is None:  # a head that was halted moves no more
+                way = tick_times(clock, rate_hz, start_s)
+                come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log)
             log.state = state
     finally:
         parts.bus.stop(stop)
@@ -129,16 +178,16 @@ def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> Stat
         held_rad[index] = parts.bus.enable([joint])[0]
     log.start(held_rad)
     return State(
-        parts.timeline.start(), parts.limiter.start(held_rad), held_rad, 0 * held_rad, held_rad, held_rad,
-        parts.life.start() if parts.life else None, parts.retargeter.start(),
+        parts.timeline.start(), parts.limiter.start(held_rad), held_rad, 0 * held_rad, held_rad, held_rad, held_rad,
+        parts.life.start() if parts.life else None, parts.retargeter.start(), Heat.cool(len(held_rad)),
     )  # fmt: skip
 
 
 def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state: State) -> State:
     """Frames of the person go to the listener, plans that are ready join the timeline."""
-    watched = state.watched
+    presence = state.presence
     for frame in parts.source.read(now_s):
-        watched = watch(frame, watched)
+        presence = presence.after(frame)
         parts.feed.push(frame, now_s)
         log.heard(frame)
         observers.heard(frame)
@@ -150,7 +199,36 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
         timeline = parts.timeline.accept(plan, timeline)
         log.planned(plan)
         observers.planned(plan)
-    return replace(state, timeline=timeline, watched=watched)
+    return replace(state, timeline=timeline, presence=presence)
+
+
+def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
+    """What the run is doing, from here on."""
+    presence = state.presence
+    lost = (*parts.source.missing, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
+    eased_in = bool(now_s - state.since_s.max() >= EASE_S)
+    halted = parts.halt.by
+    if halted is None and state.run.name == "halted" and not state.released:
+        (halted,) = state.run.why  # it is released when it stands, not before
+    run = following(
+        state.run, Situation(eased_in, presence.person(now_s), presence.speaking(now_s), lost, halted), now_s
+    )
+    if run.name == "halted":
+        parts.halt.answer()
+    if run is not state.run or not log.states:
+        log.entered(run, now_s)
+    return replace(state, run=run)
+
+
+def _ending(log: RunLog, now_s: float, state: State) -> State:
+    run = following(state.run, Situation(ending=True), now_s)
+    log.entered(run, now_s)
+    return replace(state, run=run)
+
+
+def turned_by_hand(planned: Floats, asked: Floats) -> bool:
+    """Whether what is asked (N, 58) turns head or eyes otherwise than what was planned (N, 58)."""
+    return asked is not planned and not np.array_equal(asked[:, _TURNING], planned[:, _TURNING])
 
 
 @dataclass(frozen=True)
@@ -171,24 +249,55 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     ahead_s = np.minimum(parts.leads_s + period_s, parts.timeline.lead_limit_s(state.timeline))
     times_s = np.concatenate([[now_s], now_s + ahead_s])
     motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
+    answer = state.answer
+    if parts.answers:
+        answer = answer.toward(float(state.presence.answered(now_s)), times_s)
+        motion = motion * answer.at(times_s)[:, None].astype(np.float32)
     planned = motion
     if parts.overlay:
         motion = parts.overlay(motion, times_s)
     life, knobs = state.life, parts.knobs() if parts.knobs else None
     if parts.life:
         shown_pose = partial(parts.retargeter.shown_pose, knobs=knobs)
-        watched = replace(state.watched, by_hand=turned_by_hand(planned, motion))
+        watched = replace(state.presence.watched, by_hand=turned_by_hand(planned, motion))
         motion, life = parts.life.step(motion, times_s, now_s, life, shown_pose, watched)
     angles_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
+    if not state.heat.none:
+        angles_rad = parts.rest_rad + state.heat.share * (angles_rad - parts.rest_rad)
     eased = smooth((now_s + period_s - state.since_s) / EASE_S)
     ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)
     state = replace(
-        state, timeline=timeline, limiter=limiter, before_rad=state.here_rad, here_rad=ahead_rad, life=life,
-        retargeter=retargeter,
+        state, timeline=timeline, limiter=limiter, before_rad=state.here_rad, here_rad=ahead_rad, goals_rad=goals_rad,
+        life=life, retargeter=retargeter, answer=answer,
     )  # fmt: skip
     return state, Command(goals_rad, reference[0], motion[0], float(times_s.max()))
+
+
+def _halted(parts: Parts, state: State) -> tuple[State, Command]:
+    """Brake; once all joints stand, let go of those that need not hold themselves."""
+    goals_rad, limiter = parts.limiter.brake(state.limiter)
+    released = state.released
+    if not released and np.array_equal(goals_rad, state.goals_rad):
+        held = np.zeros(len(goals_rad), np.bool_) if parts.holds is None else parts.holds
+        parts.bus.release([joint for joint, holds in zip(parts.retargeter.joints, held, strict=True) if not holds])
+        released = True
+    command = Command(goals_rad, goals_rad, np.zeros(MOTION_DIM, np.float32), -math.inf)
+    return replace(state, limiter=limiter, goals_rad=goals_rad, released=released), command
+
+
+def _resumed(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
+    """A person has released the halt: torque comes on again, and every joint eases in from where it stands."""
+    joints = parts.retargeter.joints
+    stands_rad = parts.bus.enable(joints)
+    everyone = np.ones(len(joints), np.bool_)
+    log.restart(everyone, stands_rad)
+    return replace(
+        state, limiter=parts.limiter.restart(everyone, stands_rad, state.limiter), held_rad=stands_rad,
+        since_s=np.full(len(joints), now_s), before_rad=stands_rad, here_rad=stands_rad, goals_rad=stands_rad,
+        released=False,
+    )  # fmt: skip
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: State, now_s: float) -> State:
@@ -205,6 +314,31 @@ def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state:
     before, here = np.where(back, stands, state.before_rad), np.where(back, stands, state.here_rad)
     limiter = parts.limiter.restart(back, stands, state.limiter)
     return replace(state, limiter=limiter, held_rad=held, since_s=since, before_rad=before, here_rad=here)
+
+
+def _noticed(parts: Parts, readings: Mapping[str, Reading], state: State, now_s: float, period_s: float) -> State:
+    """What the servos tell: who is away or faulty, who is warm; and a pinch while halted lets go at once."""
+    heat = state.heat
+    if parts.heat:
+        if _due(now_s, period_s, WARMTH_S):
+            heat = parts.heat.judge(temperatures_C(parts.retargeter.joints, readings), heat)
+        heat = parts.heat.after(heat, period_s)
+    if not _due(now_s, period_s, LOOK_S):
+        return replace(state, heat=heat) if heat is not state.heat else state
+    lost = tuple(joint for joint, reading in readings.items() if joint not in parts.ignored and _is_lost(reading))
+    if state.run.name == "halted" and any((readings[joint].fault or "").startswith(PINCH) for joint in lost):
+        parts.bus.release(parts.retargeter.joints)
+        state = replace(state, released=True)
+    return replace(state, heat=heat, lost_joints=lost)
+
+
+def _is_lost(reading: Reading) -> bool:
+    return reading.fault is not None or (reading.position_rad is not None and reading.age_s > AWAY_S)
+
+
+def _due(now_s: float, period_s: float, every_s: float) -> bool:
+    """Whether this is the first tick of a new `every_s`."""
+    return math.floor(now_s / every_s + 1e-9) != math.floor((now_s - period_s) / every_s + 1e-9)
 
 
 def difference(before: Doubles, here: Doubles, ahead: Doubles, period_s: float) -> Doubles:

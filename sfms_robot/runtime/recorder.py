@@ -5,8 +5,9 @@ value is dropped and counted, never waited for - except in virtual time, where w
 be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
 goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
-Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /face (per tick: the 58 channels asked
-for), /joints (per tick and joint: goal, present, age, fault).
+Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /event (nods, blinks and smiles that
+plans hold), /face (per tick: the 58 channels asked for), /joints (per tick and joint: goal, present, age, fault),
+/servos (once a second: what else they tell), /state (when it changes).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import math
 import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -31,15 +32,18 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
+from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals.audio import energy_db
 
 RUN_FILE: Final = "run.mcap"
 REPORT_FILE: Final = "report.json"
 FullPolicy = Literal["drop", "wait"]
+Message = tuple[str, float, dict[str, Any]]
 
 _QUEUE_LENGTH: Final = 2000  # ten seconds of a 100 Hz loop
 _CHUNK_BYTES: Final = 64 * 1024  # short stalls, and little is lost when a run is killed
 PART_MESSAGES: Final = 100_000  # about seven minutes of a 100 Hz loop
+SERVOS_S: Final = 1.0
 _DIGITS: Final = 5
 _log = logging.getLogger(__name__)
 
@@ -70,8 +74,11 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "times_s": {"type": "array", "items": _NUMBER},
         "frames": {"type": "array", "items": {"type": "array", "items": _NUMBER}},
     },
+    "/event": {"kind": {"type": "string"}, "start_s": _NUMBER, "end_s": _NUMBER, "size": _NUMBER},
     "/face": {"time_s": _NUMBER, **_CHANNELS},
     "/joints": {"time_s": _NUMBER, "joints": {"type": "object", "additionalProperties": _JOINT}},
+    "/servos": {"time_s": _NUMBER, "servos": {"type": "object"}},
+    "/state": {"time_s": _NUMBER, "state": {"type": "string"}, "why": {"type": "array", "items": {"type": "string"}}},
 }
 
 
@@ -101,6 +108,9 @@ class Recorder:
         self._about = {**(about or {}), "joints": json.dumps(self._joints), "started_utc": _now_utc()}
         self._parts = 0
         self._in_part = 0
+        self._events = PlannedEvents()
+        self._state: tuple[str, tuple[str, ...]] | None = None
+        self._servos_s = -math.inf
         self._begin()
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -175,7 +185,7 @@ class Recorder:
             _log.error("the recording ends here: %s", self._trouble)
 
     def _write(self, value: Tick | SpeakerFrame | Plan) -> None:
-        for topic, time_s, body in _messages(value, self._joints):
+        for topic, time_s, body in self._messages(value):
             time_ns = max(0, round(time_s * 1e9))
             data = json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
             self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
@@ -184,6 +194,26 @@ class Recorder:
         if self._in_part >= PART_MESSAGES:
             self._end()
             self._begin()
+
+    def _messages(self, value: Tick | SpeakerFrame | Plan) -> list[Message]:
+        """What one value becomes in the file: topic, time, body."""
+        if isinstance(value, SpeakerFrame):
+            return [("/speaker", value.time_s, _speaker_body(value))]
+        if isinstance(value, Plan):
+            events = [("/event", event.start_s, asdict(event)) for event in self._events.add(value)]
+            return [("/plan", value.made_at_s, _plan_body(value)), *events]
+        messages: list[Message] = [
+            ("/face", value.time_s, {"time_s": value.time_s, **_by_channel(value.motion)}),
+            ("/joints", value.time_s, _joints_body(value, self._joints)),
+        ]
+        if (value.state, value.why) != self._state:
+            self._state = (value.state, value.why)
+            state = {"time_s": value.time_s, "state": value.state, "why": list(value.why)}
+            messages.append(("/state", value.time_s, state))
+        if value.time_s - self._servos_s >= SERVOS_S:
+            self._servos_s = value.time_s
+            messages.append(("/servos", value.time_s, _servos_body(value)))
+        return messages
 
 
 def check_folder(folder: Path, overwrite: bool = False) -> None:
@@ -229,19 +259,12 @@ def _now_utc() -> str:
     return datetime.now(UTC).isoformat()
 
 
-def _messages(value: Tick | SpeakerFrame | Plan, joints: Sequence[str]) -> list[tuple[str, float, dict[str, Any]]]:
-    """What one value becomes in the file: topic, time, body."""
-    if isinstance(value, Plan):
-        body = {
-            "made_at_s": value.made_at_s,
-            "times_s": _numbers(value.times_s),
-            "frames": [_numbers(frame) for frame in value.frames],
-        }
-        return [("/plan", value.made_at_s, body)]
-    if isinstance(value, SpeakerFrame):
-        return [("/speaker", value.time_s, _speaker_body(value))]
-    face = {"time_s": value.time_s, **_by_channel(value.motion)}
-    return [("/face", value.time_s, face), ("/joints", value.time_s, _joints_body(value, joints))]
+def _plan_body(plan: Plan) -> dict[str, Any]:
+    return {
+        "made_at_s": plan.made_at_s,
+        "times_s": _numbers(plan.times_s),
+        "frames": [_numbers(frame) for frame in plan.frames],
+    }
 
 
 def _speaker_body(frame: SpeakerFrame) -> dict[str, Any]:
@@ -268,6 +291,14 @@ def _joints_body(seen: Tick, joints: Sequence[str]) -> dict[str, Any]:
             "fault": None if reading is None else reading.fault,
         }
     return {"time_s": seen.time_s, "joints": body}
+
+
+def _servos_body(seen: Tick) -> dict[str, Any]:
+    servos = {
+        joint: {**{name: _number(value) for name, value in reading.extra.items()}, "fault": reading.fault}
+        for joint, reading in seen.readings.items()
+    }
+    return {"time_s": seen.time_s, "servos": servos}
 
 
 def _by_channel(motion: Floats) -> dict[str, float | None]:

@@ -45,6 +45,9 @@ class AbsentBus:
     def poll(self, now_s: float) -> Mapping[str, Reading]:
         return {joint: Reading(None, float("inf"), LEFT_OUT) for joint in self.joints}
 
+    def release(self, joints: Sequence[str]) -> None:
+        """There is no torque."""
+
     def torque_off(self, policy: StopPolicy) -> None:
         """There is no torque."""
 

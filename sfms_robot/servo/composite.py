@@ -72,11 +72,14 @@ class CompositeBus:
             raise
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
-        """As `ports.Bus`; one bus after the other, for supplies that dislike many at once."""
-        held: dict[str, float] = {}
-        for bus in self._buses.values():
+        """As `ports.Bus`; one bus after the other, for supplies that dislike many at once.
+
+        A bus that has a thread of its own goes on in a new one. Joints of a bus that has failed count as absent.
+        """
+        held: dict[str, float] = dict.fromkeys(joints, 0.0)
+        for name, bus in self._working():
             mine = [joint for joint in joints if joint in bus.joints]
-            if mine:
+            if mine and self._ended(name, time.monotonic() + STOP_S):
                 held |= zip(mine, bus.enable(mine).tolist(), strict=True)
         return np.array([held[joint] for joint in joints])
 
@@ -116,6 +119,11 @@ class CompositeBus:
             name = self._unsaid.pop(0)
             raise BusError(str(self._failures[name])) from self._failures[name]
         return readings
+
+    def release(self, joints: Sequence[str]) -> None:
+        """As `ports.Bus`, on every bus that works, from the caller's thread."""
+        for _, bus in self._working():
+            bus.release([joint for joint in joints if joint in bus.joints])
 
     def torque_off(self, policy: StopPolicy) -> None:
         """As `ports.Bus`, on every bus, from the caller's thread."""

@@ -42,6 +42,7 @@ class LiveVoice:
     """
 
     duration_s: float | None = None
+    lost: bool = False
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -48,6 +48,7 @@ class PairedSource:
     Attributes:
         duration_s: None for one without end.
         latency_s: see `ports.Voice`.
+        missing: voice, face, agent_audio: those that are lost.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class PairedSource:
             raise ConfigError(f"--duration = {duration_s:g}: a run lasts longer than 0 s")
         self.duration_s = _length_s(voice, sight, agent) if duration_s is None else duration_s
         self.latency_s = 0.0
+        self.missing: tuple[str, ...] = ()
         self._voice, self._sight, self._agent = voice, sight, agent
         self._judge = FrameJudge()
         self._given = 0
@@ -84,6 +86,7 @@ class PairedSource:
                 break
             frames.append(self._frame(self._given, heard))
             self._given += 1
+        self.missing = tuple(name for name, part in self._parts().items() if part.lost)
         return frames
 
     def statistics(self) -> Mapping[str, Any]:
@@ -155,6 +158,7 @@ class JudgedSource:
             raise ConfigError(f"{type(inner).__name__} lacks {', '.join(missing)}: derive it from sfms_robot.Source")
         self.duration_s = inner.duration_s
         self.latency_s = inner.latency_s
+        self.missing: tuple[str, ...] = ()
         self._inner = inner
         self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
@@ -170,7 +174,7 @@ class JudgedSource:
             seen = None if given.face is None else Sighting(given.face, given.attention, given.place_m)
             frames.append(self._judge.frame(self._given, given.audio, seen, given.agent_audio))
             self._given += 1
-        self.latency_s = self._inner.latency_s
+        self.latency_s, self.missing = self._inner.latency_s, tuple(self._inner.missing)
         return frames
 
     def statistics(self) -> Mapping[str, Any]:
@@ -181,7 +185,7 @@ class JudgedSource:
         self._inner.close()
 
 
-_SOURCE: Final = ("duration_s", "latency_s", "start", "read", "statistics", "close")
+_SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "statistics", "close")
 
 
 class FrameJudge:

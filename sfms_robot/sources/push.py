@@ -71,6 +71,7 @@ class PushedVoice(LiveVoice):
 class PushedSight:
     """`ports.Sight` of what a program sees."""
 
+    lost = False  # what is not pushed is not there
     duration_s: float | None = None
     latency_s = 0.0
 
@@ -128,6 +129,7 @@ class PushedSpeech:
     after that. All methods may be called from any thread; `take` waits for none of them.
     """
 
+    lost = False  # what is not pushed is not there
     duration_s: float | None = None
     latency_s = 0.0
 

@@ -31,6 +31,8 @@ class RecordedVoice:
 
     latency_s = 0.0
 
+    lost = False
+
     def __init__(self, audio: Floats | AudioFile, loop: bool = False) -> None:
         self._audio = audio
         self._loop = loop
@@ -78,6 +80,8 @@ class RecordedSight:
     """
 
     latency_s = 0.0
+
+    lost = False
 
     def __init__(self, track: Track, loop: bool = False, frames: int | None = None) -> None:
         self._faces = resample(track, FRAME_HZ, start_s=FRAME_S).motion

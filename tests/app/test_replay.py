@@ -53,7 +53,7 @@ def test_reading_holds_numbers_and_no_messages(tmp_path):
     bodies: dict[str, list] = {"/speaker": [], "/plan": [], "/face": [], "/joints": []}
     with file.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
-            bodies[channel.topic].append(json.loads(message.data))
+            bodies.setdefault(channel.topic, []).append(json.loads(message.data))
     tracemalloc.start()
     run = read_recording(tmp_path)
     peak = tracemalloc.get_traced_memory()[1]

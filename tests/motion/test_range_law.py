@@ -152,6 +152,29 @@ def test_every_joint_is_inside_its_range_in_the_stated_time_and_stays(name, size
     assert before.all()
 
 
+@pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
+@pytest.mark.parametrize("name", ["op3_head", "open_duck_mini_v2_head", "face28"])
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
+def test_braking_stops_every_joint_where_no_limit_is_broken_and_nobody_goes_farther_out(name, size, seed, kinds):
+    law = Law(size(load_head(name)), TimeOptimalChase)
+    tormented(law, seed, kinds, 60)
+    limits = law.limits
+    longest_s = (limits.speed / limits.acceleration + 2 * limits.acceleration / limits.jerk).max()
+    low, high = np.minimum(limits.low, law.last), np.maximum(limits.high, law.last)
+    for _ in range(int(longest_s / DT_S) + 2):
+        before = law.last
+        goals, law.state = law.limiter.brake(law.state)
+        law.goals.ticks(goals, np.arange(law.count))
+        law.audited = law.audit.step(goals, goals, law.audited)
+        assert (goals >= low).all() and (goals <= high).all()
+        law.last = goals
+    assert law.audited.violations == 0
+    assert np.array_equal(law.last, before)
+    law.restart(np.ones(law.count, bool), law.last)  # and it goes on from there
+    law.tick(asked(np.random.default_rng(seed), limits, law.last, "anywhere"), np.arange(law.count))
+
+
 def rest_of(head: Head) -> np.ndarray:
     return np.array([joint.rest_rad for joint in head.joints.values()])
 

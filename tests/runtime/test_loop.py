@@ -18,7 +18,7 @@ from sfms_robot.ports import Source, Tick
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.runtime.loop import Parts, drive, turned_by_hand
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.sources.paired import PairedSource
@@ -251,3 +251,12 @@ def test_a_source_starts_once_at_the_first_tick_after_torque_came_on(chain: Chai
     (_, origin_s), *read = source.told
     assert origin_s == ORIGIN_S and read[0] == ("read", 0.0) and {what for what, _ in read} == {"read"}
     assert ran.outcome == "done" and ran.watcher.ticks[0].time_s == 0.0
+
+
+def test_only_what_turns_head_or_eyes_is_by_hand():
+    planned = np.zeros((3, MOTION_DIM), np.float32)
+    assert not turned_by_hand(planned, planned)
+    for channel, turned in (("mouthSmileLeft", False), ("eyeBlinkLeft", False), ("yaw", True), ("eyeLookUpLeft", True)):
+        asked = planned.copy()
+        asked[1, CHANNEL_INDEX[channel]] = 0.3
+        assert turned_by_hand(planned, asked) == turned

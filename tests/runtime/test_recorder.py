@@ -1,6 +1,7 @@
 import base64
 import json
 import threading
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -32,7 +33,7 @@ def test_a_tick_becomes_a_face_and_joints_with_nulls_for_what_is_not_known(tmp_p
     recorder = Recorder(tmp_path, JOINTS)
     recorder.tick(tick(1.5, {"neck_yaw": Reading(0.125, 0.01), "jaw": Reading(None, float("inf"), "silent")}))
     recorder.close()
-    (face_topic, face_ns, face, _), (topic, _, body, schema) = messages(tmp_path)
+    (face_topic, face_ns, face, _), (topic, _, body, schema), *_ = messages(tmp_path)
     assert (face_topic, topic, face_ns) == ("/face", "/joints", 1_500_000_000)
     assert list(face) == ["time_s", *CHANNELS] and face["tongueOut"] == 1.0
     assert body["joints"] == {
@@ -59,20 +60,23 @@ def test_sound_and_plans_are_kept(tmp_path):
 
 
 class Gate:
-    """A plan's frames that cannot be encoded before the gate opens: the writer is busy for as long as a test needs."""
+    """Sound that cannot be encoded before the gate opens: the writer is busy for as long as a test needs."""
 
     def __init__(self):
         self.reached, self.opened = threading.Event(), threading.Event()
 
-    def __iter__(self):
+    def __array__(self, dtype=None, copy=None):
         self.reached.set()
         self.opened.wait(10)
-        return iter(())
+        return np.zeros(1, dtype)
+
+    def __len__(self):
+        return 1
 
 
 def stuck(recorder):
     gate = Gate()
-    recorder.planned(Plan(0.0, np.array([]), gate))
+    recorder.heard(SpeakerFrame(0.0, gate))
     assert gate.reached.wait(10)
     return gate
 
@@ -84,7 +88,33 @@ def test_a_full_queue_drops_and_counts_and_does_not_block(tmp_path):
         recorder.tick(tick(n / 100))
     gate.opened.set()
     recorder.close()
-    assert recorder.statistics() == {"messages": 11, "dropped": 3, "trouble": None}
+    assert recorder.statistics() == {"messages": 13, "dropped": 3, "trouble": None}
+
+
+def test_states_are_kept_when_they_change_and_servos_once_a_second(tmp_path):
+    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    for n, (state, why) in enumerate([("starting", ()), ("listening", ()), ("listening", ()), ("degraded", ("jaw",))]):
+        warm = Reading(0.0, 0.0, extra={"temperature_C": 40.0 + n, "current_mA": float("nan")})
+        recorder.tick(replace(tick(n * 0.5, {"jaw": warm}), state=state, why=why))
+    recorder.close()
+    found = messages(tmp_path)
+    states = [(body["time_s"], body["state"], body["why"]) for topic, _, body, _ in found if topic == "/state"]
+    assert states == [(0.0, "starting", []), (0.5, "listening", []), (1.5, "degraded", ["jaw"])]
+    servos = [(body["time_s"], body["servos"]["jaw"]) for topic, _, body, _ in found if topic == "/servos"]
+    assert servos == [
+        (0.0, {"temperature_C": 40.0, "current_mA": None, "fault": None}),
+        (1.0, {"temperature_C": 42.0, "current_mA": None, "fault": None}),
+    ]
+
+
+def test_what_a_plan_holds_is_kept_as_an_event(tmp_path):
+    recorder = Recorder(tmp_path, JOINTS)
+    frames = np.zeros((50, 58), np.float32)
+    frames[20:26, CHANNELS.index("eyeBlinkLeft")] = frames[20:26, CHANNELS.index("eyeBlinkRight")] = 1.0
+    recorder.planned(Plan(0.0, 0.04 * np.arange(1, 51), frames))
+    recorder.close()
+    (_, _, _, _), (topic, _, event, _) = messages(tmp_path)
+    assert topic == "/event" and event["kind"] == "blink" and 0.7 < event["start_s"] < event["end_s"] < 1.2
 
 
 def test_in_virtual_time_nothing_is_dropped(tmp_path):
@@ -150,7 +180,7 @@ def test_the_report_is_json(tmp_path):
 def test_a_long_recording_goes_on_in_files_that_are_each_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "PART_MESSAGES", 10)
     recorder = Recorder(tmp_path, JOINTS, when_full="wait")
-    for k in range(14):
+    for k in range(13):
         recorder.tick(tick(k / 100))
     recorder.close()
     parts = parts_of(tmp_path)
@@ -161,7 +191,7 @@ def test_a_long_recording_goes_on_in_files_that_are_each_whole(tmp_path, monkeyp
             reader = make_reader(file)
             times += [message.log_time for _, channel, message in reader.iter_messages(topics=["/joints"])]
             assert reader.get_summary() is not None
-    assert times == [round(k / 100 * 1e9) for k in range(14)]
+    assert times == [round(k / 100 * 1e9) for k in range(13)]
 
 
 def test_a_recording_that_is_replaced_leaves_no_part_of_the_old_one(tmp_path, monkeypatch):

@@ -139,6 +139,28 @@ def test_returning_to_given_up_when_it_refuses_again_and_again(member, way):
     assert member.state is State.GIVEN_UP and member.fault == "left alone" and member.torque_wanted is False
 
 
+@pytest.mark.parametrize("before", [state for state in State if state is not State.OFF])
+def test_every_state_but_off_to_released_and_back_by_enable(member, before):
+    member.state = before
+    member.released()
+    assert member.state is State.RELEASED and member.torque_wanted is False and not member.gets_goals
+    assert member.to_release and member.job is None and not member.waits
+    member.take_torque(False, 1.0)
+    assert not member.to_release and member.fault is None
+    fails(member)
+    assert member.state is State.RELEASED  # whatever it says of itself
+    member.gone()
+    assert member.to_release  # who knows what it does now
+    member.enabled()
+    assert member.state is State.ONLINE
+
+
+def test_off_stays_off_when_it_is_released(member):
+    member.stopped()
+    member.released()
+    assert member.state is State.OFF
+
+
 def test_given_up_to_online_by_enable(member, way):
     test_returning_to_given_up_when_it_refuses_again_and_again(member, way)
     member.enabled()

@@ -11,6 +11,7 @@ from typing import Any, Final
 from sfms_robot.errors import BusError, ModelError, PortError, RobotError
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
+from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
 log = logging.getLogger(__name__)
@@ -50,11 +51,13 @@ class Background:
 
     Attributes:
         progress: the newest tick.
+        halt: emergency stop.
     """
 
-    def __init__(self, work: Callable[[Interrupt, Observer], Report]) -> None:
+    def __init__(self, work: Callable[[Interrupt, HaltLatch, Observer], Report]) -> None:
         self._work = work
         self._interrupt = Interrupt()
+        self.halt = HaltLatch()
         self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
         self._error: Exception | None = None
         self._raised = False
@@ -64,14 +67,21 @@ class Background:
 
     @property
     def state(self) -> str:
-        """starting, listening, stopping, stopped or fault."""
+        """Of the run, see docs/safety.md."""
         if self._error is not None:
             return "fault"
         if self.report is not None:
             return "stopped"
         if self._stopping:
             return "stopping"
-        return "listening" if self.progress.came.is_set() else "starting"
+        seen = self.progress.seen
+        return "starting" if seen is None else seen.state
+
+    @property
+    def running(self) -> bool:
+        """Torque is on, and nobody has asked it to stop."""
+        ended = self._error is not None or self.report is not None or self._stopping
+        return self.progress.came.is_set() and not ended
 
     def start(self) -> None:
         """Returns with the first tick, all torque on. Raises what kept it from that, as RobotError."""
@@ -123,7 +133,7 @@ class Background:
 
     def _run(self) -> None:
         try:
-            self.report = self._work(self._interrupt, self.progress)
+            self.report = self._work(self._interrupt, self.halt, self.progress)
             if self.report["exit"] == "failed":
                 kind = _KINDS.get(self.report.get("exit_code", 1), RobotError)
                 self._error = kind(self.report["error"])

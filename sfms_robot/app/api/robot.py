@@ -27,6 +27,7 @@ from sfms_robot.listeners.thread import ListenerThread
 from sfms_robot.ports import Listener, Observer, Source
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
+from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.paired import JudgedSource, PairedSource
@@ -164,6 +165,18 @@ class Robot:
         if self._run is not None:
             self._run.release()
 
+    def halt(self) -> None:
+        """Emergency stop: every joint brakes as fast as its limits allow, from the next tick on; those that bear weight
+        then hold, the others are released. Latched until `resume`. Does not wait, raises nothing.
+        """
+        if self._run is not None:
+            self._run.halt.close("Robot.halt()")
+
+    def resume(self) -> None:
+        """End a halt, whoever began it: torque comes on again, joints ease in from where they stand. Does not wait."""
+        if self._run is not None:
+            self._run.halt.open()
+
     # --- what the robot hears and sees ---
 
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
@@ -228,7 +241,8 @@ class Robot:
 
     @property
     def state(self) -> str:
-        """ "starting", "listening", "stopping", "stopped" or "fault" (ended by an error, which `stop` raises)."""
+        """ "starting", "idle", "listening", "speaking", "degraded", "halted", "stopping", "stopped" or "fault" (ended
+        by an error, which `stop` raises): see docs/safety.md."""
         return "stopped" if self._run is None else self._run.state
 
     def report(self) -> dict[str, Any]:
@@ -245,7 +259,7 @@ class Robot:
             "callbacks_detached": dict(self._events.detached),
         }  # fmt: skip
 
-    def _drive(self, interrupt: Interrupt, progress: Observer) -> Report:
+    def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
         with ExitStack() as stack:
             feed = None
             if self._listener is not None:
@@ -259,5 +273,6 @@ class Robot:
                 knobs=lambda _: lambda: self._knobs.now,
                 overlay=self._puppet.overlay,
                 interrupt=interrupt,
+                halt=halt,
                 signals=False,
             )

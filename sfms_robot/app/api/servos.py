@@ -25,6 +25,7 @@ from sfms_robot.config import Head
 from sfms_robot.errors import BusError, InputError, RobotError
 from sfms_robot.frames import POSE, Doubles, Floats, Reading
 from sfms_robot.ports import Observer
+from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
 log = logging.getLogger(__name__)
@@ -94,7 +95,7 @@ class Servos:
 
         Raises ServoError, BusError. Again: does nothing while torque is on.
         """
-        if self._run is not None and self._run.state == "listening":
+        if self._run is not None and self._run.running:
             return
         readings = self._opened.bus.poll(self._opened.clock.now_s())
         stands = [readings[joint].position_rad if joint in readings else None for joint in self.joints]
@@ -153,7 +154,7 @@ class Servos:
         if self._run is None:
             raise BusError("torque is off: enable() first")
         self._run.check()
-        if self._run.state not in ("starting", "listening"):
+        if not self._run.running:
             raise BusError("torque is off: the run has ended")
         return self._run
 
@@ -168,9 +169,9 @@ class Servos:
             raise InputError(f"{self.joints[worst]} = {angles[worst]:g} rad is not in {low:.4f}..{high:.4f}")
         return np.clip(angles, self.low_rad, self.high_rad)
 
-    def _drive(self, interrupt: Interrupt, observer: Observer) -> Report:
+    def _drive(self, interrupt: Interrupt, halt: HaltLatch, observer: Observer) -> Report:
         opened, alone = self._opened, NobodyThere()
-        programme = Programme(alone, alone, None, retargeter=self._target, observers=[observer])
+        programme = Programme(alone, alone, None, retargeter=self._target, halt=halt, observers=[observer])
         drove = drive_head(opened, programme, interrupt, signals=False)
         report = run_report(
             drove.log, opened.bus, alone, head=opened.config.name, listener="none", port=self._options.port, seed=0,

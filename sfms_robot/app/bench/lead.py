@@ -49,6 +49,8 @@ class Delays:
 class Waves:
     """A smooth face (58,) at any time: every channel a sum of sines of its own. Implements `ports.PlanFeed` with it."""
 
+    lost = False
+
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         self._rates = 2 * np.pi * rng.uniform(*_RANGE_HZ, (_WAVES, MOTION_DIM))

@@ -143,6 +143,8 @@ class HeldFace(WholeTimeline):
 class NobodyThere(Source):
     """The empty source and the empty feed: nobody speaks, nobody listens."""
 
+    lost = False
+
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
         return ()
 

@@ -54,6 +54,7 @@ def run_report(
         },
         "joints": log.joint_report(),
         "motion": log.motion_report(),
+        "states": log.state_report(),
         "attention": log.attention_report(),
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),

@@ -120,6 +120,8 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._switched_off: list[int] = []  # enabled, but the board has switched them off
         self._next_on_s = -math.inf  # when the next of them may come on
         self._faults: dict[int, str] = {}
+        self._resting: frozenset[int] = frozenset()  # channels that `release` has switched off
+        self._rest_due = False  # and that are to be told so again
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
@@ -194,6 +196,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _switch_on(self, wire: RateLimitedPort, index: int) -> float:
         """Pulses on for one joint; the angle it was sent to, rad. Raises BusError when `torque_off` comes meanwhile."""
         servo = self._servos[index]
+        self._resting -= {servo.id}
         self._take_over(index)
         self._send(wire, {servo.id: int(self._ticks[index])})
         if self._pulses.get(servo.id) != self._ticks[index] and index not in self._enabled:
@@ -218,6 +221,26 @@ class PulseBus(WireBus[RateLimitedPort]):
         ticks[index] = pulse
         angle = self._conversion.to_rad(ticks)
         self._ticks = self._conversion.to_ticks(np.clip(angle, self._lowest, self._highest))
+
+    def release(self, joints: Sequence[str]) -> None:
+        """End the pulses of `joints` now; the others go on. Said once more by the next `poll`. From any thread."""
+        indices = {self.joints.index(joint) for joint in joints}
+        if not indices:
+            return
+        channels = frozenset(self._servos[index].id for index in indices)
+        self._resting, self._rest_due = self._resting | channels, True
+        self._enabled = [index for index in self._enabled if index not in indices]
+        self._switched_off = [index for index in self._switched_off if index not in indices]
+        for sent in (self._pulses, self._sent):
+            for channel in channels:
+                sent.pop(channel, None)
+        self._say_resting()
+
+    def _say_resting(self) -> None:
+        wire = self._link
+        if wire is not None:
+            data = self._protocol.encode_off(tuple(self._resting), self._silent)
+            self._rest_due |= self._attempt(lambda: wire.send(data)) is None
 
     def torque_off(self, policy: StopPolicy) -> None:
         """End the pulses now, but of joints whose safety says hold; goals are withheld until the next `enable`.
@@ -296,7 +319,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         Raises ValueError, with nothing sent, before `enable` and after `stop`, for a goal that is not finite, or one
         out of range. While the port is gone, and after `torque_off`, nothing is sent and nothing is raised.
         """
-        self._check(bool(self._enabled))
+        self._check(bool(self._enabled or self._resting))
         if self._off is not None:
             return
         self._ticks = self._goals.ticks(goals_rad, np.array(self._enabled, np.intp))
@@ -316,6 +339,9 @@ class PulseBus(WireBus[RateLimitedPort]):
         if self._off_unsent:  # over a port that was gone, and nobody had noticed: this finds out, and opens it again
             wire.send(self._protocol.encode_off(self._off or (), restarted=True))
             self._off_unsent = False
+        if self._rest_due:
+            self._rest_due = False
+            self._say_resting()
         if self._status_due_s is None:
             self._status_due_s = now_s + _STATUS_EVERY_S
         if wire.awaiting:
@@ -361,12 +387,17 @@ class PulseBus(WireBus[RateLimitedPort]):
         """Send goals, unless torque is off; where it was switched off while these bytes left, switch it off again."""
         if self._off is not None:
             return
+        ticks = {channel: each for channel, each in ticks.items() if channel not in self._resting}
+        if not ticks:
+            return
         interval_s = max(wire.port.now_s(), wire.busy_until_s) - self._sent_at_s if self._sent else 0.0
         self._sent_at_s = wire.send(self._protocol.encode_goals(ticks, interval_s))
         self._sent.update(ticks)
         if self._off is not None:
             self._sent = {}
             self._send_off()
+        elif self._resting & ticks.keys():
+            self._say_resting()
 
     # --- the port ----------------------------------------------------------------------------------------------
 
@@ -376,6 +407,7 @@ class PulseBus(WireBus[RateLimitedPort]):
 
     def _returned(self, wire: RateLimitedPort, now_s: float) -> None:
         self._status_due_s = now_s  # the board is asked before it gets any goal
+        self._rest_due = bool(self._resting)
         self._send_off()
 
     # --- the board ----------------------------------------------------------------------------------------------
@@ -408,6 +440,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._sent = {}  # whatever it does now, it is not what it was told
         if was_silent or status.went_home:
             self._send_off()
+            self._rest_due |= bool(self._resting)
         if status.faults:
             self._counts["errors"] += not status.lasting
             self._report_fault(range(len(self.joints)), status.faults, shown=status.lasting)

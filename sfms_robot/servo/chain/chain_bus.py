@@ -106,6 +106,7 @@ class ChainBus(WireBus[L], Generic[L]):
         self._peak_mA = 0.0
         self._release_packet = b""
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
+        self._letting_go: frozenset[int] = frozenset()  # asked for by `release`, not yet told to their members
         self._sending = RLock()
         self._set_up()
 
@@ -202,7 +203,7 @@ class ChainBus(WireBus[L], Generic[L]):
         """
         link = self._connected()
         startup = self._begin(link)
-        self._released = False
+        self._released, self._letting_go = False, frozenset()
         held = []
         for joint in joints:
             index = self.joints.index(joint)
@@ -244,9 +245,20 @@ class ChainBus(WireBus[L], Generic[L]):
         if policy == "hold":
             return
         self._released = True
+        self._send_at_once(self._release_packet)
+
+    def release(self, joints: Sequence[str]) -> None:
+        """As `ports.Bus`; from any thread."""
+        indices = frozenset(self.joints.index(joint) for joint in joints)
+        if indices:
+            self._letting_go |= indices
+            ids = {self._servos[index].id: 0 for index in indices}
+            self._send_at_once(self._sync_write_packet(self._telemetry.torque, ids))
+
+    def _send_at_once(self, packet: bytes) -> None:
         alone = self._sending.acquire(timeout=_SENDING_S)  # a goal must not overtake it; a port that hangs may
         try:
-            link, packet = self._link, self._release_packet
+            link = self._link
             if link is not None and packet:
                 link.port.write(packet)
         except BusError as error:
@@ -254,6 +266,13 @@ class ChainBus(WireBus[L], Generic[L]):
         finally:
             if alone:
                 self._sending.release()
+
+    def _let_go(self) -> None:
+        """Tell members what `release` asked for, in the thread that they belong to."""
+        indices, self._letting_go = self._letting_go, frozenset()
+        for index in indices:
+            self._members[index].released()
+        self._update_places()
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """As `ports.Bus`: torque off first, in one packet, then watchdogs off, in another; then both are read back and
@@ -342,6 +361,8 @@ class ChainBus(WireBus[L], Generic[L]):
         While the port is gone nothing is sent and nothing is raised.
         """
         self._check(self._enabled)
+        if self._letting_go:
+            self._let_go()
         if self._accepted(goals_rad):
             self._update_places()
         link = self._link
@@ -350,7 +371,7 @@ class ChainBus(WireBus[L], Generic[L]):
         if link is None or not len(places):
             return
         with self._sending:
-            if self._released:
+            if self._released or self._letting_go:
                 return
             self._counts["writes"] += 1
             try:
@@ -404,6 +425,8 @@ class ChainBus(WireBus[L], Generic[L]):
         if self._released:
             for member in self._members:
                 member.stopped()
+        if self._letting_go:
+            self._let_go()
         with link.within(self._poll.budget_s, self._read_deadline_s + TURN_S):
             heard = self._poll.step(link, stamp_s)
             self._command(link, stamp_s)

@@ -10,6 +10,7 @@
     rebooting  the same after a reboot
     rejoining  holds where it stands, and waits for goals that begin there
     given up   failed too often: as limp, until somebody enables it again
+    released   the same because somebody asked for it: no fault
 
 The diagram and a table of all arrows are in docs/safety.md. A goal is sent to members that are online or reduced and
 have been seen with torque, and to nobody else. So a servo that was away moves only from where it stands.
@@ -62,6 +63,7 @@ class State(Enum):
     REBOOTING = "rebooting"
     REJOINING = "rejoining"
     GIVEN_UP = "given up"
+    RELEASED = "released"
 
 
 ONLINE: Final = State.ONLINE  # by way of the class each is a call, for every servo in every tick
@@ -69,7 +71,7 @@ REDUCED: Final = State.REDUCED
 REJOINING: Final = State.REJOINING
 _DRIVEN: Final = frozenset({ONLINE, REDUCED})  # get goals
 _POWERED: Final = _DRIVEN | {State.FAULTY, State.REJOINING}  # torque is wanted, and was seen
-_RELEASED: Final = frozenset({State.LIMP, State.GIVEN_UP})  # torque off is wanted
+_LIMP: Final = frozenset({State.LIMP, State.GIVEN_UP, State.RELEASED})  # torque off is wanted
 _COMING: Final = frozenset({State.RETURNING, State.REBOOTING})
 
 
@@ -204,12 +206,12 @@ class Member:
         """None where it is not for the poll to say: before `enable`, or on its way back."""
         if self.state in _POWERED:
             return True
-        return False if self.state in _RELEASED else None
+        return False if self.state in _LIMP else None
 
     @property
     def to_release(self) -> bool:
         """Torque off has to be written: nobody has seen that it is."""
-        return self.state in _RELEASED and self.torque_seen is not False
+        return self.state in _LIMP and self.torque_seen is not False
 
     @property
     def over_load(self) -> bool:
@@ -257,6 +259,12 @@ class Member:
         """No torque is wanted any more; `stop` sees to it."""
         self._drop_job()
         self.state = State.OFF
+
+    def released(self) -> None:
+        """Torque off is wanted until `enable`; the poll sees to it."""
+        if self.state is not State.OFF:
+            self._release(math.inf)
+            self.state = State.RELEASED
 
     def _reset(self, state: State) -> None:
         self._drop_job()
@@ -306,7 +314,7 @@ class Member:
             self.state = State.SILENT
             self.torque_seen = None
             self._trouble = self._trouble or NO_ANSWER
-        elif self.state in _RELEASED or self.state is State.FAULTY:
+        elif self.state in _LIMP or self.state is State.FAULTY:
             self.torque_seen = None  # who knows what it does now
 
     def back(self, now_s: float) -> None:
@@ -331,7 +339,7 @@ class Member:
             else:
                 self._reporter.excuse(self.servo, name)
         new = set(names) - set(self._named)
-        if names or self.state not in _RELEASED | {State.FAULTY}:  # who stays out says why, also when it has passed
+        if names or self.state not in _LIMP | {State.FAULTY}:  # who stays out says why, also when it has passed
             self._named = names
         if new:
             self._reporter.say(self.servo, ", ".join(names))
@@ -353,7 +361,7 @@ class Member:
     def take_torque(self, on: bool, now_s: float) -> None:
         """Torque enable as told by the servo, against what is wanted."""
         self.torque_seen = on
-        if self.state in _RELEASED:
+        if self.state in _LIMP:
             if on and self.off_written:
                 self._say(TORQUE_ON)
             elif self._trouble == TORQUE_ON:

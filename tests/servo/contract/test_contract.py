@@ -159,6 +159,52 @@ def test_release_takes_the_torque_away_and_hold_leaves_it(rig):
 
 
 @pytest.mark.emulated
+def test_some_joints_are_released_while_the_others_go_on(rig):
+    held = rig.hold()
+    rig.ticks(held, 5)
+    gone = rig.bus.joints[0]
+    mark = len(rig.line.sent)
+    rig.bus.release([gone])
+    assert len(rig.line.sent) == mark + 1  # at once, in one packet
+    goals = held.copy()
+    goals[1:] = np.clip(held[1:] + 0.05, -LIMIT_RAD, LIMIT_RAD)
+    for share in np.linspace(0, 1, 20):
+        readings = rig.ticks(held + share * (goals - held), 1)
+    rig.ticks(goals, 30)
+    assert rig.torques() == [False] + [True] * (len(rig.ids) - 1)
+    assert rig.shafts_rad()[1:] == near(goals[1:], rig)
+    assert all(readings[joint].fault is None for joint in rig.bus.joints)  # nobody calls it a fault
+    again = rig.bus.enable([gone])
+    assert not rig.tells("position") or again == near(rig.shafts_rad()[:1], rig)
+    rig.ticks(np.concatenate([rig.shafts_rad()[:1], goals[1:]]), 5)
+    assert all(rig.torques())
+
+
+@pytest.mark.emulated
+def test_all_joints_may_be_released_and_goals_move_nothing(rig):
+    held = rig.hold()
+    rig.bus.release(rig.bus.joints)
+    rig.ticks(held, 10)
+    assert not any(rig.torques())
+    rig.bus.release(rig.bus.joints)  # again
+    rig.bus.release([])
+    rig.ticks(held, 2)
+    assert not any(rig.torques())
+
+
+@pytest.mark.emulated
+def test_a_servo_that_does_not_hear_it_is_told_again_until_it_does(rig):
+    """What is released is released, whatever the wire loses."""
+    rig.ticks(rig.hold(), 3)
+    rig.chain.inject("drop=0.6")
+    rig.bus.release(rig.bus.joints)
+    rig.ticks(np.zeros(len(rig.ids)), 40)
+    rig.chain.clear_faults()
+    rig.ticks(np.zeros(len(rig.ids)), 60)
+    assert not any(rig.torques())
+
+
+@pytest.mark.emulated
 @pytest.mark.parametrize("place", [0, 2])
 def test_dead_servo_leaves_the_others_fresh_and_its_own_reading_grows_old(rig, place):
     held = rig.hold()

@@ -1,0 +1,194 @@
+"""Emergency stop on emulated servos in virtual time: braked under the limits, held or released, latched, resumed."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.app.session import build_bus, build_motion
+from sfms_robot.app.wiring import emulated
+from sfms_robot.config import load_head
+from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, FaceFrame, Plan, SpeakerFrame
+from sfms_robot.ports import Source, Tick
+from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.runtime.safety import EASE_S
+
+RATE_HZ = 100.0
+HEAD = load_head("face28")
+JOINTS = list(HEAD.joints)
+NECK = [joint for joint in JOINTS if joint.startswith("neck")]
+STOPS_S = 0.5  # more than any joint of this head needs from full speed
+
+
+class Nodder:
+    """A listener that nods all the time, opens its jaw with it, and looks about."""
+
+    hop, horizon = 4, 8
+
+    def start(self, seed: int) -> int:
+        return 0
+
+    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
+        if memory % self.hop:
+            return None, memory + 1
+        times_s = speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1)
+        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
+        for channel, size in (("pitch", 0.15), ("yaw", 0.2), ("jawOpen", 0.4)):
+            swing = np.sin(2 * np.pi * times_s)
+            frames[:, CHANNEL_INDEX[channel]] = size * (swing if channel != "jawOpen" else np.abs(swing))
+        return Plan(speaker.time_s, times_s, frames), memory + 1
+
+
+class Somebody(Source):
+    """A face that is always there, until `gone_s`."""
+
+    def __init__(self, gone_s: float = np.inf) -> None:
+        self._given, self._gone_s = 0, gone_s
+
+    def read(self, now_s: float) -> list[SpeakerFrame]:
+        frames = []
+        while (time_s := (self._given + 1) * FRAME_S) <= now_s + 1e-9:
+            self._given += 1
+            face = FaceFrame(time_s, np.zeros(6, np.float32), np.zeros(52, np.float32))
+            seen = time_s <= self._gone_s
+            frames.append(SpeakerFrame(time_s, np.zeros(640 if seen else 0, np.float32), face if seen else None))
+        return frames
+
+
+@dataclass
+class Watcher:
+    """Keeps every tick, and does at a tick what the test asks for."""
+
+    does: dict[int, Callable[[], None]] = field(default_factory=dict)
+    ticks: list[Tick] = field(default_factory=list)
+
+    def tick(self, seen: Tick) -> None:
+        self.does.get(len(self.ticks), lambda: None)()
+        self.ticks.append(seen)
+
+    def heard(self, frame: SpeakerFrame) -> None: ...
+
+    def planned(self, plan: Plan) -> None: ...
+
+    def close(self) -> None: ...
+
+    def states(self) -> list[str]:
+        names = [tick.state for tick in self.ticks]
+        return [name for before, name in zip(["", *names], names, strict=False) if name != before]
+
+
+@dataclass
+class Ran:
+    outcome: str
+    log: RunLog
+    ticks: list[Tick]
+    states: list[str]
+
+
+@pytest.fixture
+def chain() -> Iterator[Chain]:
+    with launch(emulated(HEAD)["main"], virtual=True) as running:
+        yield running
+
+
+def run(
+    chain: Chain,
+    does: Callable[[HaltLatch], dict[int, Callable[[], None]]] = lambda latch: {},
+    seconds: float = 4.0,
+    source: Source | None = None,
+) -> Ran:
+    clock, latch, motion = VirtualClock(), HaltLatch(), build_motion(HEAD, RATE_HZ)
+    clock.wait_until(chain_time(chain))
+    watcher = Watcher(does(latch))
+    bus = build_bus(HEAD, {"main": chain}, clock)
+    log = RunLog(JOINTS, 1 / RATE_HZ, motion.audit)
+    parts = Parts(
+        source or Somebody(), InlineFeed(Nodder(), 0, 0.01), motion.timeline, motion.retargeter, motion.limiter, bus,
+        [watcher], motion.leads_s, motion.rest_rad, answers=True, halt=latch, holds=motion.holds, heat=motion.heat,
+    )  # fmt: skip
+    bus.connect()
+    try:
+        outcome = drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=lambda: False)
+        TIMES[id(chain)] = clock.now_s()
+    finally:
+        bus.close()
+    return Ran(outcome, log, watcher.ticks, watcher.states())
+
+
+TIMES: dict[int, float] = {}
+
+
+def chain_time(chain: Chain) -> float:
+    return TIMES.get(id(chain), 0.0)
+
+
+def torque(chain: Chain, joint: str) -> bool:
+    return bool(chain.state(HEAD.joints[joint].id)["torque"])
+
+
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(halted=st.integers(60, 250), resumed=st.integers(0, 120))
+def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_is_released(chain, halted, resumed):
+    seen: dict[str, bool] = {}
+    late = halted + round(STOPS_S * RATE_HZ) + resumed
+
+    def does(latch: HaltLatch) -> dict[int, Callable[[], None]]:
+        def look() -> None:
+            seen.update({joint: torque(chain, joint) for joint in JOINTS})
+            latch.open()
+
+        return {halted: lambda: latch.close("key"), late: look}
+
+    ran = run(chain, does, seconds=(late + 250) / RATE_HZ)
+    assert ran.outcome == "done" and ran.log.audited.violations == 0
+    assert [ran.ticks[halted].state, ran.ticks[halted + 1].state] == [ran.ticks[halted - 1].state, "halted"]
+    assert ran.ticks[halted + 1].why == ("key",)
+    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    stop = halted + round(STOPS_S * RATE_HZ)
+    assert np.array_equal(goals[stop], goals[late])  # stands, for as long as it is halted
+    assert seen == {joint: joint in NECK for joint in JOINTS}
+    assert "starting" in ran.states[ran.states.index("halted") :] and ran.states[-1] == "listening"
+    after = goals[late + round((EASE_S + 0.5) * RATE_HZ) :]
+    assert np.ptp(after, axis=0)[JOINTS.index(NECK[1])] > 0.05  # it nods again
+
+
+def test_a_head_that_is_halted_at_the_end_moves_no_more(chain):
+    ran = run(chain, lambda latch: {150: lambda: latch.close("key")}, seconds=3.0)
+    assert ran.log.eased == 0 and ran.states[-1] == "halted"
+    assert not any(torque(chain, joint) for joint in JOINTS)
+
+
+def test_a_halt_that_is_released_at_once_is_ended_when_the_head_stands(chain):
+    ran = run(chain, lambda latch: {150: lambda: latch.close("key"), 151: latch.open}, seconds=4.0)
+    assert ran.states == ["starting", "listening", "halted", "starting", "listening"]
+    assert ran.log.audited.violations == 0
+
+
+def test_a_halt_while_joints_ease_in_and_one_before_the_first_tick(chain):
+    ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: latch.open}, seconds=4.0)
+    assert ran.states == ["starting", "halted", "starting", "listening"] and ran.log.audited.violations == 0
+
+
+def test_who_is_gone_is_not_answered_and_who_comes_is_answered_within_half_a_second(chain):
+    ran = run(chain, source=Somebody(gone_s=3.0), seconds=8.0)
+    pitch = np.array([tick.motion[CHANNEL_INDEX["pitch"]] for tick in ran.ticks])
+    t = np.array([tick.time_s for tick in ran.ticks])
+    assert np.ptp(pitch[(t > 1.5) & (t < 3.0)]) > 0.2
+    assert np.ptp(pitch[(t > 4.5) & (t < 8.0)]) == 0.0  # nothing has come for half a second: it does not answer
+
+
+def test_a_hot_servo_moves_less_and_then_rests(chain):
+    jaw = HEAD.joints["jaw"]
+    chain.heat(jaw.id, 69.0)
+    ran = run(chain, seconds=6.0)
+    goals = np.array([tick.goals_rad[JOINTS.index("jaw")] for tick in ran.ticks])
+    assert np.abs(goals[-100:] - jaw.rest_rad).max() < 1e-6
+    assert ran.log.audited.violations == 0

@@ -1,0 +1,73 @@
+"""The document of a run's state: whole at any moment, JSON all the way, and it says why something is not followed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sfms_robot.frames import FaceFrame, Reading, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.status import RunStatus
+
+JOINTS = ("neck_yaw", "jaw")
+
+
+def tick(state: str = "listening", why: tuple[str, ...] = ()) -> Tick:
+    readings = {
+        "jaw": Reading(None, float("inf"), "silent"),
+        "neck_yaw": Reading(0.25, 0.01, extra={"temperature_C": 41.0, "current_mA": float("nan")}),
+    }
+    return Tick(2.0, np.zeros(58, np.float32), np.array([0.5, -0.5]), readings, state, why)
+
+
+def test_before_the_first_tick_it_is_starting() -> None:
+    document = RunStatus(JOINTS, {"head": "face28"}).document()
+    assert (document["head"], document["state"], document["person"]["seen"]) == ("face28", "starting", False)
+    json.dumps(document, allow_nan=False)
+
+
+def test_joints_are_told_by_name_with_null_for_what_nobody_knows() -> None:
+    status = RunStatus(JOINTS, {})
+    status.tick(tick())
+    document = json.loads(json.dumps(status.document(), allow_nan=False))
+    assert document["joints"]["neck_yaw"] == {
+        "goal_rad": 0.5, "present_rad": 0.25, "age_s": 0.01, "temperature_C": 41.0, "current_mA": None,
+    }  # fmt: skip
+    assert document["joints"]["jaw"] == {"goal_rad": -0.5, "present_rad": None, "age_s": None}
+    assert document["faults"] == {"jaw": "silent"}
+    assert document["hottest"] == {"joint": "neck_yaw", "temperature_C": 41.0}
+
+
+def test_the_person_is_what_the_newest_frame_holds() -> None:
+    status = RunStatus(JOINTS, {})
+    face = FaceFrame(0.0, np.zeros(6, np.float32), np.zeros(52, np.float32))
+    loud = np.full(640, 0.1, np.float32)
+    status.heard(SpeakerFrame(0.04, loud, face, np.zeros(640, np.float32), attention=0.75))
+    assert status.document()["person"] == {
+        "voice_db": -20.0, "seen": True, "attention": 0.75, "own_voice_db": -100.0,
+    }  # fmt: skip
+    status.heard(SpeakerFrame(0.08, loud[:0]))
+    assert status.document()["person"] == {"voice_db": None, "seen": False, "attention": None, "own_voice_db": None}
+
+
+@pytest.mark.parametrize(
+    ("state", "why", "says"),
+    [
+        ("listening", (), None),
+        ("degraded", ("voice", "jaw"), "without voice, jaw"),
+        ("halted", ("key",), "until somebody releases it"),
+        ("idle", (), "nobody is seen or heard"),
+        ("fault", ("the supply is gone",), "the supply is gone"),
+    ],
+)
+def test_it_says_why_something_is_not_followed(state: str, why: tuple[str, ...], says: str | None) -> None:
+    status = RunStatus(JOINTS, {})
+    status.tick(tick(state, why))
+    note = status.document()["note"]
+    assert note is None if says is None else says in note
+
+
+def test_counters_are_asked_for_every_time() -> None:
+    counts = iter(range(9))
+    status = RunStatus(JOINTS, {}, lambda: {"ticks": next(counts)})
+    assert [status.document()["ticks"] for _ in range(3)] == [0, 1, 2]
