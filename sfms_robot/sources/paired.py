@@ -49,6 +49,7 @@ class PairedSource:
         duration_s: None for one without end.
         latency_s: see `ports.Voice`.
         missing: voice, face, agent_audio: those that are lost.
+        outlets: those behind its parts, each once.
     """
 
     def __init__(
@@ -64,6 +65,8 @@ class PairedSource:
         self.latency_s = 0.0
         self.missing: tuple[str, ...] = ()
         self._voice, self._sight, self._agent = voice, sight, agent
+        behind = [getattr(part, "outlet", None) for part in self._parts().values()]
+        self.outlets: Sequence[Outlet] = list(dict.fromkeys(each for each in behind if each is not None))
         self._judge = FrameJudge()
         self._given = 0
         self._overruns = 0
@@ -111,12 +114,6 @@ class PairedSource:
         """Close all parts. Idempotent."""
         for part in self._parts().values():
             part.close()
-
-    @property
-    def outlets(self) -> Sequence[Outlet]:
-        """Those behind its parts, each once."""
-        found = [getattr(part, "outlet", None) for part in self._parts().values()]
-        return list(dict.fromkeys(each for each in found if each is not None))
 
     def _parts(self) -> dict[str, Voice | Sight]:
         parts = {"voice": self._voice, "face": self._sight, "agent_audio": self._agent}

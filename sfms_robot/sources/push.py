@@ -153,8 +153,8 @@ class PushedSpeech:
         """What it says, as `PushedVoice.hear`.
 
         Args:
-            at_s: `time.monotonic` when its first sample is played; what was to be played from then on is replaced. None:
-                behind what still waits, or one frame (40 ms) after this call.
+            at_s: `time.monotonic` when its first sample is played; what was to be played from then on is replaced.
+                None: behind what still waits, or one frame (40 ms) after this call.
 
         A piece that is within 20 ms of the end of the last one follows it. Stay ahead of what is played: what comes
         later than that is left out, and counted. So is what is to be played later than in two minutes.
@@ -211,7 +211,7 @@ class PushedSpeech:
         return frame
 
     def statistics(self) -> Mapping[str, Any]:
-        """Samples that were to be played too late (dropped) or before they were said (late), or were not finite."""
+        """Samples to be played in more than two minutes (dropped), said too late to be played, or not finite."""
         with self._lock:
             return dict(self._counts)
 
