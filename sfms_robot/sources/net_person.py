@@ -58,11 +58,12 @@ class NetPerson:
     """The server's handler: who feeds what, and who wants to be told what.
 
     Attributes:
-        voice, sight, speech: where it goes, each None until a flag names it.
+        now: `time.monotonic`, or a test's.
+        token: what a hello has to hold; None: nothing.
     """
 
     def __init__(self, flag: str, host: str, port: int, now: Callable[[], float] = time.monotonic) -> None:
-        self._now = now
+        self.now = now
         self._place = (host, port)
         self._feeds: dict[str, NetVoice | NetSight | NetSpeech] = {}
         self._feeders: dict[str, Connection] = {}
@@ -158,13 +159,13 @@ class NetPerson:
         for name in sorted(hello.feeds):
             self._claim(connection, name)
         for name in hello.feeds:
-            self._feeders[name], self._heard_s[name] = connection, self._now()
+            self._feeders[name], self._heard_s[name] = connection, self.now()
             logger.info("%s: %s", FLAGS[name], connection.name)
         self._clocks[connection] = SenderClock()
         connection.greeted, connection.wants = True, hello.wants
-        connection.send(json_message(type="welcome", version=VERSION, sent_s=self._now(), takes=sorted(self._feeds)))
+        connection.send(json_message(type="welcome", version=VERSION, sent_s=self.now(), takes=sorted(self._feeds)))
         if self._state is not None and "events" in hello.wants:
-            connection.send(json_message(**self._state, sent_s=self._now()))
+            connection.send(json_message(**self._state, sent_s=self.now()))
 
     def _claim(self, connection: Connection, name: str) -> None:
         if name not in self._feeds:
@@ -172,7 +173,7 @@ class NetPerson:
         feeder = self._feeders.get(name)
         if feeder is None:
             return
-        if name == "speech" or self._now() - self._heard_s[name] < SILENT_S:
+        if name == "speech" or self.now() - self._heard_s[name] < SILENT_S:
             raise PacketError(f"{name} comes from {feeder.name} already")
         del self._feeders[name]
         feeder.end(f"{name} now comes from {connection.name}: none came for {SILENT_S:g} s")
@@ -180,11 +181,11 @@ class NetPerson:
     def _allowed(self, connection: Connection, name: str) -> None:
         if self._feeders.get(name) is not connection:
             raise PacketError(f"{name} was not announced in its hello")
-        self._heard_s[name] = self._now()
+        self._heard_s[name] = self.now()
 
     def _times(self, connection: Connection, message: Sound | Seen) -> tuple[float, float | None]:
         """Now, and what the sender says of a time in our clock."""
-        now_s = self._now()
+        now_s = self.now()
         if not message.at_s:
             return now_s, None
         clock = self._clocks[connection]
@@ -231,7 +232,7 @@ class NetPerson:
         wanting = [each for each in self._server.connections() if "microphone" in each.wants]
         if wanting:
             samples = np.rint(np.clip(audio, -1.0, 1.0) * 32767).astype(np.int16)
-            message = sound_message(MICROPHONE, AUDIO_HZ, self._now(), at_s, samples)
+            message = sound_message(MICROPHONE, AUDIO_HZ, self.now(), at_s, samples)
             for connection in wanting:
                 connection.send(message)
 
@@ -240,14 +241,14 @@ class NetPerson:
             self._state = told
         for connection in self._server.connections():
             if "events" in connection.wants:
-                connection.send(json_message(**told, sent_s=round(self._now(), 4)))
+                connection.send(json_message(**told, sent_s=round(self.now(), 4)))
 
 
 class NetVoice(PushedVoice):
     """`ports.Voice` of a person whose sound another program has."""
 
     def __init__(self, outlet: NetPerson) -> None:
-        super().__init__()
+        super().__init__(outlet.now)
         self.outlet = outlet
         outlet.join("voice", self)
 
@@ -266,7 +267,7 @@ class NetSight(PushedSight):
     """`ports.Sight` of a person whom another program sees."""
 
     def __init__(self, outlet: NetPerson) -> None:
-        super().__init__()
+        super().__init__(outlet.now)
         self.outlet = outlet
         outlet.join("face", self)
 
@@ -285,7 +286,7 @@ class NetSpeech(PushedSpeech):
     """`ports.Voice` of a robot for which another program speaks."""
 
     def __init__(self, outlet: NetPerson) -> None:
-        super().__init__()
+        super().__init__(outlet.now)
         self.outlet = outlet
         outlet.join("speech", self)
 

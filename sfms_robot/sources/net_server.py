@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import re
 import socket
 import sys
 import threading
@@ -37,6 +38,7 @@ MOST_MALFORMED: Final = 100  # then the connection is closed
 _SLICE: Final = 1024  # bytes that are looked at at once
 LAST_WORDS_S: Final = 0.2  # that a program gets to read why it is closed
 _STOP_S: Final = 2.0
+_MOST_SAID: Final = 20
 
 
 class Handler(Protocol):
@@ -89,8 +91,9 @@ class NetServer:
         return list(self._connections)
 
     def say_once(self, key: str, text: str) -> None:
-        """One line in the log for `key`, the first time."""
-        if key not in self._said and len(self._said) < 32:
+        """One line in the log for `key`, whatever its numbers, the first time."""
+        key = re.sub(r"\d+", "", key)
+        if key not in self._said and len(self._said) < _MOST_SAID:
             self._said.add(key)
             logger.warning("%s (said once)", text)
 
