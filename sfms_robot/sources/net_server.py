@@ -160,7 +160,7 @@ class NetServer:
         server.close()
         open_still = self.connections()
         for connection in open_still:
-            connection.end("the robot stops")
+            connection.end("the robot stops", refused=False)
         if open_still:
             await asyncio.wait([connection.lost for connection in open_still], timeout=LAST_WORDS_S)
         for connection in open_still:
@@ -241,14 +241,14 @@ class Connection(asyncio.Protocol):
         self._server.counts["missed"] += len(self._outbox) == self._outbox.maxlen
         self._outbox.append(message)
 
-    def end(self, reason: str) -> None:
-        """Tell why, as a message of type "error", and close."""
+    def end(self, reason: str, refused: bool = True) -> None:
+        """Tell why, as a message of type "error", and close. `refused`: it was the program's own doing."""
         transport = self._transport
         if transport is None:
             return
         if self._wire is not None:
             self._write(json_message(type="error", error=reason))
-            transport.write(self._wire.closing(reason))
+            transport.write(self._wire.closing(reason, refused))
         self._transport = None
         transport.close()
         self._loop.call_later(HELLO_S, transport.abort)  # who does not read does not keep it open

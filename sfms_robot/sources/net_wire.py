@@ -36,7 +36,7 @@ class Wire(Protocol):
     def packed(self, message: bytes) -> bytes:
         """A message as it is sent; empty while the other side is not ready for any."""
 
-    def closing(self, reason: str) -> bytes:
+    def closing(self, reason: str, refused: bool) -> bytes:
         """What is sent before the connection is closed."""
 
     def answer(self) -> bytes:
@@ -61,7 +61,7 @@ class TcpWire:
     def packed(self, message: bytes) -> bytes:
         return framed(message)
 
-    def closing(self, reason: str) -> bytes:
+    def closing(self, reason: str, refused: bool) -> bytes:
         return b""
 
     def answer(self) -> bytes:
@@ -101,9 +101,10 @@ class WebSocketWire:
             return b""
         return self.answer()
 
-    def closing(self, reason: str) -> bytes:
+    def closing(self, reason: str, refused: bool) -> bytes:
+        code = CloseCode.POLICY_VIOLATION if refused else CloseCode.GOING_AWAY
         try:
-            self._protocol.send_close(CloseCode.POLICY_VIOLATION, reason.encode()[:_REASON].decode(errors="ignore"))
+            self._protocol.send_close(code, reason.encode()[:_REASON].decode(errors="ignore"))
         except WebSocketException:
             return b""
         return self.answer()

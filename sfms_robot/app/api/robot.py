@@ -195,12 +195,18 @@ class Robot:
         """
         self._pushed("see").sight.see(face)
 
-    def say(self, pcm: Pcm, rate_hz: float) -> None:
+    def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
         """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
 
-        Play it one frame (40 ms) after it is handed over. Up to two minutes may wait. Never blocks.
+        Play it one frame (40 ms) after it is handed over, behind what still waits; or say by `at_s` (`time.monotonic`)
+        when its first sample will be played: that replaces what was to be played from then on. Up to two minutes may
+        wait. Never blocks.
         """
-        self._pushed("say").speech.say(pcm, rate_hz)
+        self._pushed("say").speech.say(pcm, rate_hz, at_s)
+
+    def hush(self) -> None:
+        """What it still had to say will not be played: you were interrupted. Never blocks."""
+        self._pushed("hush").speech.hush()
 
     def _pushed(self, what: str) -> _PushedPerson:
         if self._person is None:
