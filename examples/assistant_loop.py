@@ -11,7 +11,7 @@ import time
 import numpy as np
 from websockets.sync.client import connect
 
-HEADER = struct.Struct("<BBHIdd")  # kind, version, 0, samples a second, when it was sent, when it was heard or is played
+HEADER = struct.Struct("<BBHIdd")  # kind, version, 0, samples a second; when it was sent, and heard or to be played
 SPEECH, RATE_HZ = 3, 24_000
 HELLO = {"type": "hello", "version": 1, "name": "assistant", "feeds": ["speech"], "wants": ["microphone", "events"]}
 

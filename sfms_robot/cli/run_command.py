@@ -34,7 +34,8 @@ def run(
         "default",
         autocompletion=names.speakers,
         rich_help_panel=PERSON,
-        help="FILE.wav (any rate, mono or stereo), a shipped speaker, 'none', or 'default': a shipped speaker.",
+        help="FILE.wav (any rate, mono or stereo), a shipped speaker, 'none', 'push[:[HOST:]PORT]' for a program of yours, "
+        "or 'default': a shipped speaker.",
     ),
     face: str = typer.Option(
         "auto",
@@ -45,7 +46,8 @@ def run(
         "none",
         autocompletion=names.speakers,
         rich_help_panel=PERSON,
-        help="What the robot itself says: FILE.wav, a shipped speaker or 'none'. An ARIG listener's lips follow it.",
+        help="What the robot itself says: FILE.wav, a shipped speaker, 'tcp[:[HOST:]PORT]' for a program of yours, or "
+        "'none'. An ARIG listener's lips follow it.",
     ),
     duration: float | None = typer.Option(
         None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."

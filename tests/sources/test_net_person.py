@@ -363,7 +363,9 @@ def test_pages_of_this_machine_may_connect(run, origin):
     all_looked_at(joined(WebSocket(run, origin, wants=["events"])))
 
 
-@pytest.mark.parametrize("origin", ["https://example.org", "null", "http://127.0.0.1.example.org", "http://[", "file://"])
+@pytest.mark.parametrize(
+    "origin", ["https://example.org", "null", "http://127.0.0.1.example.org", "http://[", "file://"]
+)
 def test_other_pages_may_not(run, origin):
     with pytest.raises(InvalidStatus) as refused:
         WebSocket(run, origin, wants=["events"])

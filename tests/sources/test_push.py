@@ -264,8 +264,12 @@ def test_a_voice_with_times_is_placed_by_them():
         person.now_s = 100.0 + (index + 1) * 0.1 + 0.03 * (index % 3)
         person.voice.hear(sound, 16000, 100.0 + (index + 1) * 0.1)
         frames += person.read(person.now_s - 100.0)
-    assert abs(int(np.argmax(np.abs(np.concatenate([f.audio if len(f.audio) else np.zeros(640) for f in frames]))))
-               - 16000) <= 16
+    assert (
+        abs(
+            int(np.argmax(np.abs(np.concatenate([f.audio if len(f.audio) else np.zeros(640) for f in frames])))) - 16000
+        )
+        <= 16
+    )
 
 
 def test_calls_may_come_from_any_thread():
