@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.corpora.states import STATE, UNKNOWN
+from sfms_robot.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
 from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.signals.events import near

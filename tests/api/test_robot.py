@@ -44,7 +44,7 @@ class Nodder:
 def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end():
     told = []
     with sr.Robot(HEAD, listener=(nodder := Nodder())) as robot:
-        assert robot.state == "listening"
+        assert robot.state == "starting"
         nodded = threading.Event()
         robot.on("nod", lambda event: (told.append(event), nodded.set()))
         assert nodded.wait(30)
@@ -77,8 +77,9 @@ def test_what_is_pushed_is_what_the_listener_hears():
 def test_a_listener_that_raises_ends_no_run_and_is_named():
     listener = Nodder(raises_at=3)
     with sr.Robot(HEAD, listener=listener) as robot:
-        robot.wait(0.5)
-        assert robot.state == "listening"
+        robot.wait(1.5)
+        assert robot.state == "degraded"
+    assert robot.report()["states"]["changes"][1]["why"] == ["listener"]
     assert robot.report()["listener_state"]["state"] == "failed: RuntimeError: out of ideas"
 
 
@@ -92,7 +93,7 @@ def test_it_runs_in_any_thread_and_stops_from_another():
     thread.start()
     thread.join()
     (robot,) = robots
-    assert robot.state == "listening"
+    assert robot.state == "starting"
     robot.stop()
     robot.stop()
     assert robot.state == "stopped"
@@ -110,7 +111,7 @@ def test_virtual_time_a_source_by_name_and_the_end_by_itself():
 def test_show_reaches_the_servos_and_intensity_zero_keeps_them_still():
     travels = []
     for intensity in (1.0, 0.0):
-        with sr.Robot(HEAD, audio="none", duration_s=3.0, fast=True, listener=Still(), seed=1) as robot:
+        with sr.Robot(HEAD, audio="katie", duration_s=3.0, fast=True, listener=Still(), seed=1) as robot:
             for region in robot.knobs:
                 robot.knobs[region].intensity = intensity
             robot.wait()
@@ -250,3 +251,17 @@ def test_a_plain_script_needs_no_main_guard_and_rests_when_it_forgets_to_stop(tm
     script.write_text(SCRIPT)
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "listening", "")
+
+
+def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
+    with sr.Robot(HEAD, listener=Nodder()) as robot:
+        robot.wait(0.3)
+        robot.halt()
+        robot.wait(0.3)
+        assert robot.state == "halted"
+        robot.resume()
+        robot.wait(0.3)
+        assert robot.state == "starting"
+    assert [change["state"] for change in robot.report()["states"]["changes"]] == [
+        "starting", "halted", "starting", "stopping", "stopped",
+    ]  # fmt: skip

@@ -93,7 +93,7 @@ def test_a_robot_that_stops_speaking_while_somebody_talks_listens_within_a_secon
         ("text.wav", ["text.wav"]),
         ("empty.wav", ["empty.wav"]),
         (".", ["is a folder, not a sound file"]),
-        ("loopback", ["loopback", "not available yet"]),
+        ("loopback", ["loopback", "no such file"]),
     ],
 )
 def test_a_voice_that_cannot_be_used_is_one_clear_line(given: str, said, seeded, tmp_path, capsys, monkeypatch):

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sfms_robot.config.arig import STATES
-from sfms_robot.corpora import states as labels
-from sfms_robot.corpora.states import PATTERNS, STATE, Voices, label, of_activity
+from sfms_robot.corpora import conversational_states as labels
+from sfms_robot.corpora.conversational_states import PATTERNS, STATE, Voices, label, of_activity
 
 MASKS = st.integers(0, 60).flatmap(lambda n: arrays(bool, (5, n)))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tiny_arig_training import HZ, dyad, settings
 
-from sfms_robot.corpora.states import STATE
+from sfms_robot.corpora.conversational_states import STATE
 from sfms_robot.evaluation import interaction as scores
 from sfms_robot.evaluation.paper import arig_tables as tables
 from sfms_robot.evaluation.rollout import frames_of_dyad, rollout

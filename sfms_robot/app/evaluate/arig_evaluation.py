@@ -17,7 +17,7 @@ from sfms_robot.app.train.train_runs import TrainOptions, run_of, train_settings
 from sfms_robot.config import find, parse_training
 from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.corpora.states import UNKNOWN
+from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import interaction as scores
 from sfms_robot.evaluation.paper import arig_tables as tables

@@ -21,7 +21,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.corpora import states as labels
+from sfms_robot.corpora import conversational_states as labels
 from sfms_robot.corpora.clips import Dyad, save
 from sfms_robot.corpora.compose import speaking
 from sfms_robot.corpora.compose.acting import Score, listener_motion, speaker_motion

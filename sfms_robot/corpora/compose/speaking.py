@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.corpora import states as labels
+from sfms_robot.corpora import conversational_states as labels
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.compose.acting import speaker_motion
 from sfms_robot.corpora.compose.motions import SPLITS, Motions

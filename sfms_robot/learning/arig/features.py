@@ -15,8 +15,8 @@ from torch import Tensor
 
 from sfms_robot.corpora.clips import Dyad as Conversation
 from sfms_robot.corpora.collection import Dataset
+from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.corpora.formats import open_dataset
-from sfms_robot.corpora.states import UNKNOWN
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning import corpus as dyads
