@@ -228,10 +228,10 @@ def test_commands_that_speak_to_servos_stay_here(best):
         best.run("servo", "scan", "--ids", "1-2", *line)
         best.run("servo", "ping", "1-2", *line)
         best.run("servo", "read", "1", "all", *line)
-        best.run("servo", "dump", "1", *line, codes=(0, 2))
-        best.run("doctor", "--head", HEAD, "--port", device, codes=(0, 1))
+        best.run("servo", "dump", "dump.yaml", "--ids", "1", *line)
+        best.run("doctor", "--head", HEAD, "--port", device)
         best.run("run", "--head", HEAD, "--port", device, "--dry-run")
-        best.run("head", "solve", HEAD, "--poses", "poses.csv", codes=(0, 2))
+        best.run("head", "solve", "reachy_mini", "--poses", "poses.csv")
         os.killpg(emulator.pid, signal.SIGTERM)
         emulator.communicate(timeout=LIMIT_S)
     assert best.strangers() == []
@@ -262,11 +262,11 @@ def test_commands_that_learn_and_measure_stay_here(best):
     clips.save(best.folder / "data" / "train", [dyad("a", 0)])
     clips.save(best.folder / "data" / "validation", [dyad("b", 1)])
     (best.folder / "tiny.yaml").write_text(yaml.safe_dump(training(), sort_keys=False))
-    best.run("data", "check", "data", codes=(0, 1))
+    best.run("data", "check", "data")
     flags = ["--config", "tiny.yaml", "--data", "data", "--out", "out", "--device", "cpu"]
     best.run("train", "tokenizer", *flags, "--tensorboard")
     best.run("train", "listener", *flags, "--no-tensorboard")
-    best.run("evaluate", "tokenizer", "--listener", "out", "--data", "data/validation", codes=(0, 2))
+    best.run("evaluate", "tokenizer", "--listener", "out", "--data", "data")
     best.run("bench", "retarget", "--frames", "50")
     assert best.strangers() == []
 

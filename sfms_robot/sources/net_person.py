@@ -145,9 +145,11 @@ class NetPerson:
         for name in [each for each, feeder in self._feeders.items() if feeder is connection]:
             del self._feeders[name]
             logger.info("%s: %s has gone", FLAGS[name], connection.name)
-            face = self._feeds.get("face")
-            if name == "face" and isinstance(face, NetSight):
-                face.see(None)
+            part = self._feeds.get(name)
+            if part is not None and name != "speech":  # who has nothing to say is no loss
+                part.lost = True
+            if isinstance(part, NetSight):
+                part.see(None)
 
     def _greet(self, connection: Connection, hello: Hello) -> None:
         if connection.greeted:
@@ -160,6 +162,7 @@ class NetPerson:
             self._claim(connection, name)
         for name in hello.feeds:
             self._feeders[name], self._heard_s[name] = connection, self.now()
+            self._feeds[name].lost = False
             logger.info("%s: %s", FLAGS[name], connection.name)
         self._clocks[connection] = SenderClock()
         connection.greeted, connection.wants = True, hello.wants

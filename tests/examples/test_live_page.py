@@ -35,7 +35,7 @@ def test_an_assistant_joins_as_typed(here, tmp_path):
     robot, assistant = (line.split("#")[0].split() for line in blocks(section("Voice agents"))[0].splitlines())
     assert (robot[0], assistant) == ("sfms-robot", ["python", "examples/assistant_loop.py"])
     (lines,) = blocks(section("Voice agents"), "python")
-    assert len(lines.splitlines()) == 5
+    assert len([line for line in lines.splitlines() if line]) == 5
     with subprocess.Popen([*COMMAND, *robot[1:]], cwd=tmp_path, env=here, stderr=subprocess.PIPE, text=True) as running:
         assert "tcp://127.0.0.1:8765" in running.stderr.readline()
         program = subprocess.run([sys.executable, "-c", lines], env=here, capture_output=True, text=True, timeout=60)

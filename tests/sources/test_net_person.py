@@ -271,6 +271,19 @@ def test_who_sends_nothing_but_noise_is_closed(run, Program):
     assert run.told["malformed"] == net_server.MOST_MALFORMED + 1
 
 
+def test_a_run_misses_whose_program_has_gone_but_not_a_silent_assistant(run):
+    assert not run.voice.lost
+    all_looked_at(joined(Tcp(run, feeds=["voice", "face", "speech"])))
+    for _ in range(20_000):
+        if not run.told["feeders"]:
+            break
+        threading.Event().wait(0.001)
+    assert (run.voice.lost, run.sight.lost, run.speech.lost) == (True, True, False)
+    program = joined(Tcp(run, feeds=["voice"]))
+    assert (run.voice.lost, run.sight.lost) == (False, True)
+    all_looked_at(program)
+
+
 def test_what_was_not_announced_or_not_asked_for_is_refused(run):
     program = joined(Tcp(run, feeds=["voice"]))
     program.send(sound_message(SPEECH, 16000, 0, 0, SECOND))
