@@ -23,7 +23,7 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
-from sfms_robot.ports import Sight, Source, Voice
+from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -49,6 +49,7 @@ class PairedSource:
         duration_s: None for one without end.
         latency_s: see `ports.Voice`.
         missing: voice, face, agent_audio: those that are lost.
+        outlets: those behind its parts, each once.
     """
 
     def __init__(
@@ -64,6 +65,8 @@ class PairedSource:
         self.latency_s = 0.0
         self.missing: tuple[str, ...] = ()
         self._voice, self._sight, self._agent = voice, sight, agent
+        behind = [getattr(part, "outlet", None) for part in self._parts().values()]
+        self.outlets: Sequence[Outlet] = list(dict.fromkeys(each for each in behind if each is not None))
         self._judge = FrameJudge()
         self._given = 0
         self._overruns = 0
@@ -159,6 +162,7 @@ class JudgedSource:
         self.latency_s = inner.latency_s
         self.missing: tuple[str, ...] = ()
         self._inner = inner
+        self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
         self._given = 0
 
