@@ -103,6 +103,10 @@ class Source(Protocol):
         """Frames complete at or before loop time `now_s` and not given yet, oldest first. Must not block."""
         ...
 
+    def moves(self, speed_rad_s: float) -> None:
+        """How fast the head's joints move, all together; told at every tick. Its microphone hears their motors."""
+        return None
+
     def statistics(self) -> Mapping[str, Any]:
         """What was lost: for the report."""
         return {}

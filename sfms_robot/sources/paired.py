@@ -89,6 +89,11 @@ class PairedSource:
         self.missing = tuple(name for name, part in self._parts().items() if part.lost)
         return frames
 
+    def moves(self, speed_rad_s: float) -> None:
+        """See `ports.Source`; a microphone wants to know."""
+        if (tell := getattr(self._voice, "moves", None)) is not None:
+            tell(speed_rad_s)
+
     def statistics(self) -> Mapping[str, Any]:
         """Of the grid, and under `voice`, `face` and `agent_audio` what these tell of themselves.
 
@@ -174,11 +179,14 @@ class JudgedSource:
         """Frames so far, what was left out of them, and what the source tells of itself."""
         return {"frames": self._given, "left_out": dict(self._judge.left_out), **self._inner.statistics()}
 
+    def moves(self, speed_rad_s: float) -> None:
+        self._inner.moves(speed_rad_s)
+
     def close(self) -> None:
         self._inner.close()
 
 
-_SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "statistics", "close")
+_SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "moves", "statistics", "close")
 
 
 class FrameJudge:
