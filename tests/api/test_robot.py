@@ -250,7 +250,7 @@ def test_a_plain_script_needs_no_main_guard_and_rests_when_it_forgets_to_stop(tm
     script = tmp_path / "mine.py"
     script.write_text(SCRIPT)
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120)
-    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "listening", "")
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "starting", "")
 
 
 def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
