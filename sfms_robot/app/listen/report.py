@@ -45,6 +45,8 @@ def run_report(
             "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},
         },
         "listener_step_ms": heard.pop("step_ms"),
+        "hop": heard.pop("hop", None),
+        "budget_ms": heard.pop("budget_ms", None),
         "listener_state": heard,
         "bus": dict(bus.statistics()),
         "limits": {
