@@ -1,6 +1,7 @@
 """`--port FAMILY=DEVICE[,MODEL:IDS[@BAUD]]` runs the contract of the servo buses on real servos."""
 
 import pytest
+from sound_server import SoundServer
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -28,3 +29,21 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "hardware" in item.keywords:
             item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def _sound_servers(tmp_path_factory):
+    if missing := SoundServer.missing():
+        pytest.skip(f"needs a sound server: {missing}")
+    return SoundServer(tmp_path_factory.mktemp("sound"))
+
+
+@pytest.fixture
+def sound_server(_sound_servers, monkeypatch):
+    """A sound server with the sink `person`, whose monitor is the only microphone of this process."""
+    for name, value in _sound_servers.environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("PULSE_SERVER", raising=False)
+    _sound_servers.start("person")
+    yield _sound_servers
+    _sound_servers.stop()

@@ -1,4 +1,6 @@
-"""What there is to choose from: listeners, recorded people, serial ports. Each row has a name and a description."""
+"""What there is to choose from: listeners, recorded people, serial ports, microphones. Each row has a name and a
+description.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ from typing import Any
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.servo.discovery import ports_data
+from sfms_robot.sources.microphone import sound_devices
 from sfms_robot.sources.speakers import shipped_speaker, speakers
 
 
@@ -49,3 +52,21 @@ def shipped_speakers() -> list[dict[str, Any]]:
 def serial_ports() -> list[dict[str, Any]]:
     """What `port list` shows. `name` is what to give to --port."""
     return ports_data()
+
+
+def microphones() -> list[dict[str, Any]]:
+    """What `port list` shows of sound; blocks for half a second. `name` is what to give to --audio mic:NAME.
+
+    Raises ConfigError without PortAudio.
+    """
+    return [
+        {
+            "name": device.name,
+            "number": None if device.server_source else str(device.number),
+            "default": device.default,
+            "channels": device.inputs,
+            "rate_hz": round(device.rate_hz),
+            "description": f"--agent-audio device:{device.name}" if device.monitor else f"--audio mic:{device.name}",
+        }
+        for device in sound_devices()
+    ]

@@ -57,7 +57,7 @@ from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.sources.registry import open_source
+from sfms_robot.sources.registry import open_source, split_kind
 
 logger = logging.getLogger(__name__)
 
@@ -374,6 +374,11 @@ class RunOptions:
     status: int | None = None
 
     @property
+    def hears(self) -> str:
+        """`audio`, where "default" is the microphone for servos that are not emulated here."""
+        return "mic" if self.audio == "default" and self.port != SIM and not self.dry_run else self.audio
+
+    @property
     def servos(self) -> HeadOptions:
         """The head and its servos."""
         return HeadOptions(self.head, self.port, self.fast, self.yes or self.dry_run, self.without)
@@ -408,6 +413,8 @@ def run(
     Raises RobotError before torque came on.
     """
     prepare_head(options.servos)
+    if options.fast and split_kind(options.hears)[0] == "mic":
+        raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
@@ -422,7 +429,7 @@ def run(
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         if source is None:
-            source = open_source(options.audio, options.face, options.duration_s, agent_audio=options.agent_audio)
+            source = open_source(options.hears, options.face, options.duration_s, agent_audio=options.agent_audio)
             stack.callback(source.close)
         duration_s = source.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
@@ -497,7 +504,7 @@ def _recorder(options: RunOptions, head: Head) -> Recorder | None:
         "head": head.name,
         "listener": Path(options.listener).name,
         "seed": str(options.seed),
-        "audio": Path(options.audio).name,
+        "audio": Path(options.hears).name,
     }
     when_full: FullPolicy = "wait" if options.fast else "drop"
     return Recorder(options.record, list(head.joints), when_full=when_full, about=about)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json as json_module
+
 import typer
 
 listener = typer.Typer(help="Listeners: list.", no_args_is_help=True)
 speaker = typer.Typer(help="Recorded people: list.", no_args_is_help=True)
-port = typer.Typer(help="Serial ports: list.", no_args_is_help=True)
+port = typer.Typer(help="Serial ports and microphones: list.", no_args_is_help=True)
 JSON = typer.Option(False, "--json", help="Print as one JSON object.")
 
 
@@ -35,9 +37,23 @@ def list_speakers(json: bool = JSON) -> None:
 
 
 @port.command("list")
-def list_serial_ports(json: bool = JSON) -> None:
-    """Serial ports that servos may hang on: what the adapter is, who holds it, what speaks against using it."""
-    from sfms_robot.app.catalogue import serial_ports
-    from sfms_robot.cli.show import print_list
+def list_ports(json: bool = JSON) -> None:
+    """Serial ports that servos may hang on, with what speaks against using them; and devices that record sound."""
+    from sfms_robot.app.catalogue import microphones, serial_ports
+    from sfms_robot.cli.show import print_list, screen
+    from sfms_robot.errors import RobotError
 
-    print_list("ports", serial_ports(), json)
+    ports, problem = serial_ports(), None
+    try:
+        devices = microphones()
+    except RobotError as error:
+        devices, problem = [], str(error)
+    if json:
+        told = {"version": 1, "ports": ports, "microphones": devices, "microphone_problem": problem}
+        print(json_module.dumps(told))
+        return
+    print_list("serial ports", ports, json=False)
+    if problem:
+        screen(highlight=False).print(problem, style="dim")
+    else:
+        print_list("microphones", devices, json=False)

@@ -34,7 +34,9 @@ def run(
         "default",
         autocompletion=names.speakers,
         rich_help_panel=PERSON,
-        help="FILE.wav (any rate, mono or stereo), a shipped speaker, 'none', or 'default': a shipped speaker.",
+        metavar="mic[:DEVICE]|FILE.wav|NAME|none",
+        help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, 'none'. "
+        "Default: the microphone, with emulated servos a shipped speaker.",
     ),
     face: str = typer.Option(
         "auto",
@@ -45,7 +47,9 @@ def run(
         "none",
         autocompletion=names.speakers,
         rich_help_panel=PERSON,
-        help="What the robot itself says: FILE.wav, a shipped speaker or 'none'. An ARIG listener's lips follow it.",
+        metavar="FILE.wav|device:DEVICE|NAME|none",
+        help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, "
+        "'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
     ),
     duration: float | None = typer.Option(
         None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."
@@ -74,6 +78,9 @@ def run(
     ),
     json: bool = typer.Option(
         False, "--json", rich_help_panel=OUTPUT, help="Print the report as one JSON object, last line of stdout."
+    ),
+    check: bool = typer.Option(
+        False, "--check", rich_help_panel=PERSON, help="Say how good the sound of --audio is, for 3 s; no servo moves."
     ),
     status: int | None = typer.Option(
         None,
@@ -109,6 +116,9 @@ def run(
     from sfms_robot.app.listen.preflight import begin_listening, check_names
 
     check_names(head, listener, port, audio, face, agent_audio)
+    if check:
+        _check(audio, duration, json)
+        return
     with ExitStack() as stack:
         # The listener loads from here on, in a process of its own, while this one imports what drives a head.
         feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(listener, seed)))
@@ -132,3 +142,17 @@ def run(
     if report.get("error"):
         print(f"sfms-robot: {report['error']}", file=sys.stderr)
     raise typer.Exit(report.get("exit_code", 0))
+
+
+def _check(audio: str, duration_s: float | None, json: bool) -> None:
+    from sfms_robot.app.listen.sound_check import CHECK_S, check_sound
+    from sfms_robot.cli.meter import LevelMeter
+
+    with LevelMeter() as meter:
+        told = check_sound("mic" if audio == "default" else audio, duration_s or CHECK_S, None if json else meter)
+    if json:
+        print(json_module.dumps(told))
+        return
+    from sfms_robot.cli.show import print_sound_check
+
+    print_sound_check(told)

@@ -72,6 +72,21 @@ def print_dry_run(report: Mapping[str, Any]) -> None:
     screen().print(table)
 
 
+def print_sound_check(told: Mapping[str, Any]) -> None:
+    """Levels of what was heard, and what is not as it should be."""
+    voice = told["source"].get("voice", {})
+    table = Table(title=f"{voice.get('device') or told['audio']}, {told['seconds']:g} s", show_header=False)
+    table.add_row("loudest", f"{told['level_dbfs']:g} dBFS (peak {told['peak']:.2f})")
+    table.add_row("noise floor", f"{told['noise_floor_dbfs']:g} dBFS")
+    table.add_row("clipped", f"{told['clipped']:.2%}")
+    table.add_row("missing", f"{told['missing_frames']} frames")
+    table.add_row("latency", f"{_or(voice.get('latency_ms'), '-')} ms")
+    console = screen(highlight=False)
+    console.print(table)
+    for line in told["findings"] or ["fit to be listened to"]:
+        console.print(line)
+
+
 def print_bench(result: Mapping[str, Mapping[str, Any]]) -> None:
     """One row per thing measured."""
     table = Table("measured", "median", "p99", "ratio", "to")

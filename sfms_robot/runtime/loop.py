@@ -215,7 +215,7 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
     )
     if run.name == "halted":
         parts.halt.answer()
-    if run is not state.run or not log.states:
+    if (run.name, run.why) != (state.run.name, state.run.why) or not log.states:
         log.entered(run, now_s)
     return replace(state, run=run)
 

@@ -19,7 +19,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, speakers, voice_file
 
 if TYPE_CHECKING:
-    from sfms_robot.ports import Source
+    from sfms_robot.ports import Source, Voice
 
 GROUP: Final = "sfms_robot.sources"
 _HERE: Final = "sfms_robot.sources"
@@ -40,7 +40,7 @@ SIGHTS: Final = _ours(
     live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
     push="push:open_pushed_sight", browser="browser:open_browser_sight",
 )  # fmt: skip
-AGENT_VOICES: Final = _ours(device="loudspeaker:open_loudspeaker", tcp="tcp_audio:open_tcp_audio")
+AGENT_VOICES: Final = _ours(device="microphone:open_loudspeaker", tcp="tcp_audio:open_tcp_audio")
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,13 @@ def open_source(
     loop: bool = True,
     agent_audio: str = "none",
     kinds: SourceKinds | None = None,
+    agent: Voice | None = None,
 ) -> Source:
     """A person by what a run is told of them.
 
     An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
-    own, else none. `loop`: recordings start again when they end before `duration_s` does.
+    own, else none. `loop`: recordings start again when they end before `duration_s` does. `agent` is what the robot says,
+    instead of `agent_audio`.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
@@ -97,7 +99,11 @@ def open_source(
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     again = loop and duration_s is not None
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
-        voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed) or _recorded_voice(audio, again)
+        if split_kind(audio)[0] == "mic" and (agent is not None or agent_audio != "none"):
+            voice, agent = _conversation(audio, agent or agent_audio, known, failed)
+        else:
+            voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed)
+        voice = voice or _recorded_voice(audio, again)
         if voice is not None and hasattr(voice, _METHODS["source"]):
             for flag, value, free in (("--face", face, "auto"), ("--agent-audio", agent_audio, "none")):
                 if value not in (free, "none"):
@@ -106,8 +112,7 @@ def open_source(
         else:
             sight = _opened("--face", face, known.sights, ("face",), failed)
             sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
-            agent = _opened("--agent-audio", agent_audio, known.agent_voices, ("voice",), failed)
-            agent = agent or _recorded_voice(agent_audio, False)
+            agent = agent or _agent(agent_audio, known, failed)
             source = PairedSource(voice, sight, agent, duration_s)
         failed.pop_all()
     return source
@@ -142,6 +147,25 @@ def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed
     if not any(hasattr(part, _METHODS[each]) for each in wanted):
         raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {' or '.join(wanted)}")
     return part
+
+
+def _conversation(audio: str, agent: Voice | str, known: SourceKinds, failed: ExitStack) -> tuple[Any, Any]:
+    """A microphone, and what the robot says: the one has to know of the other, whose echo it hears."""
+    from sfms_robot.sources.microphone import open_microphone_and_loudspeaker, open_microphone_beside
+
+    device = split_kind(audio)[1]
+    both: tuple[Any, Any]
+    if isinstance(agent, str) and split_kind(agent)[0] == "device":
+        both = open_microphone_and_loudspeaker(device, split_kind(agent)[1])
+    else:
+        both = open_microphone_beside(device, _agent(agent, known, failed) if isinstance(agent, str) else agent)
+    failed.callback(both[0].close)
+    return both
+
+
+def _agent(value: str, known: SourceKinds, failed: ExitStack) -> Any:
+    agent = _opened("--agent-audio", value, known.agent_voices, ("voice",), failed)
+    return agent or _recorded_voice(value, False)
 
 
 def _recorded_voice(name: str, loop: bool) -> Any:

@@ -93,7 +93,9 @@ class SourceWorker:
             raise value
 
     def tell(self, value: Any) -> None:
-        """The worker finds it at its next `yield`, and one that is started anew from the first on. Keep it small."""
+        """The worker finds it at its next `yield`, and one that is started anew from the first on. Never blocks: of
+        what it has not fetched yet only the newest is kept.
+        """
         self._told = value
         self._child.tell(value)
 
@@ -182,15 +184,18 @@ class _Child:
         self.dropped = 0
         self.process = start_child("sfms_robot.sources.worker:main", quiet=True)
         assert self.process.stdin is not None and self.process.stdout is not None
-        self.tell(order)
+        self._untold: deque[bytes] = deque(maxlen=1)
+        self._telling = threading.Condition()
+        self._open = True
+        writes = (self.process.stdin, pickle.dumps(order, protocol=5))
+        threading.Thread(target=self._write, args=writes, name="source", daemon=True).start()
         self._reader = threading.Thread(target=self._read, args=(self.process.stdout,), name="source", daemon=True)
         self._reader.start()
 
     def tell(self, value: Any) -> None:
-        assert self.process.stdin is not None
-        with suppress(BrokenPipeError, ValueError):  # it died: the reader sees that too, and says so
-            pickle.dump(value, self.process.stdin, protocol=5)
-            self.process.stdin.flush()
+        with self._telling:
+            self._untold.append(pickle.dumps(value, protocol=5))
+            self._telling.notify()
 
     def kill(self) -> None:
         """Returns at once; the reader sees to the rest."""
@@ -202,9 +207,19 @@ class _Child:
         end_child(self.process, CLOSE_LIMIT_S)
 
     def _hang_up(self) -> None:
-        assert self.process.stdin is not None
-        with suppress(BrokenPipeError):
-            self.process.stdin.close()
+        with self._telling:
+            self._open = False
+            self._telling.notify()
+
+    def _write(self, pipe: IO[bytes], value: bytes) -> None:
+        """A child that hangs does not read: this thread waits for it then, until it is killed."""
+        with suppress(BrokenPipeError), pipe:  # one that died: the reader sees that too, and says so
+            while self._open:
+                pipe.write(value)
+                pipe.flush()
+                with self._telling:
+                    self._telling.wait_for(lambda: self._untold or not self._open)
+                    value = self._untold.pop() if self._untold else b""
 
     def _read(self, pipe: IO[bytes]) -> None:
         kind = "value"

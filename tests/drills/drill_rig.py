@@ -11,6 +11,7 @@ from typing import NamedTuple
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 
 CHECKOUT = Path(__file__).parents[2]
 START = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]
@@ -149,4 +150,5 @@ DURATION_S = {resting: 0.04}  # of the others: until somebody ends them
 
 
 def run(head, device, *words, duration_s=600.0, **how) -> Command:
-    return Command("run", "--head", head, "--port", device, "--duration", duration_s, *words, **how)
+    person = () if "--audio" in words else ("--audio", DEFAULT_SPEAKER)
+    return Command("run", "--head", head, "--port", device, *person, "--duration", duration_s, *words, **how)

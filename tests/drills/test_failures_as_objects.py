@@ -32,7 +32,9 @@ def test_what_is_not_there_is_named_in_an_object(words, code):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [["run", "--duration", "1"], ["run", "--dry-run"], ["doctor"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [["run", "--audio", "none", "--duration", "1"], ["run", "--dry-run"], ["doctor"]], ids=" ".join
+)
 def test_a_dead_bus_is_named_in_an_object(words, device):
     with launch([EmulatedServo(9)], link=str(device)):  # somebody else's servo
         ended, out, err = command(*words, "--head", HEAD, "--port", device, "--json")

@@ -79,7 +79,7 @@ def test_commands_that_listen_move_and_read_stay_on_this_computer(watch, device,
     with Command("emulate", "--head", HEAD, "--link", device, **how) as emulator:
         emulator.until(device.is_symlink)
         for words in (
-            ["run", "--head", HEAD, "--port", device, "--duration", "0.2"],
+            ["run", "--head", HEAD, "--port", device, "--audio", "none", "--duration", "0.2"],
             ["servo", "scan", "--ids", "1-2", "--baud", "1000000", "--port", device],
             ["servo", "read", "1", "all", "--baud", "1000000", "--port", device],
             ["doctor", "--head", HEAD, "--port", device],

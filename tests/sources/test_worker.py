@@ -205,6 +205,16 @@ def test_a_stopped_worker_is_ended_too(start):
     assert worker._child.process.poll() is not None
 
 
+def test_one_that_hangs_is_told_without_waiting_for_it(start):
+    worker = start(says_and_hangs, "hello")
+    worker.wait()
+    os.kill(worker._child.process.pid, signal.SIGSTOP)
+    for _ in range(10):
+        worker.tell(bytes(1_000_000))  # a pipe holds a fraction of it
+    worker.close()
+    assert worker._child.process.poll() is not None
+
+
 def test_a_worker_gives_way_as_far_as_it_is_told(start):
     assert until(start(tells_its_niceness, nice=3), "finished") == [os.nice(0) + 3]
 

@@ -32,6 +32,7 @@ from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.paired import JudgedSource, PairedSource
 from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
+from sfms_robot.sources.registry import open_source, split_kind
 
 log = logging.getLogger(__name__)
 
@@ -114,6 +115,9 @@ class Robot:
         config = load_head(self._options.head)
         self._listener = own
         self._person = _PushedPerson() if pushed else None
+        self._speech = self._person.speech if self._person is not None else None
+        if source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none":
+            self._speech = PushedSpeech()
         self._source = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
@@ -198,9 +202,12 @@ class Robot:
     def say(self, pcm: Pcm, rate_hz: float) -> None:
         """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
 
-        Play it one frame (40 ms) after it is handed over. Up to two minutes may wait. Never blocks.
+        Play it one frame (40 ms) after it is handed over. Up to two minutes may wait. Never blocks. With a microphone
+        (`audio="mic"`) it is taken out of what is heard. Raises InputError beside another source.
         """
-        self._pushed("say").speech.say(pcm, rate_hz)
+        if self._speech is None:
+            raise InputError(f'say() needs audio="push" or "mic"; this robot listens to {self._hears!r}')
+        self._speech.say(pcm, rate_hz)
 
     def _pushed(self, what: str) -> _PushedPerson:
         if self._person is None:
@@ -265,9 +272,14 @@ class Robot:
             if self._listener is not None:
                 feed = ListenerThread(self._listener, self._options.seed)
                 stack.callback(feed.close)
+            source: Source | None = self._source if self._person is None else self._person.source()
+            if self._person is None and self._speech is not None:
+                asked = self._options
+                source = open_source(asked.hears, asked.face, asked.duration_s, agent=self._speech)
+                stack.callback(source.close)
             return run(
                 self._options,
-                source=self._source if self._person is None else self._person.source(),
+                source=source,
                 feed=feed,
                 observers=[progress, self._events],
                 knobs=lambda _: lambda: self._knobs.now,

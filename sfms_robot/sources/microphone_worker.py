@@ -1,0 +1,228 @@
+"""The microphone's own process: PortAudio's callbacks in, frames of the loop out, the robot's own voice taken out.
+
+A device that gives nothing for `LOST_S` went away: the process ends with that, and the one that is started in its place
+begins with a PortAudio that sees the devices of that moment. So it goes on until the device is back.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any, Final
+
+from sfms_robot.errors import PortError
+from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.sources.front_end import FrontEnd, Heard, ToldSpeech
+from sfms_robot.sources.live_voice import LiveVoice
+from sfms_robot.sources.sound_devices import SoundDevice, choose_device, portaudio, recording_devices
+
+LOST_S: Final = 0.2
+STATISTICS_S: Final = 1.0
+_ALIVE_S: Final = 0.1
+_BLOCK_S: Final = 0.01
+_LATENCY_S: Final = 0.06  # asked of the device; with less, a sound server's stream seldom starts
+_STARTS: Final = 20  # a stream of ALSA's plugin for sound servers may never start: it is opened again
+_START_LIMIT_S: Final = 0.3
+_OLDEST_S: Final = 1.0  # a time stamp that is further away is of another clock
+_MIXED: Final = 2  # channels; of more the first is taken, where arrays put what they made of the others
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What to record: a device by number, name or part of its name, "" for the default one, and for whom.
+
+    Attributes:
+        flag: how errors call it, "--audio mic".
+        reference: what the loudspeaker is given, as a device; None for none.
+        told: the parent tells what the robot says (`Told.said`).
+    """
+
+    device: str
+    flag: str
+    reference: str | None = None
+    reference_flag: str = ""
+    told: bool = False
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The first message."""
+
+    device: str
+    rate_hz: float
+    channels: int
+
+
+@dataclass(frozen=True)
+class Told:
+    """From the parent.
+
+    Attributes:
+        origin_s: loop time 0 in seconds of `time.monotonic`.
+        first, said: (n x 640,) what the robot says from frame `first` on: the newest frames, as it may miss some.
+    """
+
+    origin_s: float
+    first: int = 0
+    said: Floats | None = None
+
+
+Message = Opened | Heard | dict[str, Any]
+
+
+def listen(recording: Recording) -> Generator[Message | None, Told | None, None]:
+    """Frames of a microphone, once a second its statistics; see `sources.worker`.
+
+    Raises ConfigError for a device that is not there and without PortAudio, PortError where nothing records, for a
+    device that cannot be opened, and when one goes away.
+    """
+    with ExitStack() as stack:
+        mic = stack.enter_context(open_capture(recording.device, recording.flag))
+        said = None
+        if recording.reference is not None:
+            said = stack.enter_context(open_capture(recording.reference, recording.reference_flag))
+        reference = ToldSpeech() if recording.told else None if said is None else LiveVoice()
+        front_end = FrontEnd(reference)
+        told = yield Opened(mic.device.name, mic.rate_hz, mic.channels)
+        before: Told | None = None
+        said_s = next_statistics_s = 0.0
+        while True:
+            mic.pass_on(front_end.mic, 2 * _BLOCK_S)
+            if said is not None and isinstance(reference, LiveVoice):
+                said.pass_on(reference, 0.0)
+            if told is not None and told is not before:
+                if before is None or told.origin_s != before.origin_s:
+                    front_end.start(told.origin_s, time.monotonic())
+                if isinstance(reference, ToldSpeech) and told.said is not None:
+                    reference.tell(told.first, told.said)
+                before = told
+            messages: list[Message | None] = [*front_end.frames(time.monotonic())]
+            if (now_s := time.monotonic()) >= next_statistics_s:
+                next_statistics_s = now_s + STATISTICS_S
+                messages.append({**front_end.statistics(), "overflows": mic.overflows})
+            elif not messages and (before is None or recording.told or now_s > said_s + _ALIVE_S):
+                messages.append(None)  # and hear what the parent tells
+            for message in messages:
+                told, said_s = (yield message), now_s
+
+
+class Capture:
+    """A device that records into a queue, by callbacks in a thread of PortAudio's.
+
+    Attributes:
+        overflows: times that PortAudio lost samples.
+    """
+
+    def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
+        self.device, self.rate_hz, self.channels = device, rate_hz, channels
+        self.overflows = 0
+        self._pieces: queue.SimpleQueue[tuple[Floats, float, bool]] = queue.SimpleQueue()
+        self._heard_s = time.monotonic()
+        self._stream: Any = None
+
+    def start(self) -> bool:
+        """Open the stream; whether it records. Raises PortAudio's errors."""
+        import sounddevice
+
+        with self.device.selected():
+            self._stream = sounddevice.InputStream(
+                device=self.device.number, samplerate=self.rate_hz, channels=self.channels, dtype="float32",
+                blocksize=round(self.rate_hz * _BLOCK_S), latency=_LATENCY_S, callback=self._called,
+            )  # fmt: skip
+            self._stream.start()
+        try:
+            self._pieces.get(timeout=_START_LIMIT_S)
+        except queue.Empty:
+            self.close()
+            return False
+        return True
+
+    def pass_on(self, voice: LiveVoice, wait_s: float) -> None:
+        """All that was recorded, to `voice`; waits so long for something. Raises PortError when it went away."""
+        try:
+            piece = self._pieces.get(timeout=wait_s) if wait_s else self._pieces.get_nowait()
+            while True:
+                samples, captured_s, overflow = piece
+                if overflow:
+                    self.overflows += 1
+                    voice.interrupt()
+                voice.push(samples, self.rate_hz, captured_s)
+                piece = self._pieces.get_nowait()
+        except queue.Empty:
+            if time.monotonic() - self._heard_s > LOST_S:
+                raise PortError(f"{self.device.name} gives no more sound") from None
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.abort()
+            self._stream.close()
+
+    def __enter__(self) -> Capture:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
+        now_s = self._heard_s = time.monotonic()
+        adc_age_s = stamp.currentTime - stamp.inputBufferAdcTime if stamp.inputBufferAdcTime else None
+        mono = samples[:, :1] if self.channels > _MIXED else samples
+        self._pieces.put((mono.copy(), captured_s(now_s, adc_age_s, n / self.rate_hz), bool(status.input_overflow)))
+
+
+def captured_s(now_s: float, first_age_s: float | None, length_s: float) -> float:
+    """When the newest sample of a piece came, `time.monotonic`, never after `now_s`.
+
+    `first_age_s`: how old the device says that its first one is; None, or what cannot be: it came just now.
+    """
+    if first_age_s is None or not -length_s <= first_age_s <= _OLDEST_S:
+        return now_s
+    return min(now_s, now_s - first_age_s + length_s)
+
+
+def open_capture(wanted: str, flag: str) -> Capture:
+    """The device that is wanted, recording: at 16 kHz and mono where it takes that, else as it is.
+
+    Blocks until sound comes, some tenths of a second. Raises ConfigError, PortError; see `listen`.
+    """
+    sounddevice = portaudio(flag)
+    devices = recording_devices(flag)
+    device = choose_device(devices, wanted, flag)
+    try:
+        rate_hz, channels = _format(device)
+        for _ in range(_STARTS):
+            capture = Capture(device, rate_hz, channels)
+            if capture.start():
+                return capture
+    except sounddevice.PortAudioError as error:
+        raise PortError(f"{flag}: {device.name} cannot be opened, {_reason(error)}") from error
+    raise PortError(f"{flag}: {device.name} is open, but gives no sound ({_others(devices, device)})")
+
+
+def _format(device: SoundDevice) -> tuple[float, int]:
+    """Rate and channels that it takes. Raises PortAudioError: it takes none."""
+    import sounddevice
+
+    wishes = [(rate, channels) for rate in (AUDIO_HZ, device.rate_hz) for channels in (1, device.inputs)]
+    with device.selected():
+        for rate_hz, channels in wishes[:-1]:
+            try:
+                sounddevice.check_input_settings(device.number, channels, "float32", samplerate=rate_hz)
+                return rate_hz, channels
+            except (sounddevice.PortAudioError, ValueError):
+                continue
+    return wishes[-1]
+
+
+def _reason(error: Exception) -> str:
+    """PortAudio's own word, and what it mostly means."""
+    text = str(error.args[0] if error.args else error).rpartition(": ")[2].partition(" [")[0]
+    busy = "unavailable" in text.casefold() or "busy" in text.casefold()
+    return "another program holds it, or it was unplugged" if busy else text
+
+
+def _others(devices: Sequence[SoundDevice], device: SoundDevice) -> str:
+    return ", ".join(each.label for each in devices if each is not device) or "there is no other"

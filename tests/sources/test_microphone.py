@@ -1,0 +1,213 @@
+"""`--audio mic` on the real path: PortAudio, ALSA, a sound server, and what somebody plays to it."""
+
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+import soundfile
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
+from sfms_robot.signals.audio import energy_db, read_audio
+from sfms_robot.sources.microphone import OwnVoice, open_loudspeaker, open_microphone, sound_devices
+from sfms_robot.sources.microphone_worker import captured_s
+from sfms_robot.sources.push import PushedSpeech
+from sfms_robot.sources.recording import RecordedVoice
+from sfms_robot.sources.registry import open_source
+
+PATIENCE_S = 60.0  # on a computer with nothing to spare
+
+
+class Hearing:
+    """A source that is read in real time; every wait is for what its worker sends."""
+
+    def __init__(self, source, microphone):
+        self.source, self.microphone = source, microphone
+        self.frames = []
+        self.origin_s = time.monotonic()
+        source.start(self.origin_s)
+
+    def until(self, enough):
+        """Read frames until `enough()`; returns those."""
+        before = len(self.frames)
+        while not enough():
+            assert time.monotonic() < self.origin_s + PATIENCE_S
+            arrived = self.microphone._worker._child.arrived
+            arrived.wait(FRAME_S)
+            arrived.clear()
+            self.frames += self.source.read(time.monotonic() - self.origin_s)
+        return self.frames[before:]
+
+    def seconds(self, seconds):
+        wanted = len(self.frames) + round(seconds / FRAME_S)
+        return self.until(lambda: len(self.frames) >= wanted)
+
+
+@pytest.fixture
+def hear():
+    """How to open `--audio` and `--agent-audio` and listen; all is closed afterwards."""
+    sources = []
+
+    def opened(audio="mic", **how):
+        source = open_source(audio, "none", **how)
+        sources.append(source)
+        return Hearing(source, source._voice)
+
+    yield opened
+    for source in sources:
+        source.close()
+
+
+@pytest.fixture
+def play(sound_server):
+    """How to play a file to a sink; what still plays is ended afterwards."""
+    players = []
+
+    def played(sink, file):
+        players.append(sound_server.play(sink, file))
+
+    yield played
+    for player in players:
+        player.kill()
+        player.wait()
+
+
+def heard(frames):
+    """(n,) whole, silence for what did not come in time."""
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    return np.concatenate([frame.audio if len(frame.audio) else silence for frame in frames])
+
+
+def likeness(one, other):
+    """The largest correlation of two sounds, wherever they lie, and where the second lies in the first."""
+    size = len(one) + len(other)
+    together = np.fft.irfft(np.fft.rfft(one, size) * np.fft.rfft(other, size).conj(), size)
+    return together.max() / np.sqrt((one**2).sum() * (other**2).sum()), int(together.argmax())
+
+
+@pytest.mark.slow
+def test_what_is_played_is_what_is_heard(hear, play, tmp_path):
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")[: 3 * AUDIO_HZ]
+    soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
+    hearing = hear("mic:person")
+    play("person", tmp_path / "said.wav")
+    frames = hearing.seconds(5.0)
+    assert [frame.time_s for frame in frames] == pytest.approx(FRAME_S * np.arange(1, len(frames) + 1))
+    correlation, _ = likeness(heard(frames), said)
+    assert correlation > 0.95
+    told = hearing.source.statistics()["voice"]
+    assert told["device"] == "person.monitor" and told["state"] == "running" and told["voice_frames"] > 25
+    assert 0.0 < hearing.microphone.latency_s < 1.0
+
+
+@pytest.mark.slow
+def test_an_unplugged_microphone_is_lost_and_comes_back(hear, sound_server, caplog):
+    hearing = hear("mic:person.monitor")
+    hearing.seconds(0.4)
+    assert not hearing.microphone.lost
+    sound_server.unplug("person")
+    hearing.until(lambda: hearing.microphone.lost)
+    silent = hearing.seconds(0.4)
+    assert not any(len(frame.audio) for frame in silent)
+    sound_server.plug("person")
+    hearing.until(lambda: not hearing.microphone.lost)
+    again = hearing.seconds(1.0)
+    assert any(len(frame.audio) for frame in again)
+    assert [frame.time_s for frame in hearing.frames] == pytest.approx(FRAME_S * np.arange(1, len(hearing.frames) + 1))
+    assert [record.getMessage() for record in caplog.records] == [
+        "microphone: person.monitor",
+        "microphone: person.monitor gives no more sound; it is tried again until it is back",
+        "microphone is back",
+    ]
+
+
+@pytest.mark.slow
+def test_a_sound_server_that_is_started_again_is_found_again(hear, sound_server):
+    hearing = hear("mic")
+    hearing.seconds(0.4)
+    sound_server.stop()
+    hearing.until(lambda: hearing.microphone.lost)
+    sound_server.start("person")
+    hearing.until(lambda: not hearing.microphone.lost)
+    assert any(len(frame.audio) for frame in hearing.seconds(1.0))
+    assert hearing.microphone.statistics()["restarts"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("told_by", ["file", "device", "program"])
+def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_server, tmp_path, told_by):
+    """Its loudspeaker is heard by the microphone 50 ms later; nobody else speaks."""
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")[: 6 * AUDIO_HZ]
+    file = tmp_path / "said.wav"
+    soundfile.write(file, said, AUDIO_HZ)
+    sound_server.plug("robot")
+    sound_server.load("module-loopback", "source=robot.monitor", "sink=person", "latency_msec=50")
+    speech = PushedSpeech()
+    how = {"file": {"agent_audio": str(file)}, "device": {"agent_audio": "device:robot.monitor"}}
+    levels = []
+    for taken_out in (False, True):
+        hearing = hear("mic:person.monitor", **(how.get(told_by, {"agent": speech}) if taken_out else {}))
+        if taken_out:
+            speech.say(said, AUDIO_HZ)
+        play("robot", file)
+        frames = hearing.seconds(6.0)
+        levels.append(energy_db(heard(frames[75:])))
+        hearing.source.close()
+    assert levels[0] > -40.0
+    assert levels[1] < levels[0] - 15.0
+    assert any(frame.agent_audio is not None and frame.agent_audio.any() for frame in frames)
+
+
+def test_a_loudspeaker_is_heard_two_frames_late_without_a_microphone(sound_server):
+    with closing(open_loudspeaker("person.monitor")) as loudspeaker:
+        hearing = Hearing(open_source("none", "none", 1.0), loudspeaker._recorder)
+        loudspeaker.start(hearing.origin_s)
+        taken = []
+        while len(taken) < 5:
+            hearing.until(lambda: loudspeaker._recorder._worker._child.messages)
+            frame = loudspeaker.take(len(taken) + 2)
+            if frame is not None:
+                taken.append(frame)
+        assert all(frame.shape == (FRAME_SAMPLES,) for frame in taken)
+
+
+def test_a_device_that_is_not_there_is_one_line_with_the_choices(sound_server):
+    assert [device.label for device in sound_devices() if "hw:" not in device.name] == [
+        "0 pulse",
+        "1 default",
+        "person.monitor",
+    ]
+    for wanted, problem in (("nobody", "no such device"), ("7", "no such device"), ("p", "fits several devices")):
+        with pytest.raises(ConfigError, match=f"--audio mic:{wanted}: {problem} .*person.monitor") as raised:
+            open_microphone(wanted)
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("first_age_s", "expected_s"),
+    [
+        (0.03, 99.98),  # the newest of 10 ms is 20 ms old
+        (None, 100.0),  # no time stamp
+        (-0.005, 100.0),  # never after now
+        (1e6, 100.0),  # of another clock
+        (-1e6, 100.0),
+        (float("nan"), 100.0),
+    ],
+)
+def test_a_piece_came_when_its_device_says_so_where_that_can_be(first_age_s, expected_s):
+    assert captured_s(100.0, first_age_s, 0.01) == pytest.approx(expected_s)
+
+
+def test_the_microphone_is_told_of_every_frame_that_the_robot_says():
+    said = np.arange(40 * FRAME_SAMPLES, dtype=np.float32) / 1e5
+    own = OwnVoice(RecordedVoice(said))
+    for index in range(30):
+        assert own.ask(index + 1)
+        assert not own.ask(index + 1)
+        first, samples = own.newest()
+        np.testing.assert_array_equal(own.take(index + 1), said[(index + 1) * FRAME_SAMPLES :][:FRAME_SAMPLES])
+        begin = max(first, 1)  # frame 0 is over before anybody can ask
+        expected = said[begin * FRAME_SAMPLES : (index + 2) * FRAME_SAMPLES]
+        np.testing.assert_array_equal(samples[(begin - first) * FRAME_SAMPLES :], expected)
