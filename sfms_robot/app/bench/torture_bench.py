@@ -63,7 +63,7 @@ class Blow:
     Attributes:
         at_s: loop time.
         degraded_s: until the run said so, with the right reason.
-        well_s: from then on, until that reason was gone; a source or servo is away for 3 s of it.
+        well_s: from then on, or from the moment that the source or servo was back, until that reason was gone.
     """
 
     kind: str
@@ -114,12 +114,12 @@ class _Victim:
         except OSError as error:
             raise BusError(f"bench live: the run tells no status any more: {error}") from error
 
-    def strike(self, kind: str, chance: random.Random) -> tuple[str, str, Callable[[], None]]:
-        """Do it: what was hit, how the run calls it, and what ends it."""
+    def strike(self, kind: str, chance: random.Random) -> tuple[str, str, Callable[[], None] | None]:
+        """Do it: what was hit, how the run calls it, and what ends it; None: the run helps itself."""
         if kind in ("killed", "stopped"):
             (pid,) = [pid for role, pid in children(self.command.process.pid) if role == "listener"]
             os.kill(pid, signal.SIGKILL if kind == "killed" else signal.SIGSTOP)
-            return "listener", "listener", _nothing
+            return "listener", "listener", None
         if kind == "unplugged":
             joint = chance.choice(list(self.head.joints))
             servo = self.head.joints[joint].id
@@ -152,8 +152,9 @@ def _strike(victim: _Victim, order: Sequence[str], duration_s: float, seed: int,
         began_s = time.monotonic()
         what, why, end = victim.strike(kind, chance)
         degraded_s = victim.until(partial(_degraded_by, why, True), slot_s / 2)
-        time.sleep(max(0.0, began_s + _AWAY_S - time.monotonic()))
-        end()
+        if end is not None:
+            time.sleep(max(0.0, began_s + _AWAY_S - time.monotonic()))
+            end()
         well_s = victim.until(partial(_degraded_by, why, False), max(1.0, ends_s - time.monotonic()))
         blow = Blow(kind, what, at_s, _rounded(degraded_s), _rounded(well_s))
         blows.append(blow)
@@ -295,10 +296,6 @@ def _patient_head(folder: Path) -> Path:
     raw.pop("calibrate_first", None)
     (place / "head.yaml").write_text(yaml.safe_dump(raw, sort_keys=False), encoding="utf-8")
     return place
-
-
-def _nothing() -> None:
-    """The run helps itself."""
 
 
 def _rounded(value: float | None) -> float | None:
