@@ -75,7 +75,7 @@ def test_missed_ticks_are_laid_to_the_blow_before_them():
     "degraded_s, well_s, passed", [(0.9, 5.0, True), (None, 0.0, False), (2.5, 5.0, False), (0.9, None, False)]
 )
 def test_a_blow_passes_when_the_run_says_so_in_time_and_is_well_again(degraded_s, well_s, passed):
-    assert Blow("killed", "listener", 3.0, degraded_s, well_s).passed == passed
+    assert Blow("killed", "listener", "listener", 3.0, degraded_s, well_s).passed == passed
 
 
 def test_a_figure_that_was_not_measured_is_neither_met_nor_missed():

@@ -48,7 +48,7 @@ MINUTES: Final = 30.0
 EACH: Final = 20  # of a kind, in half an hour
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
 LONGEST_S: Final[Mapping[str, float]] = {"killed": 1.0, "stopped": 1.0, "cut": 1.0, "unplugged": 1.5}
-LOOK_S: Final = 0.05  # between two looks at the status: a state may be seen so much later, and a request more
+LOOK_S: Final = 0.1  # between two looks at the status, all the time: a state may be seen so much later
 _TOLERANCE_S: Final = 0.3
 _AWAY_S: Final = 3.0  # of a source or a servo
 _START_S: Final = 60.0
@@ -61,6 +61,7 @@ class Blow:
     """One thing that happened. Times in seconds; None: not within its slot.
 
     Attributes:
+        why: by which name the run has to be degraded.
         at_s: loop time.
         degraded_s: until the run said so, with the right reason.
         well_s: from then on, or from the moment that the source or servo was back, until that reason was gone.
@@ -68,6 +69,7 @@ class Blow:
 
     kind: str
     what: str
+    why: str
     at_s: float
     degraded_s: float | None
     well_s: float | None
@@ -147,21 +149,25 @@ def _strike(victim: _Victim, order: Sequence[str], duration_s: float, seed: int,
     blows = []
     for number, kind in enumerate(order):
         ends_s = time.monotonic() + slot_s
-        time.sleep(chance.uniform(0.0, slot_s / 5))
+        victim.until(_never, chance.uniform(0.0, slot_s / 5))
         at_s = victim.status()["time_s"]
         began_s = time.monotonic()
         what, why, end = victim.strike(kind, chance)
         degraded_s = victim.until(partial(_degraded_by, why, True), slot_s / 2)
         if end is not None:
-            time.sleep(max(0.0, began_s + _AWAY_S - time.monotonic()))
+            victim.until(_never, began_s + _AWAY_S - time.monotonic())
             end()
         well_s = victim.until(partial(_degraded_by, why, False), max(1.0, ends_s - time.monotonic()))
-        blow = Blow(kind, what, at_s, _rounded(degraded_s), _rounded(well_s))
+        blow = Blow(kind, what, why, at_s, _rounded(degraded_s), _rounded(well_s))
         blows.append(blow)
         told = f"degraded after {blow.degraded_s} s, well after {blow.well_s} s"
         say(f"{number + 1} of {len(order)}: {kind} {what}: {told}")
-        time.sleep(max(0.0, ends_s - time.monotonic()))
+        victim.until(_never, ends_s - time.monotonic())
     return blows
+
+
+def _never(_: Mapping[str, Any]) -> bool:
+    return False
 
 
 def _degraded_by(why: str, wanted: bool, status: Mapping[str, Any]) -> bool:
@@ -171,7 +177,8 @@ def _degraded_by(why: str, wanted: bool, status: Mapping[str, Any]) -> bool:
 def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torque: Sequence[int]) -> dict[str, Any]:
     recording = read_recording(folder)
     missed = missed_ticks(recording.times_s, [blow.at_s for blow in blows])
-    told = [state for _, state, _ in states_of(folder)]
+    states = states_of(folder)
+    recorded = sum(_recorded(blow, states) for blow in blows)
     changes = [each["state"] for each in report["states"]["changes"]]
     counts = {
         kind: {
@@ -188,7 +195,7 @@ def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torq
         and not torque
         and recording.whole
         and report["exit"] == "interrupted"
-        and "degraded" in told
+        and recorded == len(blows)
     )
     return {
         "passed": passed,
@@ -199,12 +206,18 @@ def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torq
         "ticks": report["ticks"],
         "exit": report["exit"],
         "torque_left_on": list(torque),
-        "recording": {"whole": recording.whole, "ticks": len(recording.times_s), "states": len(told)},
+        "recording": {"whole": recording.whole, "ticks": len(recording.times_s), "blows": recorded},
         "states": {"changes": len(changes), "seconds": report["states"]["seconds"]},
         "listener": report["listener_state"],
         "violations": report["limits"]["violations"],
         "blows": [asdict(blow) | {"passed": blow.passed} for blow in blows],
     }
+
+
+def _recorded(blow: Blow, states: Sequence[tuple[float, str, tuple[str, ...]]]) -> bool:
+    """Whether the recording holds that the run was degraded by it, in time."""
+    until_s = blow.at_s + LONGEST_S[blow.kind] + _TOLERANCE_S
+    return any(blow.at_s <= at_s <= until_s and blow.why in why for at_s, state, why in states if state == "degraded")
 
 
 def missed_ticks(times_s: Any, blows_s: Sequence[float]) -> dict[str, float]:
