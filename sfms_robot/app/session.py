@@ -14,8 +14,8 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.limitation import limitation
-from sfms_robot.app.listen.report import run_report
+from sfms_robot.app.listen.report import figures_so_far, run_report
+from sfms_robot.app.listen.run_facts import run_facts
 from sfms_robot.app.listen.status_server import status_server
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
@@ -64,6 +65,8 @@ logger = logging.getLogger(__name__)
 SIM_READ_DEADLINE_S: Final = 0.02  # an emulator shares the computer's cores: it may be late without being silent
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 INTERRUPTED: Final = 130
+
+Panel = Callable[[Callable[[], Mapping[str, Any]], Interrupt, HaltLatch], AbstractContextManager[object]]
 
 
 # --- a head and its servos ------------------------------------------------------------------------------------------
@@ -311,11 +314,18 @@ class Drove:
         return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
-def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, signals: bool = True) -> Drove:
+def run_log(opened: OpenHead) -> RunLog:
+    """An empty one, for `drive_head`."""
+    return RunLog(opened.motion.retargeter.joints, 1.0 / opened.rate_hz, opened.motion.audit)
+
+
+def drive_head(
+    opened: OpenHead, programme: Programme, interrupt: Interrupt, *, signals: bool = True, log: RunLog | None = None
+) -> Drove:
     """Torque on, the loop, rest, torque off. Blocks until then.
 
     An exception on the way is kept, not raised: the head is at rest and the report is still to be made. `signals`:
-    Ctrl-C and the like ask `interrupt`; main thread only.
+    Ctrl-C and the like ask `interrupt`; main thread only. `log`: is filled; for who reads it meanwhile.
     """
     motion = opened.motion
     parts = Parts(
@@ -324,7 +334,7 @@ def drive_head(opened: OpenHead, programme: Programme, interrupt: Interrupt, *, 
         motion.rest_rad, programme.life, programme.knobs, programme.overlay, programme.answers, programme.halt,
         motion.holds, motion.heat, frozenset(opened.options.without),
     )  # fmt: skip
-    log = RunLog(motion.retargeter.joints, 1.0 / opened.rate_hz, motion.audit)
+    log = run_log(opened) if log is None else log
     duration_s = math.inf if programme.duration_s is None else programme.duration_s
     real = not opened.options.fast
     outcome, error = "failed", None
@@ -386,7 +396,7 @@ class RunOptions:
 
 def run(
     options: RunOptions,
-    progress: Callable[[float | None], Observer] | None = None,
+    panel: Panel | None = None,
     *,
     source: Source | None = None,
     feed: PlanFeed | None = None,
@@ -403,7 +413,7 @@ def run(
     torque came on nothing is raised any more: the report says `"exit": "failed"` and why, the head is at rest.
 
     Args:
-        progress: makes an observer that shows a run of that many seconds.
+        panel: from the status document, what ends and what halts the run: shows it, and takes keys, while inside.
         source, feed: instead of those that the options name.
         knobs: from the retargeter of the opened head, what is asked at every tick; None: the options' own.
         observers, overlay: see `Programme`.
@@ -443,14 +453,24 @@ def run(
             feed.choose_hop_by(lambda: source.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
         turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
         recorder = _recorder(options, opened.config)
+        log = run_log(opened)
+        facts = {
+            "head": opened.config.name, "port": options.port, "listener": Path(options.listener).name,
+            "duration_s": duration_s,
+        }  # fmt: skip
         status = RunStatus(
             list(opened.config.joints),
-            {"head": opened.config.name, "port": options.port, "listener": Path(options.listener).name},
-            lambda: {"source": dict(source.statistics()), "listener_state": dict(feed.statistics())},
+            facts,
+            lambda: {
+                **figures_so_far(log, opened.rate_hz, real=not options.fast),
+                "source": dict(source.statistics()),
+                "listener_state": dict(feed.statistics()),
+            },
         )
-        own = [each for each in (recorder, progress(duration_s) if progress else None) if each is not None]
-        for observer in own:
-            stack.callback(observer.close)
+        if recorder is not None:
+            stack.callback(recorder.close)
+        if panel is not None:
+            stack.enter_context(panel(status.document, interrupt, halt))
         if options.status is not None:
             port = stack.enter_context(status_server(options.status, status.document))
             logger.warning("status: http://127.0.0.1:%d/", port)
@@ -461,9 +481,9 @@ def run(
             overlay=overlay,
             answers=True,
             halt=halt,
-            observers=[status, *observers, *own],
+            observers=[status, *observers, *([] if recorder is None else [recorder])],
         )  # fmt: skip
-        drove = drive_head(opened, programme, interrupt, signals=False)
+        drove = drive_head(opened, programme, interrupt, signals=False, log=log)
         report = run_report(
             drove.log, opened.bus, feed, head=opened.config.name, listener=Path(options.listener).name,
             port=options.port, seed=options.seed, outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz,
@@ -500,12 +520,7 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
 def _recorder(options: RunOptions, head: Head) -> Recorder | None:
     if options.record is None:
         return None
-    about = {
-        "head": head.name,
-        "listener": Path(options.listener).name,
-        "seed": str(options.seed),
-        "audio": Path(options.hears).name,
-    }
+    about = run_facts(head, options.listener, asdict(options) | {"audio": options.hears})
     when_full: FullPolicy = "wait" if options.fast else "drop"
     return Recorder(options.record, list(head.joints), when_full=when_full, about=about)
 

@@ -34,13 +34,13 @@ def demo(
 
     check_names(head=head, listener=listener)
     from sfms_robot.app.listen import demo as app
-    from sfms_robot.app.listen.progress import RunProgress
+    from sfms_robot.app.listen.panel import live_panel
 
     options = app.DemoOptions(head, listener, seed, duration, fast or seeds is not None, out)
     if seeds is not None:
         told = app.compare_seeds(options, seeds, lambda row: print(_line(row), file=sys.stderr))
     else:
-        told = app.demo(options, RunProgress)
+        told = app.demo(options, None if json else live_panel)
     if json:
         print(json_module.dumps(told))
     elif seeds is None:

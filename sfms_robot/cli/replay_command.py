@@ -1,25 +1,51 @@
-"""`sfms-robot replay`: look at a recorded run."""
+"""`sfms-robot replay`: look at a recorded run, or let a head do it again."""
 
 from __future__ import annotations
 
 import json as json_module
+import sys
 from pathlib import Path
 
 import typer
 
+from sfms_robot.cli import names
+from sfms_robot.errors import ConfigError
+
 
 def replay(
     folder: Path = typer.Argument(..., metavar="DIR", help="Folder that `sfms-robot run --record` wrote."),
-    plot: Path | None = typer.Option(None, help="PNG: voice, head pose, six face channels, joint angles over time."),
+    plot: Path | None = typer.Option(
+        None, help="PNG: states and events, voice, head pose, six face channels, joint angles over time."
+    ),
     sheet: Path | None = typer.Option(None, help="PNG: the virtual head at twelve instants of the run."),
+    port: str | None = typer.Option(
+        None, help="Drive a head with the recorded face: 'sim', 'auto', a device, or NAME=DEVICE per bus."
+    ),
+    head: str | None = typer.Option(
+        None, autocompletion=names.heads, help="With --port: another head than the recorded one."
+    ),
+    fast: bool = typer.Option(False, "--fast", help="With --port sim: virtual time."),
+    yes: bool = typer.Option(False, "--yes", help="With --port: hobby servos may jump when they come on."),
     json: bool = typer.Option(False, "--json", help="Print what was found as one JSON object."),
 ) -> None:
-    """Draw a recorded run, or say what is in it."""
+    """Draw a recorded run, drive a head with it, or say what is in it."""
+    if port is None and (head is not None or fast or yes):
+        raise ConfigError("--head, --fast and --yes are of a head that is driven: add --port (sim, or a device)")
     from sfms_robot.app.replay import replay_run
 
-    summary = replay_run(folder, plot, sheet)
+    told = replay_run(folder, plot, sheet)
+    if port is not None:
+        from sfms_robot.app.listen.panel import live_panel
+        from sfms_robot.app.replay.run_playback import PlaybackOptions, play_back
+
+        played = play_back(folder, PlaybackOptions(head, port, fast, yes), None if json else live_panel)
+        told = {**played, "recording": told}
     if json:
-        print(json_module.dumps(summary))
+        print(json_module.dumps(told))
     else:
-        for key, value in summary.items():
-            print(f"{key}: {value}")
+        for key, value in told.items():
+            if not isinstance(value, dict):
+                print(f"{key}: {value}")
+    if told.get("error"):
+        print(f"sfms-robot: {told['error']}", file=sys.stderr)
+    raise typer.Exit(told.get("exit_code", 0))

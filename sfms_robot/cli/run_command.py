@@ -123,13 +123,13 @@ def run(
         # The listener loads from here on, in a process of its own, while this one imports what drives a head.
         feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(listener, seed)))
         from sfms_robot.app import session
-        from sfms_robot.app.listen.progress import RunProgress
+        from sfms_robot.app.listen.panel import live_panel
 
         options = session.RunOptions(
             head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
             tuple(intensity), tuple(style), tuple(without), halt_on, status,
         )  # fmt: skip
-        report = session.run(options, RunProgress, feed=feed)
+        report = session.run(options, None if json else live_panel, feed=feed)
     if json:
         print(json_module.dumps(report))
     else:

@@ -41,7 +41,6 @@ class HaltLatch:
             if self._by is None:
                 self._by, self._answered = by, False
                 self._changed.notify_all()
-                log.warning("halted: %s", by)
 
     def open(self) -> None:
         """A person lets the head go on. Nothing happens to a latch that is open."""

@@ -53,9 +53,23 @@ class EventCounter:
         self._before = 0  # values of the block before, at the front
         self._counted = 0
         self._counting: Future[int] | None = None
+        self._looking: Future[None] | None = None
+        self._look_wanted = False
+        self._so_far = 0
+
+    @property
+    def so_far(self) -> int:
+        """Events as of the newest look at the unfinished block, and asks for another. From any thread; never blocks."""
+        self._look_wanted = True
+        return self._so_far
 
     def add(self, value: float) -> None:
         self._values.append(value)
+        if self._look_wanted and (self._looking is None or self._looking.done()):
+            self._look_wanted = False
+            self._looking = self._worker.submit(
+                self._look, self._counted, self._counting, tuple(self._values), self._before
+            )
         if len(self._values) >= self._before + self._block + self._margin:
             self._collect()
             last = self._before + self._block
@@ -66,6 +80,11 @@ class EventCounter:
         """Events so far, those in the unfinished block included. Blocks for the block that is being counted."""
         self._collect()
         return self._counted + self._starting(self._values, self._before, len(self._values))
+
+    def _look(self, counted: int, counting: Future[int] | None, values: Sequence[float], before: int) -> None:
+        """In the worker, which has counted the block before by then: it does one thing after the other."""
+        block = 0 if counting is None else counting.result()
+        self._so_far = counted + block + self._starting(values, before, len(values))
 
     def _collect(self) -> None:
         """The block before was given twenty seconds."""
@@ -80,7 +99,10 @@ class EventCounter:
 
 @dataclass
 class RunLog:
-    """Filled by the loop, read once at the end. `period_s` is the tick's."""
+    """Filled by the loop, read at the end; `motion_so_far`, counters and quantiles also by other threads meanwhile.
+
+    `period_s` is the tick's.
+    """
 
     joints: Sequence[str]
     period_s: float
@@ -205,6 +227,10 @@ class RunLog:
     def motion_report(self) -> dict[str, int]:
         """`motion` of the report."""
         return {f"{name}s": counter.total() for name, counter in self._counters.items()}
+
+    def motion_so_far(self) -> dict[str, int]:
+        """The same while it runs, as old as the last time that it was asked for. From any thread."""
+        return {f"{name}s": counter.so_far for name, counter in self._counters.items()}
 
     def tick_report(self, target_hz: float, elapsed_s: float | None) -> dict[str, Any]:
         """`tick` of the report; wall-clock figures are null where there is no wall clock (`elapsed_s` None)."""

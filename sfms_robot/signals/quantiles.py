@@ -17,6 +17,7 @@ class Quantiles:
     """Takes values one at a time.
 
     Values are sorted into bins whose ends grow by two percent each; nothing else of them is kept once there are many.
+    One thread adds; any thread may read meanwhile.
     """
 
     def __init__(self) -> None:
@@ -30,22 +31,23 @@ class Quantiles:
 
     def add(self, value: float) -> None:
         """A value that is not negative and not NaN."""
-        self._count += 1
         self._largest = max(self._largest, value)
         if len(self._bins):
             self._bins[_bin(value)] += 1
-            return
-        self._values.append(value)
-        if len(self._values) > _EXACT:
-            self._bins = np.bincount([_bin(each) for each in self._values], minlength=_BINS)
-            self._values = []
+        else:
+            self._values.append(value)
+            if len(self._values) > _EXACT:
+                self._bins = np.bincount([_bin(each) for each in self._values], minlength=_BINS)
+                self._values = []
+        self._count += 1  # last: who reads meanwhile finds what is counted
 
     def at(self, percent: float) -> float:
         """The value that `percent` of all do not exceed; 100 is the largest. Raises ValueError when there is none."""
         if not self._count:
             raise ValueError("no value was taken")
+        values = self._values  # before the bins: they come first when one takes the other's place
         if not len(self._bins):
-            return float(np.percentile(self._values, percent))
+            return float(np.percentile(values, percent))
         if percent >= 100.0:
             return self._largest
         place = int(np.searchsorted(np.cumsum(self._bins), percent / 100.0 * self._count, side="left"))

@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 
 from sfms_robot.app.replay import plot, read_recording, sheet, summary
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_S, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
 from sfms_robot.runtime import recorder as recorder_module
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
@@ -29,8 +29,10 @@ def record(folder, seconds=2.0, voice=True):
             recorder.heard(SpeakerFrame(time_s + 0.04, audio, face))
             recorder.planned(Plan(time_s, np.array([time_s + 0.04]), np.zeros((1, 58), dtype=np.float32)))
         goals = np.array([0.2 * np.sin(time_s), time_s / 10, 0.0])
-        readings = {"neck_pitch": Reading(goals[0], 0.01), "jaw": Reading(None, float("inf"), "silent")}
-        recorder.tick(Tick(time_s, rng.uniform(0, 1, 58).astype(np.float32), goals, readings))
+        warmth = {"temperature_C": 40.0 + round(time_s)}
+        readings = {"neck_pitch": Reading(goals[0], 0.01, extra=warmth), "jaw": Reading(None, float("inf"), "silent")}
+        state, why = ("listening", ()) if n < 150 else ("halted", ("key",))
+        recorder.tick(Tick(time_s, rng.uniform(0, 1, 58).astype(np.float32), goals, readings, state, why))
     recorder.close()
     return folder
 
@@ -45,6 +47,26 @@ def test_what_was_recorded_is_read_back(tmp_path):
     assert run.faults.any(axis=0).tolist() == [False, True, False]
     assert run.motion.shape == (200, 58) and len(run.audio) == 50 * 640
     assert np.isnan(run.speaker[1::2]).all() and (run.speaker[::2] == 0.25).all()
+
+
+def test_states_and_what_servos_tell_are_read_back(tmp_path):
+    run = read_recording(record(tmp_path))
+    assert run.states == [(0.0, "listening", ()), (1.5, "halted", ("key",))]
+    np.testing.assert_allclose(run.servos_s, [0.0, 1.0])
+    assert set(run.servos) == {"temperature_C"}
+    np.testing.assert_array_equal(run.servos["temperature_C"], [[40.0, np.nan, np.nan], [41.0, np.nan, np.nan]])
+
+
+def test_events_that_plans_held_are_read_back(tmp_path):
+    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    recorder.tick(Tick(0.0, np.zeros(58, np.float32), np.zeros(3), {}))
+    times_s = np.arange(1, 51) * FRAME_S
+    frames = np.zeros((50, 58), np.float32)
+    frames[20:23, [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]] = 1.0
+    recorder.planned(Plan(0.0, times_s, frames))
+    recorder.close()
+    ((start_s, kind),) = read_recording(tmp_path).events
+    assert kind == "blink" and start_s == pytest.approx(times_s[20], abs=2 * FRAME_S)
 
 
 def test_reading_holds_numbers_and_no_messages(tmp_path):
@@ -88,7 +110,7 @@ def test_a_summary_counts(tmp_path):
     assert counted.pop("started_utc").startswith("20")
     assert counted == {
         "head": "face28", "seed": "3", "duration_s": 1.99, "ticks": 200, "speaker_frames": 50, "plans": 50,
-        "joints": 3, "faults": 1, "whole": True,
+        "events": {}, "states": ["listening", "halted"], "hottest_C": 41.0, "joints": 3, "faults": 1, "whole": True,
     }  # fmt: skip
 
 

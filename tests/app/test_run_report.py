@@ -4,6 +4,7 @@ import json
 import resource
 import subprocess
 import sys
+from contextlib import contextmanager
 
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.errors import ModelError
@@ -32,6 +33,23 @@ def test_a_disk_that_is_full_costs_the_recording_and_neither_the_run_nor_its_rep
     report = json.loads(out.splitlines()[-1])
     assert (code, report["exit"], report["frames"]) == (0, "done", 50)
     assert "too large" in report["recording"]["trouble"] and "the recording ends here" in err
+
+
+def test_who_watches_a_run_sees_the_figures_of_its_report_as_they_grow():
+    documents = []
+
+    @contextmanager
+    def panel(document, interrupt, halt):
+        documents.append(document())
+        yield
+        documents.append(document())
+
+    report = run(RunOptions(head=HEAD, duration_s=1.0, fast=True), panel)
+    before, after = documents
+    assert (before["ticks"], before["frames"], before["state"]) == (0, 0, "starting")
+    for key in ("head", "listener", "ticks", "frames", "tick", "latency_ms"):
+        assert after[key] == report[key]
+    assert set(after["motion"]) == set(report["motion"]) and after["duration_s"] == report["duration_s"]
 
 
 class Broken(Source):

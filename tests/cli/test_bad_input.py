@@ -1,5 +1,6 @@
 """Every kind of bad input is one line on stderr that names file, key, value and choices; the exit code says which."""
 
+import socket
 from pathlib import Path
 
 import pytest
@@ -156,3 +157,21 @@ def test_a_flag_of_the_wrong_kind(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["run", "--duration", "long"])
     assert ended.value.code == 2 and "--duration" in capsys.readouterr().err
+
+
+def test_a_status_port_that_is_in_use(fails):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        code, told = fails("run", "--fast", "--duration", "0.2", "--head", "interbotix_wxxms", "--status", port)
+    assert code == 3 and f"--status {port}: Address already in use" in told and "0 for a free one" in told
+
+
+def test_a_halt_switch_that_cannot_be_one(fails, tmp_path):
+    (tmp_path / "there").touch()
+    for where, why in (
+        (tmp_path / "none" / "halt", "no such folder"),
+        (tmp_path / "there", "is there already"),
+        ("/dev/gpiochip999:4", "No such file or directory"),
+    ):
+        code, told = fails("run", "--fast", "--duration", "0.2", "--head", "interbotix_wxxms", "--halt-on", where)
+        assert code == 2 and f"--halt-on {where}" in told and why in told

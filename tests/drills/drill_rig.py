@@ -1,10 +1,15 @@
 """The command line in processes of its own, on emulated servos in real time, and what an onlooker sees of both."""
 
+import fcntl
 import os
+import pty
 import subprocess
 import sys
+import termios
+import threading
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,15 +34,50 @@ class Ended(NamedTuple):
     err: str
 
 
-class Command:
-    """A command line that runs. `stderr` is a file descriptor, or None for a pipe that `ended` reads."""
+class Terminal:
+    """What a program shows on a terminal."""
 
-    def __init__(self, *words, stderr=None, **environment):
+    def __init__(self):
+        self._near, self.far = pty.openpty()
+        self.shown = b""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self):
+        while True:
+            try:
+                part = os.read(self._near, 4096)
+            except OSError:  # nobody has the far end any more
+                return
+            if not part:
+                return
+            self.shown += part
+
+    def press(self, keys):
+        os.write(self._near, keys)
+
+    def closed(self):
+        """All that was shown."""
+        os.close(self.far)
+        self._reader.join()
+        os.close(self._near)
+        return self.shown
+
+
+class Command:
+    """A command line that runs. `stderr` is a file descriptor, or None for a pipe that `ended` reads.
+
+    `keyboard`: far end of a terminal, which controls the command and is its stdin.
+    """
+
+    def __init__(self, *words, stderr=None, keyboard=None, **environment):
         paths = os.pathsep.join([*environment.pop("paths", []), str(CHECKOUT)])
         env = {**os.environ, "PYTHONPATH": paths, **environment}
         self.process = subprocess.Popen(
             [*START, *map(str, words)],
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL if keyboard is None else keyboard,
+            start_new_session=keyboard is not None,
+            preexec_fn=None if keyboard is None else partial(fcntl.ioctl, 0, termios.TIOCSCTTY, 0),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE if stderr is None else stderr,
             text=True,

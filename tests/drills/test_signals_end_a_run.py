@@ -2,15 +2,14 @@
 
 import json
 import os
-import pty
 import signal
-import threading
 
 import pytest
 from drill_rig import (
     DURATION_S,
     PAN,
     Command,
+    Terminal,
     connecting,
     enabling,
     listening,
@@ -46,33 +45,6 @@ def test_a_signal_ends_a_run_without_torque_and_without_a_word(phase, number, sl
     assert code == 130
     assert [line for line in err.splitlines() if not line.startswith("WARNING: ")] == []  # of a computer that is busy
     assert json.loads(out.splitlines()[-1])["exit"] == "interrupted"
-
-
-class Terminal:
-    """What a program shows on a terminal."""
-
-    def __init__(self):
-        self._near, self.far = pty.openpty()
-        self.shown = b""
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self):
-        while True:
-            try:
-                part = os.read(self._near, 4096)
-            except OSError:  # nobody has the far end any more
-                return
-            if not part:
-                return
-            self.shown += part
-
-    def closed(self):
-        """All that was shown."""
-        os.close(self.far)
-        self._reader.join()
-        os.close(self._near)
-        return self.shown
 
 
 def once(running, chain):

@@ -11,6 +11,7 @@ from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.retarget.kinematics.rotations import rotation
 from sfms_robot.signals.eye_angles import directions
 
 FULL_RAD = np.radians([30.0, 20.0])
@@ -36,13 +37,16 @@ def turned(name, intensity, style):
 @settings(max_examples=10, deadline=None)
 @given(**knobs, turn=turns, shift=shifts)
 @example(intensity=2.0, style=1.0, turn=(0.0, 0.5, 1.0), shift=(0.0, 0.0, 0.0))
+@example(intensity=2.0, style=0.0, turn=(0.0, 0.875, 0.0), shift=(0.0, 0.0, 0.0))
 def test_the_pose_that_is_said_to_be_shown_is_the_one_that_the_joints_give(name, intensity, style, turn, shift):
     retargeter, knobs = turned(name, intensity, style)
     motion = np.zeros((1, MOTION_DIM), np.float32)
     motion[0, :6] = [*turn, *shift]
     shown = retargeter.shown_pose(motion, knobs)
     given_rad = retargeter.angles(motion[0], knobs)[retargeter.neck_columns]
-    assert shown == pytest.approx(retargeter.neck.forward(given_rad[None], shown), abs=1e-6)
+    forward = retargeter.neck.forward(given_rad[None], shown)
+    assert rotation(shown[:, :3]) == pytest.approx(rotation(forward[:, :3]), abs=1e-6)  # past 90 degrees of pitch too
+    assert shown[:, 3:] == pytest.approx(forward[:, 3:], abs=1e-6)
 
 
 @pytest.mark.parametrize("name", RETARGETERS)

@@ -46,6 +46,19 @@ def test_events_counted_in_blocks_are_those_of_the_whole(seconds, seed, worker):
         assert counter.total() == whole and (whole > 0 or seconds < 10)
 
 
+def test_events_so_far_are_those_of_the_part_that_was_looked_at(worker):
+    pitch, _, _ = talkative(60.0, 0)
+    counter, looks = EventCounter(find_nods, RATE_HZ, worker), []
+    for n, value in enumerate(pitch):
+        counter.add(float(value))
+        if n % 500 == 499:
+            assert counter.so_far >= (looks[-1][1] if looks else 0)  # asks; the next value brings the look
+            counter.add(float(pitch[n]))
+            worker.submit(int).result()  # it does one thing after the other
+            looks.append((n, counter.so_far))
+    assert looks[-1][1] >= 5 and abs(looks[-1][1] - counter.total()) <= 1
+
+
 class NoAudit:
     """The audit's part is not what grows."""
 

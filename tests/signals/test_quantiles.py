@@ -1,5 +1,7 @@
 """Quantiles in fixed memory: exact while values are few, within one percent after that."""
 
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -41,3 +43,22 @@ def test_nothing_taken_is_none_in_a_report_and_an_error_when_asked():
     assert Quantiles().report(p50=50) == {"p50": None}
     with pytest.raises(ValueError, match="no value"):
         Quantiles().at(50)
+
+
+def test_any_thread_may_read_while_one_adds():
+    quantiles, wrong = Quantiles(), []
+    over = threading.Event()
+
+    def read():
+        while not over.is_set():
+            told = quantiles.report(p50=50, p100=100)
+            if told["p50"] is not None and not 0.0 <= told["p50"] <= told["p100"]:
+                wrong.append(told)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for n in range(12_000):
+        quantiles.add(float(n % 7))
+    over.set()
+    reader.join()
+    assert not wrong and quantiles.at(50) == pytest.approx(3.0, rel=0.02)

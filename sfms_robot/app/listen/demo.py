@@ -13,7 +13,6 @@ import numpy as np
 from sfms_robot.app import session
 from sfms_robot.config import load_head
 from sfms_robot.errors import MissingExtra
-from sfms_robot.ports import Observer
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 
@@ -40,13 +39,13 @@ class DemoOptions:
         )  # fmt: skip
 
 
-def demo(options: DemoOptions, progress: Callable[[float | None], Observer] | None = None) -> dict[str, Any]:
+def demo(options: DemoOptions, panel: session.Panel | None = None) -> dict[str, Any]:
     """Run once, record it, draw it. Blocks for the length of the run and some seconds. Raises RobotError.
 
     Where the pictures' packages are not installed the run is as good as any; `"missing"` names the pip install.
     """
     folder = options.folder if options.folder is not None else free_folder(Path(FOLDER))
-    report = session.run(options.run(options.seed, folder), progress)
+    report = session.run(options.run(options.seed, folder), panel)
     told = {**_summary(options, report), "folder": str(folder), "pictures": [], "missing": None, "report": report}
     if report["exit"] == "failed" or not report["ticks"]:  # interrupted before it began: nothing to draw
         return told

@@ -40,10 +40,7 @@ def run_report(
         "frames": log.frames,
         "ticks": log.ticks,
         "tick": log.tick_report(rate_hz, elapsed_s),
-        "latency_ms": {
-            "frame_to_wire": log.frame_to_wire_ms.report(p50=50, p99=99) if real else {"p50": None, "p99": None},
-            "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},
-        },
+        "latency_ms": _latency(log, real),
         "listener_step_ms": heard.pop("step_ms"),
         "hop": heard.pop("hop", None),
         "budget_ms": heard.pop("budget_ms", None),
@@ -61,6 +58,27 @@ def run_report(
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),
         "priority": priority,
+    }
+
+
+def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> dict[str, Any]:
+    """Those figures of the report that are known while it runs, under the report's names. From any thread.
+
+    `real` False means virtual time.
+    """
+    return {
+        "frames": log.frames,
+        "ticks": log.ticks,
+        "tick": log.tick_report(rate_hz, log.listened_s + (1 + log.eased) * log.period_s if real else None),
+        "latency_ms": _latency(log, real),
+        "motion": log.motion_so_far(),
+    }
+
+
+def _latency(log: RunLog, real: bool) -> dict[str, Any]:
+    return {
+        "frame_to_wire": log.frame_to_wire_ms.report(p50=50, p99=99) if real else {"p50": None, "p99": None},
+        "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},
     }
 
 

@@ -7,6 +7,7 @@ import json
 import math
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
+from sfms_robot.app.listen.run_facts import LONG
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
 from sfms_robot.runtime.recorder import RUN_FILE, parts_of
@@ -39,6 +41,10 @@ class RunRecording:
         heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
         energy_db: (M,). speaker: (M, 58) NaN where no face was seen.
         plans: how many the listener made.
+        states: (time_s, name, why) of every change, in order; none in a file of version 0.1.
+        events: (start_s, kind) of the nods, blinks and smiles that plans held.
+        servos_s: (K,) when servos told the rest of what they tell. servos: (K, J) by name, such as temperature_C; NaN
+            where one did not.
         whole: the file has its end.
     """
 
@@ -54,6 +60,10 @@ class RunRecording:
     energy_db: Doubles
     speaker: Floats
     plans: int
+    states: Sequence[tuple[float, str, tuple[str, ...]]]
+    events: Sequence[tuple[float, str]]
+    servos_s: Doubles
+    servos: Mapping[str, Floats]
     whole: bool
 
     @property
@@ -128,15 +138,24 @@ def states_of(folder: Path) -> list[tuple[float, str, tuple[str, ...]]]:
 def summary(recording: RunRecording) -> dict[str, Any]:
     """What is in a recording, for the command line."""
     return {
-        **{key: value for key, value in recording.about.items() if key != "joints"},
+        **{key: value for key, value in recording.about.items() if key not in LONG},
         "duration_s": round(recording.duration_s, 3),
         "ticks": len(recording.times_s),
         "speaker_frames": len(recording.heard_s),
         "plans": recording.plans,
+        "events": dict(Counter(kind for _, kind in recording.events)),
+        "states": [name for _, name, _ in recording.states],
         "joints": len(recording.joints),
         "faults": int(recording.faults.any(axis=0).sum()),
+        "hottest_C": _hottest(recording.servos.get("temperature_C")),
         "whole": recording.whole,
     }
+
+
+def _hottest(temperatures_C: Floats | None) -> float | None:
+    if temperatures_C is None or np.isnan(temperatures_C).all():
+        return None
+    return round(float(np.nanmax(temperatures_C)), 1)
 
 
 def _records(file: Path) -> Iterator[tuple[str, Any]]:
@@ -165,6 +184,10 @@ class _Found:
         self._times_s, self._heard_s, self._energy_db = (array("d") for _ in range(3))
         self._motion, self._goals_rad, self._present_rad, self._speaker = (array("f") for _ in range(4))
         self._faults, self._pcm16 = bytearray(), bytearray()
+        self._states: list[tuple[float, str, tuple[str, ...]]] = []
+        self._events: list[tuple[float, str]] = []
+        self._servos_s = array("d")
+        self._servos: dict[str, array[float]] = {}
 
     @property
     def ticks(self) -> int:
@@ -189,12 +212,27 @@ class _Found:
             self._energy_db.append(value["energy_db"])
             self._speaker.extend(_by_channel(value["face"]))
             self._pcm16 += _samples(value)
+        elif kind == "/state":
+            self._states.append((value["time_s"], value["state"], tuple(value["why"])))
+        elif kind == "/event":
+            self._events.append((value["start_s"], value["kind"]))
+        elif kind == "/servos":
+            self._told(value["time_s"], value["servos"])
 
     def _tick(self, time_s: float, joints: Sequence[Mapping[str, Any]]) -> None:
         self._times_s.append(time_s)
         self._goals_rad.extend(joint["goal_rad"] for joint in joints)
         self._present_rad.extend(_or_nan(joint["present_rad"]) for joint in joints)
         self._faults += bytes(joint["fault"] is not None for joint in joints)
+
+    def _told(self, time_s: float, servos: Mapping[str, Mapping[str, Any]]) -> None:
+        """A row of J for every name that any servo ever told, NaN before it was first told."""
+        before = len(self._servos_s) * len(self._joints)
+        for name in {name for told in servos.values() for name in told} - {"fault", *self._servos}:
+            self._servos[name] = array("f", [math.nan] * before)
+        for name, values in self._servos.items():
+            values.extend(_or_nan(servos.get(joint, {}).get(name)) for joint in self._joints)
+        self._servos_s.append(time_s)
 
     def recording(self) -> RunRecording:
         count, ticks = len(self._joints), self.ticks
@@ -213,6 +251,10 @@ class _Found:
             np.array(self._energy_db),
             np.array(self._speaker, dtype=np.float32).reshape(-1, MOTION_DIM),
             self._plans,
+            self._states,
+            self._events,
+            np.array(self._servos_s),
+            {name: np.array(values, np.float32).reshape(-1, count) for name, values in self._servos.items()},
             self.whole,
         )
 

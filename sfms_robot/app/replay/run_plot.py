@@ -27,6 +27,13 @@ _NECK_JOINTS: Final = 3
 _COMING_IN_S: Final = 1.0  # from where the joints stood when torque came on: not what the panel of the neck is about
 _LEAST_SCALE_DEG: Final = 1.0  # a joint that hardly moves stays pale
 
+_STATES: Final = {
+    "starting": "#b8d4e3", "idle": "#dfe3e8", "listening": "#cfe5c8", "speaking": "#d9cce9", "degraded": "#f2d9a0",
+    "halted": "#dd6b5a", "stopping": "#b8d4e3",
+}  # fmt: skip
+_EVENTS: Final = {"nod": "v", "blink": "|", "smile": "^"}
+_LEAST_LABEL: Final = 0.04  # of the width: a state that is shorter has its color alone
+
 # Lane of the face panel: name, channels added, channels taken off.
 _LANES: Final = (
     ("blink", ("eyeBlinkLeft", "eyeBlinkRight"), ()),
@@ -57,9 +64,9 @@ def plot(recording: RunRecording, png: Path | str) -> None:
         figure = Figure(figsize=_SIZE_IN, dpi=_DPI)
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(
-            5,
+            6,
             1,
-            height_ratios=(0.8, 1.45, 2.1, 1.45, 3.9),
+            height_ratios=(0.3, 0.8, 1.45, 2.1, 1.45, 3.6),
             left=0.105,
             right=0.955,
             top=0.925,
@@ -67,20 +74,22 @@ def plot(recording: RunRecording, png: Path | str) -> None:
             hspace=0.25,
         )
         first = figure.add_subplot(grid[0])
-        panels = [first, *(figure.add_subplot(grid[n], sharex=first) for n in range(1, 5))]
+        panels = [first, *(figure.add_subplot(grid[n], sharex=first) for n in range(1, 6))]
         figure.suptitle(recording.title, x=0.105, y=0.975, ha="left", fontsize=15, fontweight="bold")
-        _voice(panels[0], recording)
-        _pose(panels[1], recording)
-        _lanes(panels[2], recording)
+        _states(panels[0], recording)
+        _voice(panels[1], recording)
+        _pose(panels[2], recording)
+        _lanes(panels[3], recording)
         neck = _neck_joints(recording)
-        _neck(panels[3], recording, neck)
-        _heat(panels[4], recording, [n for n in range(len(recording.joints)) if n not in neck])
-        for axes in panels[:4]:
+        _neck(panels[4], recording, neck)
+        _heat(panels[5], recording, [n for n in range(len(recording.joints)) if n not in neck])
+        for axes in panels[1:5]:
             _phrases(axes, recording)
+        for axes in panels[:5]:
             axes.tick_params(labelbottom=False, length=3)
             axes.grid(axis="x", color="#00000012")
         first.set_xlim(0, max(recording.duration_s, FRAME_S))
-        panels[4].set_xlabel("time, s")
+        panels[5].set_xlabel("time, s")
         figure.savefig(png)
 
 
@@ -92,6 +101,25 @@ def _phrases(axes: Axes, recording: RunRecording) -> None:
 def _spans(starts_s: Doubles, ends_s: Doubles, there: NDArray[np.bool_]) -> list[tuple[float, float]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], there.astype(int), [0]])))
     return [(float(starts_s[a]), float(ends_s[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _states(axes: Axes, recording: RunRecording) -> None:
+    """What the run was doing as a band, and on it what the listener planned."""
+    axes.set_title("state of the run, and what the listener planned")
+    ends_s = [*(since_s for since_s, _, _ in recording.states[1:]), recording.duration_s]
+    for (since_s, name, why), end_s in zip(recording.states, ends_s, strict=False):
+        axes.axvspan(since_s, end_s, color=_STATES.get(name, _FAINT), lw=0)
+        if end_s - since_s > _LEAST_LABEL * recording.duration_s:
+            text = f"{name}: {', '.join(why)}" if why else name
+            axes.text(since_s, 0.7, f" {text}", va="center", fontsize=9, clip_on=True)
+    for kind, marker in _EVENTS.items():
+        at_s = [start_s for start_s, told in recording.events if told == kind]
+        if at_s:
+            axes.plot(at_s, [0.25] * len(at_s), marker, color=_INK, ms=6, ls="", label=kind)
+    axes.set_ylim(0, 1)
+    axes.set_yticks([])
+    if recording.events:
+        _legend(axes)
 
 
 def _voice(axes: Axes, recording: RunRecording) -> None:

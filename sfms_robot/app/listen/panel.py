@@ -1,0 +1,272 @@
+"""How a run is, on the terminal: the status document four times a second, and keys that halt, resume and end it.
+
+Nothing of it happens in the loop's thread: one thread draws, one reads keys, and what is logged meanwhile waits for the
+one that draws. Nothing is shown where stderr is no terminal, nor while another program has the terminal.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from typing import Any, Final
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from sfms_robot.app.listen.keys import ESCAPE, Keyboard, in_background, keyboard, reading_keys
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt
+
+PERIOD_S: Final = 0.25
+JOIN_S: Final = 1.0  # a terminal that is held (Ctrl-S) takes nothing: the run ends without it
+_QUIET_DB: Final = -60.0  # an empty meter; 0 is full scale
+_METER: Final = 20  # characters, fewer on a narrow terminal
+_FAULTS: Final = 4  # named; the others are counted
+_COLORS: Final[Mapping[str, str]] = {
+    "starting": "cyan", "idle": "blue", "listening": "green", "speaking": "magenta", "degraded": "yellow",
+    "halted": "bold white on red", "stopping": "cyan", "stopped": "dim", "fault": "bold red",
+}  # fmt: skip
+_KEYS: Final = "space halt, r resume, q end, ? help"
+_HELP: Final = (
+    "space, h, Esc: emergency stop; r: go on after one; q: come to rest and end; Ctrl-C twice: torque off at once"
+)
+_NO_KEYS: Final = "no keys here: Ctrl-C ends the run"
+
+Document = Callable[[], Mapping[str, Any]]
+
+
+@contextmanager
+def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch) -> Iterator[None]:
+    """Shown while inside; afterwards the terminal is as it was, whatever happens. Main thread only."""
+    console = Console(stderr=True)
+    if not console.is_terminal or console.is_dumb_terminal:
+        yield
+        return
+    found = keyboard(sys.stdin)
+    with ExitStack() as stack:
+        screen = stack.enter_context(_drawing(console, document, interrupt, found is not None))
+        if found is not None:
+            stack.enter_context(reading_keys(found, lambda key: _pressed(key, screen, interrupt, halt)))
+        stack.enter_context(_suspending(screen, found))
+        yield
+
+
+def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch) -> None:
+    if key in (" ", "h", ESCAPE):
+        halt.close("key")
+    elif key == "r":
+        halt.open()
+    elif key == "q" and not interrupt():  # a key that is held down asks once, and releases nothing
+        interrupt.ask()
+    elif key == "?":
+        screen.help = not screen.help
+    screen.look.set()
+
+
+class _Screen:
+    """What is drawn, and by whom: `draw` in a thread of its own, `erase` from any.
+
+    Attributes:
+        help: every key is told.
+        look: set to draw at once.
+    """
+
+    def __init__(self, console: Console, document: Document, interrupt: Interrupt, keys: bool) -> None:
+        self.help = False
+        self.look = threading.Event()
+        self.lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._console, self._document, self._interrupt, self._keys = console, document, interrupt, keys
+        self._live = Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False,
+                          redirect_stderr=False, vertical_overflow="crop")  # fmt: skip
+        self.lock = threading.RLock()  # a signal handler may interrupt who holds it
+
+    def draw(self) -> None:
+        """What was logged, and below it how the run is."""
+        with self.lock:
+            for line in self.logged():
+                self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+            if not in_background(self._console.file.fileno()):
+                keys = _NO_KEYS if not self._keys else _HELP if self.help else _KEYS
+                ending = self._interrupt()
+                self._live.update(view(self._document(), self._console, keys, ending))
+                self._live.start()
+                self._live.refresh()
+
+    def erase(self) -> None:
+        """The cursor is back, where the panel began."""
+        with self.lock:
+            self._live.update("")
+            self._live.stop()
+
+    def logged(self) -> Iterator[str]:
+        """Lines that nobody has seen yet."""
+        with suppress(queue.Empty):
+            while True:
+                yield self.lines.get_nowait()
+
+
+@contextmanager
+def _drawing(console: Console, document: Document, interrupt: Interrupt, keys: bool) -> Iterator[_Screen]:
+    """A thread that draws while inside. It also erases: a second Ctrl-C cuts short what the main thread does."""
+    screen, over = _Screen(console, document, interrupt, keys), threading.Event()
+
+    def work() -> None:
+        try:
+            while not over.is_set():
+                screen.draw()
+                screen.look.wait(PERIOD_S)
+                screen.look.clear()
+        finally:
+            screen.erase()
+
+    thread = threading.Thread(target=work, name="panel", daemon=True)
+    with _logging_to(screen):
+        thread.start()
+        try:
+            yield screen
+        finally:
+            over.set()
+            screen.look.set()
+            thread.join(JOIN_S)
+
+
+@contextmanager
+def _logging_to(screen: _Screen) -> Iterator[None]:
+    """What is logged to stderr while inside waits for who draws: a line in the middle of a panel would break it."""
+    root = logging.getLogger()
+    usual = [each for each in root.handlers if isinstance(each, logging.StreamHandler) and each.stream is sys.stderr]
+    queued = [_Queued(each, screen.lines) for each in usual]
+    for before, after in zip(usual, queued, strict=True):
+        root.removeHandler(before)
+        root.addHandler(after)
+    try:
+        yield
+    finally:
+        for before, after in zip(usual, queued, strict=True):
+            root.removeHandler(after)
+            root.addHandler(before)
+        for line in screen.logged():
+            sys.stderr.write(line + "\n")
+
+
+class _Queued(logging.Handler):
+    """Formats as another handler does, and writes nothing."""
+
+    def __init__(self, like: logging.Handler, lines: queue.SimpleQueue[str]) -> None:
+        super().__init__(like.level)
+        self.setFormatter(like.formatter)
+        self._lines = lines
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._lines.put(self.format(record))
+
+
+@contextmanager
+def _suspending(screen: _Screen, found: Keyboard | None) -> Iterator[None]:
+    """Ctrl-Z hands the terminal over as it was; who draws and who reads take it again in the foreground."""
+    if not hasattr(signal, "SIGTSTP"):
+        yield
+        return
+
+    def suspend(*_: object) -> None:
+        with screen.lock, found.lent() if found is not None else nullcontext():
+            screen.erase()
+            os.kill(os.getpid(), signal.SIGSTOP)
+
+    before = signal.signal(signal.SIGTSTP, suspend)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTSTP, before)
+
+
+# --- what is drawn --------------------------------------------------------------------------------------------------
+
+
+def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool = False) -> RenderableType:
+    """A status document as lines no wider than the terminal. `ending`: somebody has asked for the end."""
+    rows = Table.grid(padding=(0, 1))
+    rows.add_column(style="dim", no_wrap=True)
+    rows.add_column()
+    meter = max(4, min(_METER, console.width - 22))
+    person = document.get("person") or {}
+    for name, text in (
+        ("", document.get("note")),
+        ("person", _level(person.get("voice_db"), meter, console) + _attention(person)),
+        ("robot", _level(person.get("own_voice_db"), meter, console)),
+        ("face", _motion(document.get("motion") or {})),
+        ("ticks", _ticks(document.get("tick") or {})),
+        ("latency", _latency(document.get("latency_ms") or {})),
+        ("hottest", _hottest(document.get("hottest"))),
+        ("faults", _faults(document.get("faults") or {})),
+    ):
+        if text:
+            rows.add_row(name, Text(text, style="red" if name == "faults" else ""))
+    return Group(_title(document, ending), rows, Text(keys, style="dim"))
+
+
+def _title(document: Mapping[str, Any], ending: bool) -> Text:
+    state = "stopping" if ending else str(document["state"])
+    why = ", ".join(document.get("why") or ())
+    time_s, duration_s = document.get("time_s") or 0.0, document.get("duration_s")
+    clock = _clock(time_s) if duration_s is None else f"{_clock(time_s)} of {_clock(duration_s)}"
+    names = "  ".join(str(document[key]) for key in ("head", "listener") if key in document)
+    return Text.assemble(
+        (f" {state} ", _COLORS.get(state, "")), f" {why} " if why else "", f" {clock}  ", (names, "dim")
+    )
+
+
+def _clock(time_s: float) -> str:
+    minutes, seconds = divmod(int(time_s), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}" if minutes >= 60 else f"{minutes}:{seconds:02d}"
+
+
+def _level(level_db: float | None, width: int, console: Console) -> str:
+    """A meter from -60 dB to full scale."""
+    full, empty = ("#", ".") if console.options.ascii_only else ("\u2588", "\u2591")
+    filled = 0 if level_db is None else round(width * min(1.0, max(0.0, 1.0 - level_db / _QUIET_DB)))
+    return full * filled + empty * (width - filled) + ("  no sound" if level_db is None else f" {level_db:5.0f} dB")
+
+
+def _attention(person: Mapping[str, Any]) -> str:
+    if (attention := person.get("attention")) is not None:
+        return f"  attention {attention:.0%}"
+    return "  seen" if person.get("seen") else ""
+
+
+def _motion(motion: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in motion.items())
+
+
+def _ticks(tick: Mapping[str, Any]) -> str:
+    if tick.get("achieved_hz") is None:
+        return "in virtual time" if tick else ""
+    return f"{tick['achieved_hz']:.1f} of {tick['target_hz']:g} Hz, {tick['late']} late"
+
+
+def _latency(latency_ms: Mapping[str, Mapping[str, float | None]]) -> str:
+    """Medians, and in brackets how late the latest come."""
+    told = []
+    for name, ms in latency_ms.items():
+        middle, *tails = [f"{value:.0f}" for value in ms.values() if value is not None] or [""]
+        if middle:
+            told.append(f"{name.replace('_', ' ')} {middle} ms" + "".join(f" ({tail})" for tail in tails))
+    return ", ".join(told)
+
+
+def _hottest(hottest: Mapping[str, Any] | None) -> str:
+    return "" if hottest is None else f"{hottest['joint']} {hottest['temperature_C']:.0f} C"
+
+
+def _faults(faults: Mapping[str, str]) -> str:
+    named = [f"{joint} {fault}" for joint, fault in list(faults.items())[:_FAULTS]]
+    more = len(faults) - len(named)
+    return "; ".join([*named, f"and {more} more"] if more else named)

@@ -1,0 +1,131 @@
+"""Keys of a real terminal while a panel is on it, and the terminal afterwards as it was."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import termios
+
+import pytest
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo terminals here")
+LIMIT_S = 60.0  # only what never comes waits for so long,
+MOST = 50_000  # or until this much else was shown
+HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"
+PROGRAM = """
+import logging, os, sys, threading
+from sfms_robot.app.listen.panel import live_panel
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt, signals_to
+
+terminal = os.open(sys.argv[1], os.O_RDWR)  # becomes the one that controls this session
+for each in range(3):
+    os.dup2(terminal, each)
+os.environ["TERM"] = "xterm"
+logging.basicConfig(format="%(message)s")
+interrupt, halt = Interrupt(), HaltLatch()
+
+def document():
+    return {"state": "halted" if halt.by else "listening", "note": sys.argv[2]}
+
+with signals_to(interrupt), live_panel(document, interrupt, halt):
+    while not interrupt():
+        threading.Event().wait(0.01)
+        if sys.argv[2] == "fails" and halt.by:
+            raise SystemExit(7)
+"""
+
+
+class Shown:
+    """A program on a terminal of its own. `until` waits for what it shows, from where the last one was found."""
+
+    def __init__(self, note="all is well"):
+        self._near, self.far = os.openpty()
+        self.usual = termios.tcgetattr(self.far)
+        self.text = ""
+        words = [sys.executable, "-c", PROGRAM, os.ttyname(self.far), note]
+        self.process = subprocess.Popen(words, start_new_session=True, stdin=subprocess.DEVNULL)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+        os.close(self._near)
+        os.close(self.far)
+
+    def press(self, keys):
+        os.write(self._near, keys)
+
+    def until(self, part):
+        while part not in self.text:
+            assert len(self.text) < MOST, f"{part!r} never came: {self.text!r}"
+            ready, _, _ = select.select([self._near], [], [], LIMIT_S)
+            assert ready, f"{part!r} never came: {self.text!r}"
+            self.text += os.read(self._near, 4096).decode()
+        before, _, self.text = self.text.partition(part)
+        return before
+
+    def single_keys(self):
+        local = termios.tcgetattr(self.far)[3]
+        return not local & (termios.ICANON | termios.ECHO)
+
+
+def test_keys_halt_resume_help_and_end():
+    with Shown() as shown:
+        shown.until("listening")
+        shown.until("? help")
+        for key in (b" ", b"h", b"\x1b", b"\x1b[A"):  # an arrow begins with Esc: in doubt it halts
+            shown.press(key)
+            shown.until("halted: key")
+            shown.press(b"r")
+            shown.until("halt released")
+        assert shown.single_keys()
+        shown.press(b"?")
+        shown.until("torque off at once")
+        shown.press(b"xqq")  # one that is held down asks once
+        shown.until(SHOW)
+        assert shown.process.wait(LIMIT_S) == 0
+        assert termios.tcgetattr(shown.far) == shown.usual
+
+
+@pytest.mark.parametrize(
+    ("note", "how", "code"),
+    [
+        ("well", lambda shown: shown.press(b"\x03"), 1),
+        ("well", lambda shown: shown.process.terminate(), 1),
+        ("fails", lambda shown: shown.press(b"h"), 7),
+    ],
+    ids=["ctrl-c", "sigterm", "exception"],
+)
+def test_however_it_ends_the_terminal_is_as_it_was(note, how, code):
+    with Shown(note) as shown:
+        shown.until(HIDE)
+        shown.until("? help")
+        how(shown)
+        shown.until(SHOW)
+        assert shown.process.wait(LIMIT_S) in (code, -signal.SIGINT)
+        assert termios.tcgetattr(shown.far) == shown.usual
+
+
+def test_a_suspended_run_leaves_the_terminal_and_takes_it_again():
+    with Shown() as shown:
+        shown.until("? help")
+        shown.press(b" ")
+        shown.until("halted: key")
+        assert shown.single_keys()
+        shown.press(b"\x1a")
+        _, state = os.waitpid(shown.process.pid, os.WUNTRACED)
+        assert os.WIFSTOPPED(state)
+        assert termios.tcgetattr(shown.far) == shown.usual
+        shown.until(SHOW)
+        shown.process.send_signal(signal.SIGCONT)
+        shown.until(HIDE)
+        shown.press(b"r\n")  # a whole line, should it not have taken the terminal again yet
+        shown.until("halt released")
+        assert shown.single_keys()
+        shown.press(b"q")
+        shown.until(SHOW)
+        assert shown.process.wait(LIMIT_S) == 0

@@ -1,0 +1,90 @@
+"""A recorded run drives a head again: the same one as it did, another one as that one can, and within its limits."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.replay.run_file import read_recording
+from sfms_robot.app.replay.run_playback import PlaybackOptions, RecordedFace, play_back
+from sfms_robot.app.session import RunOptions, run
+from sfms_robot.cli.main import main
+from sfms_robot.runtime.recorder import RUN_FILE
+
+HEAD, SECONDS = "interbotix_wxxms", 4.0
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A run in virtual time, and its report."""
+    folder = tmp_path_factory.mktemp("recorded") / "run"
+    return folder, run(RunOptions(head=HEAD, duration_s=SECONDS, fast=True, record=folder, style=("neck=1.5",)))
+
+
+def test_the_same_head_does_what_it_did(recorded):
+    folder, report = recorded
+    played = play_back(folder, PlaybackOptions(fast=True))
+    assert (played["head"], played["exit"], played["error"]) == (HEAD, "done", None)
+    assert played["duration_s"] == pytest.approx(SECONDS) and played["limits"]["violations"] == 0
+    assert played["motion"] == report["motion"]
+    for joint, went in report["joints"].items():
+        for end in ("min_rad", "max_rad"):
+            assert played["joints"][joint][end] == pytest.approx(went[end], abs=0.02)
+
+
+def test_another_head_does_what_it_can(recorded):
+    played = play_back(recorded[0], PlaybackOptions("poppy_head", fast=True))
+    assert played["head"] == "poppy_head" and played["exit"] == "done"
+    assert played["limits"]["violations"] == 0
+    assert any(joint["travel_rad"] > 0.01 for joint in played["joints"].values())
+
+
+def test_what_a_killed_run_left_plays_up_to_its_end(recorded, tmp_path):
+    whole = (recorded[0] / RUN_FILE).read_bytes()
+    (tmp_path / RUN_FILE).write_bytes(whole[: len(whole) // 2])
+    played = play_back(tmp_path, PlaybackOptions(fast=True))
+    assert not played["whole"] and 0.5 < played["recorded_s"] < SECONDS
+    assert played["duration_s"] == pytest.approx(played["recorded_s"], abs=0.02)
+
+
+def test_a_face_is_that_of_its_tick_and_between_two_between_them(recorded):
+    recording = read_recording(recorded[0])
+    timeline, times_s = RecordedFace(recording), recording.times_s
+    np.testing.assert_array_equal(timeline.sample(times_s, 0.0, None)[0], recording.motion)
+    between, _ = timeline.sample((times_s[1:] + times_s[:-1]) / 2, 0.0, None)
+    np.testing.assert_allclose(between, (recording.motion[1:] + recording.motion[:-1]) / 2, atol=1e-6)
+    outside, _ = timeline.sample(np.array([-5.0, 1e9]), 0.0, None)
+    np.testing.assert_array_equal(outside, recording.motion[[0, -1]])
+
+
+def test_a_recording_tells_what_ran_on_what_and_how(recorded):
+    about = read_recording(recorded[0]).about
+    assert {"version", "python", "platform", "started_utc", "listener_sha256"} <= set(about)
+    assert len(about["listener_sha256"]) == 64 and "head_yaml" in about and "listener_config" in about
+    options = json.loads(about["options"])
+    assert options["head"] == HEAD and options["fast"] and options["style"] == ["neck=1.5"]
+
+
+def test_the_head_that_is_in_a_recording_is_a_head_file(recorded, tmp_path):
+    (tmp_path / "head.yaml").write_text(read_recording(recorded[0]).about["head_yaml"])
+    played = play_back(recorded[0], PlaybackOptions(str(tmp_path), fast=True))
+    assert played["head"] == HEAD and played["joints"] == play_back(recorded[0], PlaybackOptions(fast=True))["joints"]
+
+
+def test_what_is_wrong_is_said_in_one_line(recorded, capsys):
+    for words, told in (
+        (["--head", "poppy_head"], "add --port"),
+        (["--port", "sim", "--head", "nobody"], "nobody"),
+        (["--port", "/dev/nowhere"], "/dev/nowhere"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(["replay", str(recorded[0]), *words])
+        said = capsys.readouterr().err.strip()
+        assert ended.value.code in (2, 3) and told in said and len(said.splitlines()) == 1
+
+
+def test_the_command_says_what_was_played(recorded, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["replay", str(recorded[0]), "--port", "sim", "--fast", "--json"])
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert ended.value.code == 0 and told["exit"] == "done" and told["recording"]["head"] == HEAD
