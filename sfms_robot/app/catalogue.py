@@ -9,7 +9,6 @@ from typing import Any
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.servo.discovery import ports_data
-from sfms_robot.sources.microphone import sound_devices
 from sfms_robot.sources.speakers import shipped_speaker, speakers
 
 
@@ -59,6 +58,8 @@ def microphones() -> list[dict[str, Any]]:
 
     Raises ConfigError without PortAudio.
     """
+    from sfms_robot.sources.microphone import sound_devices
+
     return [
         {
             "name": device.name,

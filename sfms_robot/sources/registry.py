@@ -86,8 +86,8 @@ def open_source(
     """A person by what a run is told of them.
 
     An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
-    own, else none. `loop`: recordings start again when they end before `duration_s` does. `agent` is what the robot says,
-    instead of `agent_audio`.
+    own, else none. `loop`: recordings start again when they end before `duration_s` does. `agent` is what the robot
+    says, instead of `agent_audio`.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """

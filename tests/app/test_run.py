@@ -111,3 +111,22 @@ def test_in_real_time_every_figure_is_measured():
     assert done["latency_ms"]["speech_to_wire"]["p95"] > done["latency_ms"]["frame_to_wire"]["p50"]
     assert done["listener_step_ms"]["p50"] > 0
     assert "wire" not in done
+
+
+@pytest.mark.parametrize(
+    ("options", "hears"),
+    [
+        ({}, "default"),
+        ({"port": "/dev/ttyUSB0"}, "mic"),
+        ({"port": "/dev/ttyUSB0", "audio": "katie"}, "katie"),
+        ({"port": "/dev/ttyUSB0", "audio": "none"}, "none"),
+        ({"port": "/dev/ttyUSB0", "dry_run": True}, "default"),
+    ],
+)
+def test_a_head_on_a_real_port_hears_the_microphone_unless_told_otherwise(options, hears):
+    assert RunOptions(**options).hears == hears
+
+
+def test_there_is_no_microphone_in_virtual_time():
+    with pytest.raises(ConfigError, match="^--audio mic:2: what a microphone hears takes real time, --fast has none$"):
+        run(RunOptions(audio="mic:2", fast=True, duration_s=1.0))

@@ -7,6 +7,7 @@ import sys
 import pytest
 from drill_rig import HEAD, Command, command
 
+OF_THIS_COMPUTER = {sys.executable, "/sbin/ldconfig", "pactl"}  # where PortAudio is; what the sound server records
 WATCHER = """
 import json, os, socket, sys
 
@@ -42,7 +43,7 @@ def watch(tmp_path):
 
 def strangers(seen):
     """Addresses beyond this computer, and programs that are not this Python."""
-    programs = [address for kind, address in seen if kind == "subprocess.Popen" and address != sys.executable]
+    programs = [address for kind, address in seen if kind == "subprocess.Popen" and address not in OF_THIS_COMPUTER]
     return programs + [address for kind, address in seen if kind not in ("unix", "subprocess.Popen")]
 
 
