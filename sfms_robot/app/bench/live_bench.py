@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -27,13 +28,15 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, Literal
 
 import numpy as np
+import yaml
 
 from sfms_robot.app.bench.live_stamps import SETTLED_S, StampedSource, Stamps
 from sfms_robot.app.bench.measure import HEAD, LISTENER
 from sfms_robot.app.bench.memory_bench import ResidentMemory
 from sfms_robot.app.bench.startup_bench import first_goal_s
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.session import SIM_READ_DEADLINE_S, RunOptions, run
 from sfms_robot.config import load_head
+from sfms_robot.data import data_dir
 from sfms_robot.emulator.phone import EmulatedPhone
 from sfms_robot.emulator.sound_server import SoundServer
 from sfms_robot.errors import BusError, ConfigError
@@ -80,7 +83,8 @@ def live(minutes: float, audio: Audio, say: Say) -> dict[str, Any]:
         say("the same with a recorded person")
         compared = _run({}, audio="default", face="auto", duration_s=min(minutes * 60, FILE_S), record=None)
         say("`run` until its first goal")
-        typed_s = first_goal_s(["--audio", audio, "--face", person.face], {**os.environ, **person.environment})
+        words = ["--head", str(patient_head(Path(folder))), "--audio", audio, "--face", person.face]
+        typed_s = first_goal_s(words, {**os.environ, **person.environment})
     result = {"audio": audio, "idle": idle, "live": told, "file": compared, "first_write_s": typed_s}
     return {**result, "goals": goals(result)}
 
@@ -173,6 +177,17 @@ def live_person(folder: Path, audio: Audio) -> Iterator[LivePerson]:
             over.set()
             for thread in threads:
                 thread.join()
+
+
+def patient_head(folder: Path) -> Path:
+    """`HEAD`, with the patience for emulated servos that `--port sim` has: they share this computer's cores."""
+    place = folder / HEAD
+    shutil.copytree(data_dir("configs") / "heads" / HEAD, place)
+    raw = yaml.safe_load((place / "head.yaml").read_text(encoding="utf-8"))
+    raw["buses"]["main"]["read_deadline_ms"] = SIM_READ_DEADLINE_S * 1e3
+    raw.pop("calibrate_first", None)
+    (place / "head.yaml").write_text(yaml.safe_dump(raw, sort_keys=False), encoding="utf-8")
+    return place
 
 
 def free_port(kind: int = socket.SOCK_STREAM) -> int:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -32,15 +31,22 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-import yaml
 
-from sfms_robot.app.bench.live_bench import SINK, Audio, LivePerson, Say, children, free_port, idle_loop, live_person
+from sfms_robot.app.bench.live_bench import (
+    SINK,
+    Audio,
+    LivePerson,
+    Say,
+    children,
+    free_port,
+    idle_loop,
+    live_person,
+    patient_head,
+)
 from sfms_robot.app.bench.measure import HEAD, LISTENER, MAIN
 from sfms_robot.app.replay.run_file import read_recording, states_of
-from sfms_robot.app.session import SIM_READ_DEADLINE_S
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
-from sfms_robot.data import data_dir
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError
 
@@ -252,7 +258,7 @@ class _Command:
 def _running(folder: Path, device: str, person: LivePerson, audio: Audio) -> Iterator[_Command]:
     port, said = free_port(), folder / "said"
     words = [
-        "run", "--head", str(_patient_head(folder)), "--port", device, "--listener", LISTENER, "--audio", audio,
+        "run", "--head", str(patient_head(folder)), "--port", device, "--listener", LISTENER, "--audio", audio,
         "--face", person.face, "--record", str(folder / "run"), "--status", str(port), "--json", "--yes",
     ]  # fmt: skip
     paths = os.pathsep.join(filter(None, sys.path))
@@ -298,17 +304,6 @@ def _ended(command: _Command) -> dict[str, Any]:
         raise BusError(f"bench live: the run did not end within {_END_S:g} s of Ctrl-C") from error
     report: dict[str, Any] = json.loads((command.said.parent / "out").read_text(encoding="utf-8").splitlines()[-1])
     return report
-
-
-def _patient_head(folder: Path) -> Path:
-    """`HEAD`, with the patience for emulated servos that `--port sim` has: they share this computer's cores."""
-    place = folder / HEAD
-    shutil.copytree(data_dir("configs") / "heads" / HEAD, place)
-    raw = yaml.safe_load((place / "head.yaml").read_text(encoding="utf-8"))
-    raw["buses"]["main"]["read_deadline_ms"] = SIM_READ_DEADLINE_S * 1e3
-    raw.pop("calibrate_first", None)
-    (place / "head.yaml").write_text(yaml.safe_dump(raw, sort_keys=False), encoding="utf-8")
-    return place
 
 
 def _rounded(value: float | None) -> float | None:
