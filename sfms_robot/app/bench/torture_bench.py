@@ -4,7 +4,7 @@ At random, in turn:
 
     killed    the listener's process gets SIGKILL
     stopped   it gets SIGSTOP, and nobody wakes it
-    cut       a source is gone for some seconds: the microphone is unplugged, or the phone silent
+    cut       a source is gone for some seconds: the microphone is unplugged, and next time the phone silent
     unplugged a servo falls silent for some seconds
 
 After each the run has to be `degraded` for that reason within the time of docs/safety.md, and be well again before the
@@ -112,6 +112,7 @@ class _Victim:
 
     def __init__(self, command: _Command, chain: Chain, head: Head, person: LivePerson) -> None:
         self.command, self.chain, self.head, self.person = command, chain, head, person
+        self._cuts = 0
 
     def status(self) -> dict[str, Any]:
         """Raises BusError when the run is over."""
@@ -133,7 +134,8 @@ class _Victim:
             servo = self.head.joints[joint].id
             self.chain.kill(servo)
             return joint, joint, lambda: self.chain.revive(servo)
-        if (server := self.person.server) is not None and chance.random() < 0.5:
+        self._cuts += 1
+        if (server := self.person.server) is not None and self._cuts % 2:
             server.unplug(SINK)
             return "microphone", "voice", lambda: server.plug(SINK)
         self.person.phone_silent.set()
