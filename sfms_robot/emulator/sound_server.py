@@ -62,7 +62,8 @@ class SoundServer:
 
     def play(self, sink: str, file: Path | str) -> subprocess.Popen[bytes]:
         """A program that plays a sound file; to be ended by the caller."""
-        return subprocess.Popen(["paplay", f"--device={sink}", str(file)], env=self._environment())
+        words = ["paplay", f"--device={sink}", str(file)]
+        return subprocess.Popen(words, env=self._environment(), stderr=subprocess.DEVNULL)
 
     def _environment(self) -> dict[str, str]:
         return {**os.environ, **self.environment}

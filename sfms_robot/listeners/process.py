@@ -216,7 +216,7 @@ class ListenerProcess:
                 self._state = "hung"
 
     def _restart(self, why: str, now_s: float) -> None:
-        self._child.close()
+        self._child.kill()
         self._restarted_s = [at_s for at_s in self._restarted_s if now_s - at_s < _MINUTE_S]
         if len(self._restarted_s) >= RESTARTS:
             log.error("the listener %s again, %d times in a minute: the head goes on without it", why, RESTARTS)
@@ -272,11 +272,19 @@ class _Child:
         except queue.Empty:
             return "error", None, 0.0
 
+    def kill(self) -> None:
+        """Returns at once, also where the child is stopped; the reader sees to the rest."""
+        self._process.kill()
+        self._hang_up()
+
     def close(self) -> None:
+        self._hang_up()
+        end_child(self._process, CLOSE_LIMIT_S)
+
+    def _hang_up(self) -> None:
         with self._changed:
             self._closing = True
             self._changed.notify()
-        end_child(self._process, CLOSE_LIMIT_S)
 
     def _write(self) -> None:
         pipe = self._process.stdin
