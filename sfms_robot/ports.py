@@ -79,17 +79,29 @@ class Sight(Protocol):
     def close(self) -> None: ...
 
 
+class Outlet(Protocol):
+    """Programs beside the run, which are told what it hears and does. Never blocks, may drop."""
+
+    def hears(self, audio: Floats, time_s: float) -> None:
+        """The (640,) that the listener is given; `time_s`: loop time of the newest."""
+
+    def tells(self, kind: str, time_s: float, **values: Any) -> None:
+        """An event, or a state, that begins at loop time `time_s`."""
+
+
 class Source(Protocol):
     """Where the person's voice and face come from, as frames. Derive your own from it: all but `read` have defaults.
 
     Attributes:
         duration_s: length of a recording; None for something live.
         latency_s: as of `Voice`.
+        outlets: whom the run is to be told to.
         missing: which parts of it are lost, by name: the run is degraded meanwhile.
     """
 
     duration_s: float | None = None
     latency_s: float = 0.0
+    outlets: Sequence[Outlet] = ()
     missing: tuple[str, ...] = ()
 
     def start(self, origin_s: float) -> None:
@@ -102,6 +114,10 @@ class Source(Protocol):
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
         """Frames complete at or before loop time `now_s` and not given yet, oldest first. Must not block."""
         ...
+
+    def moves(self, speed_rad_s: float) -> None:
+        """How fast the head's joints move, all together; told at every tick. Its microphone hears their motors."""
+        return None
 
     def statistics(self) -> Mapping[str, Any]:
         """What was lost: for the report."""

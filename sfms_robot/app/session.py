@@ -27,6 +27,7 @@ from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import figures_so_far, run_report
 from sfms_robot.app.listen.run_facts import run_facts
+from sfms_robot.app.listen.run_teller import RunTeller
 from sfms_robot.app.listen.status_server import status_server
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
@@ -471,6 +472,9 @@ def run(
             stack.callback(recorder.close)
         if panel is not None:
             stack.enter_context(panel(status.document, interrupt, halt))
+        tellers = [RunTeller(outlet) for outlet in source.outlets]
+        for teller in tellers:
+            stack.callback(teller.close)
         if options.status is not None:
             port = stack.enter_context(status_server(options.status, status.document))
             logger.warning("status: http://127.0.0.1:%d/", port)
@@ -481,7 +485,7 @@ def run(
             overlay=overlay,
             answers=True,
             halt=halt,
-            observers=[status, *observers, *([] if recorder is None else [recorder])],
+            observers=[status, *observers, *tellers, *([] if recorder is None else [recorder])],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt, signals=False, log=log)
         report = run_report(

@@ -34,9 +34,9 @@ def run(
         "default",
         autocompletion=names.speakers,
         rich_help_panel=PERSON,
-        metavar="mic[:DEVICE]|FILE.wav|NAME|none",
-        help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, 'none'. "
-        "Default: the microphone, with emulated servos a shipped speaker.",
+        metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|none",
+        help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
+        "yours, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
     ),
     face: str = typer.Option(
         "auto",
@@ -47,9 +47,9 @@ def run(
         "none",
         autocompletion=names.speakers,
         rich_help_panel=PERSON,
-        metavar="FILE.wav|device:DEVICE|NAME|none",
-        help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, "
-        "'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
+        metavar="FILE.wav|device:DEVICE|NAME|tcp[:[HOST:]PORT]|none",
+        help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, a "
+        "program of yours, 'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
     ),
     duration: float | None = typer.Option(
         None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."

@@ -155,6 +155,7 @@ def drive(
                 readings = parts.bus.poll(tick.time_s)
                 state = _rejoined(parts, log, readings, state, tick.time_s)
                 state = _noticed(parts, readings, state, tick.time_s, 1.0 / rate_hz)
+                parts.source.moves(float(np.abs(state.here_rad - state.before_rad).sum() * rate_hz))
                 observers.tick(
                     Tick(tick.time_s, command.motion, command.goals_rad, readings, state.run.name, state.run.why)
                 )

@@ -79,10 +79,12 @@ class FrontEnd:
 
     Attributes:
         mic: push its pieces here.
+        speed_rad_s: how fast the head's joints move, all together: what their motors are heard by.
     """
 
     def __init__(self, reference: LiveVoice | ToldSpeech | None = None) -> None:
         self.mic = LiveVoice()
+        self.speed_rad_s = 0.0
         self._reference = reference
         self._gate = OwnVoiceGate(speaks=reference is not None)
         self._origin_s: float | None = None
@@ -131,7 +133,7 @@ class FrontEnd:
     def _judge(self, now_s: float, mic: Floats | None, said: Floats | None) -> Heard:
         """One frame in, one frame out: the gate counts samples."""
         own = None if self._reference is None else (_SILENCE if said is None else said)
-        (frame,) = self._gate.push(_SILENCE if mic is None else mic, own)
+        (frame,) = self._gate.push(_SILENCE if mic is None else mic, own, self.speed_rad_s)
         self._counts["voice_frames"] += frame.voice
         self._counts["own_voice_frames"] += own is not None and bool(own.any())
         self._counts["without_reference"] += own is not None and said is None

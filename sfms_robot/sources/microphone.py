@@ -26,6 +26,7 @@ MIC_FLAG: Final = "--audio mic"
 DEVICE_FLAG: Final = "--agent-audio device"
 TOLD_FRAMES: Final = 12  # of the robot's voice at once: the worker may miss half a second of tellings
 KEPT_FRAMES: Final = 50
+_TOLD_RAD_S: Final = 0.1  # a change of speed that is worth telling
 _SILENCE: Final = np.zeros(FRAME_SAMPLES, dtype=np.float32)
 _LATENCY_FALLS_S: Final = 1e-4  # a frame, so that a bad second is forgotten in a minute
 
@@ -51,6 +52,7 @@ class Microphone:
         self._late_frames = 0
         self._told: Mapping[str, Any] = {}
         self._said: dict[int, Floats | None] = {}
+        self._speed_rad_s = self._told_speed_rad_s = 0.0
         self._collect(0.0, 0)
 
     @property
@@ -72,12 +74,22 @@ class Microphone:
         if self._origin_s is None:
             return None
         if self._agent is not None and self._agent.ask(index + 1):
-            self._worker.tell(Told(self._origin_s, *self._agent.newest()))
+            self._tell(self._origin_s, *self._agent.newest())
+        elif self._agent is None and abs(self._speed_rad_s - self._told_speed_rad_s) > _TOLD_RAD_S:
+            self._tell(self._origin_s)
         self._collect(self._origin_s + (index + 1) * FRAME_S, index)
         heard = self._frames.pop(index, None)
         self._said[index] = None if heard is None else heard.said
         self._said.pop(index - 2, None)
         return None if heard is None else heard.audio
+
+    def moves(self, speed_rad_s: float) -> None:
+        """How fast the joints of the head beside it move, all together: the noise that they make is known by that."""
+        self._speed_rad_s = speed_rad_s
+
+    def _tell(self, origin_s: float, first: int = 0, said: Floats | None = None) -> None:
+        self._told_speed_rad_s = self._speed_rad_s
+        self._worker.tell(Told(origin_s, first, said, self._speed_rad_s))
 
     def said(self, index: int) -> Floats | None:
         """What the loudspeaker beside it was given in a frame that was taken just now."""

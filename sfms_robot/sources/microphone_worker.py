@@ -66,11 +66,13 @@ class Told:
     Attributes:
         origin_s: loop time 0 in seconds of `time.monotonic`.
         first, said: (n x 640,) what the robot says from frame `first` on: the newest frames, as it may miss some.
+        speed_rad_s: how fast its joints move, all together.
     """
 
     origin_s: float
     first: int = 0
     said: Floats | None = None
+    speed_rad_s: float = 0.0
 
 
 Message = Opened | Heard | dict[str, Any]
@@ -101,6 +103,7 @@ def listen(recording: Recording) -> Generator[Message | None, Told | None, None]
                     front_end.start(told.origin_s, time.monotonic())
                 if isinstance(reference, ToldSpeech) and told.said is not None:
                     reference.tell(told.first, told.said)
+                front_end.speed_rad_s = told.speed_rad_s
                 before = told
             messages: list[Message | None] = [*front_end.frames(time.monotonic())]
             if (now_s := time.monotonic()) >= next_statistics_s:

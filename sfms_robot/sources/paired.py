@@ -23,7 +23,7 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
-from sfms_robot.ports import Sight, Source, Voice
+from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -49,6 +49,7 @@ class PairedSource:
         duration_s: None for one without end.
         latency_s: see `ports.Voice`.
         missing: voice, face, agent_audio: those that are lost.
+        outlets: those behind its parts, each once.
     """
 
     def __init__(
@@ -64,6 +65,8 @@ class PairedSource:
         self.latency_s = 0.0
         self.missing: tuple[str, ...] = ()
         self._voice, self._sight, self._agent = voice, sight, agent
+        behind = [getattr(part, "outlet", None) for part in self._parts().values()]
+        self.outlets: Sequence[Outlet] = list(dict.fromkeys(each for each in behind if each is not None))
         self._judge = FrameJudge()
         self._given = 0
         self._overruns = 0
@@ -88,6 +91,11 @@ class PairedSource:
             self._given += 1
         self.missing = tuple(name for name, part in self._parts().items() if part.lost)
         return frames
+
+    def moves(self, speed_rad_s: float) -> None:
+        """See `ports.Source`; a microphone wants to know."""
+        if (tell := getattr(self._voice, "moves", None)) is not None:
+            tell(speed_rad_s)
 
     def statistics(self) -> Mapping[str, Any]:
         """Of the grid, and under `voice`, `face` and `agent_audio` what these tell of themselves.
@@ -154,6 +162,7 @@ class JudgedSource:
         self.latency_s = inner.latency_s
         self.missing: tuple[str, ...] = ()
         self._inner = inner
+        self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
         self._given = 0
 
@@ -174,11 +183,14 @@ class JudgedSource:
         """Frames so far, what was left out of them, and what the source tells of itself."""
         return {"frames": self._given, "left_out": dict(self._judge.left_out), **self._inner.statistics()}
 
+    def moves(self, speed_rad_s: float) -> None:
+        self._inner.moves(speed_rad_s)
+
     def close(self) -> None:
         self._inner.close()
 
 
-_SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "statistics", "close")
+_SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "moves", "statistics", "close")
 
 
 class FrameJudge:

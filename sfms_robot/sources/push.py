@@ -26,6 +26,7 @@ Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 HEARD_S: Final = 1.0  # a person's voice that is older than this is no use to a listener
 SAID_S: Final = 120.0  # speech is synthesized faster than it is spoken, a sentence at once
 SIGHTINGS: Final = 64  # kept: more than a camera sees until they are asked for
+_JOIN: Final = round(0.02 * AUDIO_HZ)
 _NONE: Final = np.zeros(0, dtype=np.float32)
 
 
@@ -40,17 +41,20 @@ class PushedVoice(LiveVoice):
         self._last_s = 0.0
         self._dropped = 0
 
-    def hear(self, pcm: Pcm, rate_hz: float) -> None:
+    def hear(self, pcm: Pcm, rate_hz: float, captured_s: float | None = None) -> None:
         """The next piece: (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit mono.
 
-        Of one that is longer than a second the newest is kept. Never blocks. Raises ConfigError for another rate, type
-        or shape.
+        Of one that is longer than a second the newest is kept. `captured_s`: `time.monotonic` of its newest sample;
+        None: it counts from this call on. Never blocks. Raises ConfigError for another rate, type or shape.
         """
         check_rate(rate_hz)
         samples = as_floats(pcm)
         kept = samples[-int(HEARD_S * rate_hz) :]
         with self._pushing:
             self._dropped += len(samples) - len(kept)
+            if captured_s is not None:
+                self.push(kept, rate_hz, captured_s, self._now())
+                return
             now_s, piece_s = self._now(), len(kept) / rate_hz
             if now_s - self._last_s > self._longest_s + HEARD_S:
                 self._longest_s = 0.0
@@ -77,8 +81,17 @@ class PushedSight:
         self._origin_s = 0.0
         self._seen: deque[tuple[float, Sighting | None]] = deque(maxlen=SIGHTINGS)  # seconds of `now`
 
-    def see(self, face: FaceFrame | NDArray[np.floating] | None) -> None:
-        """The person's face now, as a `FaceFrame` or (58,) motion; None: it is lost. Never blocks.
+    def see(
+        self,
+        face: FaceFrame | NDArray[np.floating] | None,
+        seen_s: float | None = None,
+        attention: float | None = None,
+    ) -> None:
+        """The person's face, as a `FaceFrame` or (58,) motion; None: it is lost. Never blocks.
+
+        Args:
+            seen_s: `time.monotonic` when it was seen, no earlier than the last one; None: now.
+            attention: see `Sighting`.
 
         Raises ConfigError for another shape.
         """
@@ -87,7 +100,8 @@ class PushedSight:
                 raise ConfigError(f"face has the shape {np.shape(face)}, not ({MOTION_DIM},): pose 6, blendshapes 52")
             face = FaceFrame.of(0.0, face)
         with self._lock:
-            self._seen.append((self._now(), None if face is None else Sighting(face)))
+            at_s = self._now() if seen_s is None else seen_s
+            self._seen.append((at_s, None if face is None else Sighting(face, attention)))
 
     def start(self, origin_s: float) -> None:
         with self._lock:
@@ -109,73 +123,140 @@ class PushedSight:
 
 
 class PushedSpeech:
-    """`ports.Voice` of what the robot says: a queue, for speech is synthesized faster than it is spoken.
+    """`ports.Voice` of what the robot says, each sample at the time at which it is played.
 
-    Nothing until it has said something, silence after that. All methods may be called from any thread.
+    Speech is synthesized faster than it is spoken: two minutes may wait. Nothing until it has said something, silence
+    after that. All methods may be called from any thread; `take` waits for none of them.
     """
 
     lost = False  # what is not pushed is not there
     duration_s: float | None = None
     latency_s = 0.0
 
-    def __init__(self, longest_s: float = SAID_S) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, now: Callable[[], float] = time.monotonic, longest_s: float = SAID_S) -> None:
+        self._now = now
         self._longest = int(longest_s * AUDIO_HZ)
+        self._saying = threading.Lock()  # of who says: the stretch that is resampled
         self._rate_hz = float(AUDIO_HZ)
-        self._resampler = Resampler(self._rate_hz)
-        self._waiting: Floats = _NONE
+        self._resampler: Resampler | None = None  # None: the next piece begins a stretch
+        self._given = 0  # samples of the stretch, at its rate
+        self._began = 0  # samples of 16 kHz since 0 of `now`, as all places
+        self._place = 0  # of the next sample that comes out of the resampler
+        self._lock = threading.Lock()  # of what is to be played; held for no longer than a list takes
+        self._pieces: deque[tuple[int, Floats]] = deque()
+        self._origin = 0
+        self._taken = 0  # up to here it has been asked for
         self._speaks = False
-        self._counts = {"dropped": 0, "not_finite": 0}
+        self._counts = {"dropped": 0, "late": 0, "not_finite": 0}
 
-    def say(self, pcm: Pcm, rate_hz: float) -> None:
-        """What it says from the next frame on, as `PushedVoice.hear`; play it one frame (40 ms) after this call.
+    def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
+        """What it says, as `PushedVoice.hear`.
 
-        A sentence may come in pieces; stay ahead of what is played, or there is a gap. Of more than two minutes that
-        wait the oldest are dropped.
+        Args:
+            at_s: `time.monotonic` when its first sample is played; what was to be played from then on is replaced.
+                None: behind what still waits, or one frame (40 ms) after this call.
+
+        A piece that is within 20 ms of the end of the last one follows it. Stay ahead of what is played: what comes
+        later than that is left out, and counted. So is what is to be played later than in two minutes.
         """
         check_rate(rate_hz)
+        if at_s is not None and not np.isfinite(at_s):
+            raise ConfigError(f"at_s = {at_s!r} is no time")
         samples = as_floats(pcm)
         finite = np.isfinite(samples)
-        with self._lock:
+        soonest = _place(self._now()) + FRAME_SAMPLES
+        with self._saying:
+            at = max(soonest, self._end) if at_s is None else _place(at_s)
+            if abs(at - self._end) <= _JOIN:
+                at = self._end
+            if self._resampler is None or rate_hz != self._rate_hz or at != self._end:
+                self._begin(at, rate_hz)
+            assert self._resampler is not None
+            self._given += len(samples)
             self._counts["not_finite"] += int(samples.size - finite.sum())
-            if rate_hz != self._rate_hz:
-                self._finish()
-                self._rate_hz, self._resampler = rate_hz, Resampler(rate_hz)
-            self._speaks = True
             self._append(self._resampler.push(np.clip(np.where(finite, samples, np.float32(0)), -1.0, 1.0)))
 
+    def hush(self) -> None:
+        """What is still to be played from now on will not be."""
+        with self._saying:
+            self._resampler, self._began, self._given = None, _place(self._now()), 0
+            self._cut(self._began)
+
     def start(self, origin_s: float) -> None:
-        """It is played from when the loop asks for it."""
+        """Loop time 0 is `origin_s` of `time.monotonic`."""
+        with self._lock:
+            self._origin = _place(origin_s)
 
     def take(self, index: int) -> Floats | None:
-        """The next (640,), whatever the index; the end of a sentence is filled up with silence."""
+        """The (640,) that are played in frame `index`, silence where there are none."""
+        begin = self._origin + index * FRAME_SAMPLES
+        if self._saying.acquire(blocking=False):  # else more is being said at this very moment
+            try:
+                if self._resampler is not None and self._place < min(begin + FRAME_SAMPLES, self._end):
+                    self._finish()  # who plays it has no more either
+            finally:
+                self._saying.release()
+        frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
         with self._lock:
             if not self._speaks:
                 return None
-            if len(self._waiting) < FRAME_SAMPLES:
-                self._finish()  # who plays it has no more either
-            frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-            part, self._waiting = self._waiting[:FRAME_SAMPLES], self._waiting[FRAME_SAMPLES:]
-            frame[: len(part)] = part
-            return frame
+            while self._pieces and self._pieces[0][0] + len(self._pieces[0][1]) <= begin:
+                self._pieces.popleft()
+            for place, piece in self._pieces:
+                if place >= begin + FRAME_SAMPLES:
+                    break
+                first, last = max(place, begin), min(place + len(piece), begin + FRAME_SAMPLES)
+                frame[first - begin : last - begin] = piece[first - place : last - place]
+            self._taken = begin + FRAME_SAMPLES
+        return frame
 
     def statistics(self) -> Mapping[str, Any]:
-        """Samples dropped because too many waited, and those that were not finite."""
+        """Samples to be played in more than two minutes (dropped), said too late to be played, or not finite."""
         with self._lock:
             return dict(self._counts)
 
     def close(self) -> None:
         """Nothing is held open."""
 
+    @property
+    def _end(self) -> int:
+        """Where the stretch ends, with what its resampler still holds."""
+        return self._began + round(self._given * AUDIO_HZ / self._rate_hz)
+
+    def _begin(self, at: int, rate_hz: float) -> None:
+        self._finish()
+        self._cut(at)
+        self._rate_hz, self._resampler, self._given = rate_hz, Resampler(rate_hz), 0
+        self._began = self._place = at
+
     def _finish(self) -> None:
         """What was said so far is a whole: let out what the resampler still holds."""
-        self._append(self._resampler.push(_NONE, last=True))
-        self._resampler = Resampler(self._rate_hz)
+        if self._resampler is not None:
+            end = self._end
+            self._append(self._resampler.push(_NONE, last=True))
+            self._resampler, self._began, self._given = None, end, 0
+
+    def _cut(self, at: int) -> None:
+        """Nothing of what was said before is played from `at` on."""
+        with self._lock:
+            while self._pieces and self._pieces[-1][0] + len(self._pieces[-1][1]) > at:
+                place, piece = self._pieces.pop()
+                if place < at:
+                    self._pieces.append((place, piece[: at - place]))
 
     def _append(self, samples: Floats) -> None:
-        waiting = np.concatenate([self._waiting, samples])
-        self._counts["dropped"] += max(0, len(waiting) - self._longest)
-        self._waiting = waiting[-self._longest :]
+        kept = samples[: max(0, _place(self._now()) + self._longest - self._place)]
+        with self._lock:
+            self._speaks = True
+            self._counts["dropped"] += len(samples) - len(kept)
+            self._counts["late"] += min(len(kept), max(0, self._taken - self._place))
+            if len(kept):
+                self._pieces.append((self._place, kept))
+        self._place += len(samples)
+
+
+def _place(time_s: float) -> int:
+    return round(time_s * AUDIO_HZ)
 
 
 def as_floats(pcm: Pcm) -> NDArray[np.float32]:
@@ -192,13 +273,3 @@ def as_floats(pcm: Pcm) -> NDArray[np.float32]:
         return samples.astype(np.float32) / np.float32(32768)
     with np.errstate(over="ignore"):  # what is too large for 32 bits becomes infinite, and is judged as that
         return samples.astype(np.float32)
-
-
-def open_pushed_voice(argument: str) -> PushedVoice:
-    """`--audio push`; it takes no argument."""
-    return PushedVoice()
-
-
-def open_pushed_sight(argument: str) -> PushedSight:
-    """`--face push`; it takes no argument."""
-    return PushedSight()

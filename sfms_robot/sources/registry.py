@@ -34,13 +34,13 @@ def _ours(**kinds: str) -> Kinds:
 
 
 VOICES: Final = _ours(
-    mic="microphone:open_microphone", push="push:open_pushed_voice", browser="browser:open_browser_voice"
+    mic="microphone:open_microphone", push="net_person:open_net_voice", browser="browser:open_browser_voice"
 )
 SIGHTS: Final = _ours(
     live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
-    push="push:open_pushed_sight", browser="browser:open_browser_sight",
+    push="net_person:open_net_sight", browser="browser:open_browser_sight",
 )  # fmt: skip
-AGENT_VOICES: Final = _ours(device="microphone:open_loudspeaker", tcp="tcp_audio:open_tcp_audio")
+AGENT_VOICES: Final = _ours(device="microphone:open_loudspeaker", tcp="net_person:open_net_speech")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ RUNS = {
 
 
 def test_every_example_is_tried_and_under_forty_lines():
-    assert {path.name for path in FOLDER.glob("*.py")} == set(RUNS)
+    assert {path.name for path in FOLDER.glob("*.py")} == {*RUNS, "assistant_loop.py"}  # that one: test_live_page
     for path in FOLDER.glob("*.py"):
         assert len(path.read_text(encoding="utf-8").splitlines()) < 40, path.name
 

@@ -108,3 +108,13 @@ def test_told_speech_is_given_as_late_as_the_echo_canceller_needs_it(first):
     assert speech.take(first + 7) is None
     if first:
         assert not speech.take(0).any()
+
+
+def test_what_is_no_voice_is_turned_down_while_joints_move_and_passes_while_they_stand():
+    levels = []
+    for speed_rad_s in (0.0, 5.0):
+        front_end = FrontEnd()
+        front_end.speed_rad_s = speed_rad_s
+        frames = record(front_end, 1.0)
+        levels.append(np.abs(np.concatenate([frame.audio for frame in frames[5:]])).max())
+    assert levels[0] > 0.15 and levels[1] < 0.01

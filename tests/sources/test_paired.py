@@ -77,7 +77,9 @@ def test_an_object_that_is_no_source_is_told_what_it_lacks():
         def read(self, now_s):
             return []
 
-    with pytest.raises(ConfigError, match="Hum lacks latency_s, start, statistics, close: derive it from sfms_robot"):
+    with pytest.raises(
+        ConfigError, match="Hum lacks latency_s, missing, start, statistics, close: derive it from sfms_robot"
+    ):
         JudgedSource(Hum())
 
 
@@ -87,6 +89,7 @@ def test_an_object_that_is_no_source_is_told_what_it_lacks():
 class Scripted:
     """A voice whose frame i is at hand `late_s[i]` after its end, and a sight whose faces come at `seen_s`."""
 
+    lost = False
     duration_s = None
     latency_s = 0.0
 

@@ -23,7 +23,7 @@ class Person:
         self.now_s = 100.0
         self.voice = PushedVoice(lambda: self.now_s)
         self.sight = PushedSight(lambda: self.now_s)
-        self.speech = PushedSpeech()
+        self.speech = PushedSpeech(lambda: self.now_s)
         self.source = PairedSource(self.voice, self.sight, self.speech, **more)
         self.source.start(100.0)
 
@@ -146,33 +146,130 @@ def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
         person.sight.see(np.zeros(52))
 
 
+def played(speech, frames):
+    """What is played in so many frames from the start on."""
+    return np.concatenate([speech.take(index) for index in range(frames)])
+
+
 @given(st.sampled_from(RATES_HZ), st.lists(st.integers(1, 9000), min_size=1, max_size=12), st.integers(0, 9))
 def test_what_the_robot_says_comes_out_as_the_sound_resampled_at_once(rate_hz, sizes, seed):
+    """A frame after the first call, whatever its pieces, behind one another without a gap."""
     samples = np.random.default_rng(seed).uniform(-1, 1, sum(sizes)).astype(np.float32)
-    speech, pushed = PushedSpeech(), 0
+    speech, pushed = PushedSpeech(lambda: 100.0), 0
+    speech.start(100.04)
     for size in sizes:
         speech.say(samples[pushed : pushed + size], rate_hz)
         pushed += size
     whole = samples if rate_hz == 16000 else soxr.resample(samples, rate_hz, 16000, quality="HQ")
-    out = np.concatenate([speech.take(index) for index in range(len(whole) // 640 + 3)])
+    out = played(speech, len(whole) // 640 + 3)
     np.testing.assert_array_equal(out[: len(whole)], np.clip(whole, -1, 1))
     assert not out[len(whole) :].any()
 
 
 def test_a_robot_that_has_not_spoken_has_no_track_and_one_that_has_is_silent_after():
+    """Said at 0.1 s, it is played at 0.14 s: in the second half of the frame that begins at 0.12 s."""
     person = Person(duration_s=2.0)
-    assert person.read(0.1)[0].agent_audio is None
+    assert [frame.agent_audio for frame in person.read(0.1)] == [None]
     person.speech.say(np.full(640, 0.5), 16000)
-    one, *after = person.read(5.0)
-    assert one.agent_audio.all() and not any(frame.agent_audio.any() for frame in after)
-    assert one.time_s == 0.08 and after[-1].time_s == 2.0 and not person.read(9.0)
+    before, one, two, *after = person.read(5.0)
+    assert not before.agent_audio.any()
+    assert (one.time_s, two.time_s, after[-1].time_s) == (0.12, 0.16, 2.0) and not person.read(9.0)
+    assert not one.agent_audio[:320].any() and one.agent_audio[320:].all()
+    assert two.agent_audio[:320].all() and not two.agent_audio[320:].any()
+    assert not any(frame.agent_audio.any() for frame in after)
 
 
-def test_a_program_that_says_more_than_two_minutes_at_once_keeps_the_newest():
-    speech = PushedSpeech(longest_s=0.08)
+@given(st.integers(-3000, 60_000), st.sampled_from([16000, 24000, 48000]))
+def test_speech_is_placed_at_the_sample_at_which_it_is_played(after, rate_hz):
+    speech = PushedSpeech(lambda: 100.0)
+    speech.start(100.0)
+    speech.say(np.full(rate_hz // 10, 0.5), rate_hz, 100.0 + after / 16000)
+    out = played(speech, 110)
+    assert abs(int((out > 0.25).argmax()) - max(after, 0)) <= 1 or not (out > 0.25).any() and after <= -1600
+    assert np.count_nonzero(out > 0.25) == pytest.approx(max(0, 1600 + min(after, 0)), abs=2)
+
+
+def test_a_piece_near_the_end_of_the_last_follows_it_and_one_further_off_is_where_it_says():
+    speech = PushedSpeech(lambda: 0.0)
+    for at_s in (0.1, 0.215, 0.285, 0.5):
+        speech.say(np.full(1600, 0.5), 16000, at_s)
+    sounds = np.flatnonzero(np.diff(np.r_[0, played(speech, 25) != 0, 0].astype(int)))
+    assert sounds.tolist() == [1600, 6400, 8000, 9600]
+
+
+def test_an_earlier_time_replaces_what_was_to_be_played_from_then_on():
+    speech = PushedSpeech(lambda: 0.0)
+    speech.say(np.full(16000, 0.5), 16000, 0.1)
+    speech.say(np.full(800, -0.5), 16000, 0.3)
+    out = played(speech, 50)
+    assert (out[1600:4800] == 0.5).all() and (out[4800:5600] == -0.5).all() and not out[5600:].any()
+
+
+def test_a_robot_that_is_hushed_says_nothing_from_then_on_and_the_next_sentence_at_once():
+    now_s = 0.0
+    speech = PushedSpeech(lambda: now_s)
+    speech.say(np.full(32000, 0.5), 16000)
+    now_s = 0.2
+    speech.hush()
+    speech.say(np.full(640, -0.5), 16000)
+    out = played(speech, 100)
+    assert (out[640:3200] == 0.5).all() and not out[3200:3840].any() and (out[3840:4480] == -0.5).all()
+    assert not out[4480:].any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.floats(0, 0.015), min_size=50, max_size=50), st.sampled_from([16000, 24000]))
+def test_a_voice_that_is_streamed_as_it_is_played_has_no_gaps(lates_s, rate_hz):
+    """Pieces of 20 ms that come up to 15 ms late, frames taken when they are due: no silence between them."""
+    now_s, out = 0.0, []
+    speech = PushedSpeech(lambda: now_s)
+    for index, late_s in enumerate(lates_s):
+        now_s = index * 0.02 + late_s
+        speech.say(np.full(rate_hz // 50, 0.5), rate_hz)
+        if index % 2:
+            now_s = (index + 1) * 0.02
+            out.append(speech.take(len(out)))
+    sound = np.concatenate(out)
+    first = int((sound > 0.25).argmax())
+    assert first <= 640 + 240 and (sound[first + 32 :] > 0.1).all()
+
+
+def test_what_is_to_be_played_later_than_in_two_minutes_is_left_out():
+    speech = PushedSpeech(lambda: 0.0, longest_s=0.08)
     speech.say(np.r_[np.full(640, 0.1), np.full(1280, 0.2)], 16000)
-    assert (np.concatenate([speech.take(0), speech.take(1)]) == np.float32(0.2)).all()
-    assert speech.statistics() == {"dropped": 640, "not_finite": 0}
+    out = played(speech, 5)
+    assert (out[640:1280] == np.float32(0.1)).all() and not out[1280:].any()
+    assert speech.statistics() == {"dropped": 1280, "late": 0, "not_finite": 0}
+
+
+def test_what_is_said_after_its_time_is_left_out_and_counted():
+    speech = PushedSpeech(lambda: 0.0)
+    speech.say(np.full(640, 0.5), 16000, 0.0)
+    assert speech.take(0).all()
+    speech.say(np.full(1280, -0.5), 16000, 0.01)
+    assert (np.flatnonzero(speech.take(1)) == np.arange(640)).all() and speech.statistics()["late"] == 480
+    with pytest.raises(ConfigError, match="at_s = nan is no time"):
+        speech.say(np.zeros(9), 16000, float("nan"))
+
+
+def test_a_voice_with_times_is_placed_by_them():
+    """A click that was heard at 1.0 s is at 1.0 s, whenever its piece came."""
+    person = Person()
+    click = np.zeros(1600, np.float32)
+    frames = []
+    for index in range(40):
+        sound = click.copy()
+        if index == 10:
+            sound[0] = 1.0
+        person.now_s = 100.0 + (index + 1) * 0.1 + 0.03 * (index % 3)
+        person.voice.hear(sound, 16000, 100.0 + (index + 1) * 0.1)
+        frames += person.read(person.now_s - 100.0)
+    assert (
+        abs(
+            int(np.argmax(np.abs(np.concatenate([f.audio if len(f.audio) else np.zeros(640) for f in frames])))) - 16000
+        )
+        <= 16
+    )
 
 
 def test_calls_may_come_from_any_thread():
@@ -196,4 +293,5 @@ def test_calls_may_come_from_any_thread():
         thread.join()
     frames += person.source.read(20.0)
     said = np.concatenate([frame.agent_audio for frame in frames if frame.agent_audio is not None])
-    assert not raised and np.count_nonzero(said) == 4 * 50 * 160
+    assert not raised
+    assert np.count_nonzero(said) + person.speech.statistics()["late"] == 4 * 50 * 160

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -49,8 +50,8 @@ def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed():
     assert told == ["left:2"] and inner.closed
 
 
-@pytest.mark.parametrize("audio", ["push", "katie", "none", "ear"])
-@pytest.mark.parametrize("face", ["push", "none", str(shipped_speaker("facegood_1114_3_16").face), "eye"])
+@pytest.mark.parametrize("audio", ["push:0", "katie", "none", "ear"])
+@pytest.mark.parametrize("face", ["push:0", "none", str(shipped_speaker("facegood_1114_3_16").face), "eye"])
 @pytest.mark.parametrize("agent_audio", ["katie", "none"])
 def test_any_voice_goes_with_any_face(audio, face, agent_audio):
     theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
@@ -64,13 +65,16 @@ def test_any_voice_goes_with_any_face(audio, face, agent_audio):
 
 
 def test_a_face_that_is_named_goes_without_the_default_voice():
-    assert open_source("default", "push").duration_s is None
+    with closing(open_source("default", "push:0")) as source:
+        assert source.duration_s is None
     assert open_source("default", "none").duration_s == pytest.approx(47.68)
 
 
 def test_a_recording_ends_a_run_also_beside_a_live_face_and_what_is_live_does_not():
-    assert open_source("katie", "push").duration_s == pytest.approx(18.36)
-    assert open_source("push", "auto", agent_audio="katie").duration_s is None
+    with closing(open_source("katie", "push:0")) as source:
+        assert source.duration_s == pytest.approx(18.36)
+    with closing(open_source("push:0", "auto", agent_audio="katie")) as source:
+        assert source.duration_s is None
 
 
 def test_a_whole_source_brings_its_own_face():

@@ -199,15 +199,24 @@ class Robot:
         """
         self._pushed("see").sight.see(face)
 
-    def say(self, pcm: Pcm, rate_hz: float) -> None:
+    def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
         """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
 
-        Play it one frame (40 ms) after it is handed over. Up to two minutes may wait. Never blocks. With a microphone
-        (`audio="mic"`) it is taken out of what is heard. Raises InputError beside another source.
+        Play it one frame (40 ms) after it is handed over, behind what still waits; or say by `at_s` (`time.monotonic`)
+        when its first sample will be played: that replaces what was to be played from then on. Up to two minutes may
+        wait. Never blocks. With a microphone (`audio="mic"`) it is taken out of what is heard. Raises InputError beside
+        another source.
         """
+        self._spoken("say").say(pcm, rate_hz, at_s)
+
+    def hush(self) -> None:
+        """What it still had to say will not be played: you were interrupted. Never blocks."""
+        self._spoken("hush").hush()
+
+    def _spoken(self, what: str) -> PushedSpeech:
         if self._speech is None:
-            raise InputError(f'say() needs audio="push" or "mic"; this robot listens to {self._hears!r}')
-        self._speech.say(pcm, rate_hz)
+            raise InputError(f'{what}() needs audio="push" or "mic"; this robot listens to {self._hears!r}')
+        return self._speech
 
     def _pushed(self, what: str) -> _PushedPerson:
         if self._person is None:

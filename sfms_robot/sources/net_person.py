@@ -1,0 +1,339 @@
+"""Other programs in place of microphone, camera and loudspeaker: `--audio push`, `--face push`, `--agent-audio tcp`.
+
+One server for all flags that name the same address. What programs hand over goes through the sources of calls
+(`push`), with the sender's times in our clock; what the run hears and does is told to those who ask for it.
+
+1. One program feeds each of voice, face and speech. Another is refused by name until the first has gone; one that has
+   sent no voice, or no face, for `SILENT_S` loses its place to whoever asks for it.
+2. Beyond loopback whoever says hello needs the token, which is made anew and printed at every start.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError, PacketError, PortError
+from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.sources.net_clock import SenderClock
+from sfms_robot.sources.net_messages import (
+    FEEDS,
+    MICROPHONE,
+    VERSION,
+    VOICE,
+    Hello,
+    Hush,
+    Message,
+    Seen,
+    Sound,
+    json_message,
+    sound_message,
+)
+from sfms_robot.sources.net_server import Connection, NetServer
+from sfms_robot.sources.push import PushedSight, PushedSpeech, PushedVoice
+
+logger = logging.getLogger(__name__)
+
+PORT: Final = 8765
+LOOPBACK: Final = "127.0.0.1"
+SILENT_S: Final = 2.0
+OLDEST_S: Final = 1.0  # of a voice or a face that is still of use
+FLAGS: Final = {"voice": "--audio push", "face": "--face push", "speech": "--agent-audio tcp"}
+_SPARE_S: Final = 2.0  # of sound, that may come in faster than time passes
+_HIGHEST_PORT: Final = 65535
+
+_open: dict[tuple[str, int], NetPerson] = {}
+_opening: Final = threading.Lock()
+
+
+class NetPerson:
+    """The server's handler: who feeds what, and who wants to be told what.
+
+    Attributes:
+        now: `time.monotonic`, or a test's.
+        token: what a hello has to hold; None: nothing.
+    """
+
+    def __init__(self, flag: str, host: str, port: int, now: Callable[[], float] = time.monotonic) -> None:
+        self.now = now
+        self._place = (host, port)
+        self._feeds: dict[str, NetVoice | NetSight | NetSpeech] = {}
+        self._feeders: dict[str, Connection] = {}
+        self._clocks: dict[Connection, SenderClock] = {}
+        self._heard_s: dict[str, float] = {}
+        self._spare_s = _SPARE_S
+        self._spared_s = now()
+        self._origin_s = 0.0
+        self._state: Mapping[str, Any] | None = None
+        self._counts = dict.fromkeys(("old", "too_fast"), 0)
+        self._server = NetServer(flag, host, port, self)
+        bound = self._server.address
+        self.token = None if ipaddress.ip_address(bound[0]).is_loopback else secrets.token_urlsafe(12)
+        at = f"[{bound[0]}]:{bound[1]}" if ":" in bound[0] else f"{bound[0]}:{bound[1]}"
+        logger.warning(
+            "%s: tcp://%s and ws://%s%s", flag, at, at, "" if self.token is None else f", token {self.token}"
+        )
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port that are bound."""
+        return self._server.address
+
+    # --- what a run opens and tells; from its threads ---
+
+    def join(self, name: str, part: NetVoice | NetSight | NetSpeech) -> None:
+        """`part` takes what programs feed as `name`. Raises PortError when another one does already."""
+        if name in self._feeds:
+            raise PortError(f"{FLAGS[name]}: port {self.address[1]} is used by another run of this program")
+        self._feeds[name] = part
+
+    def leave(self, name: str) -> None:
+        """The last one closes the server. Blocks until it is."""
+        with _opening:
+            self._feeds.pop(name, None)
+            if not self._feeds:
+                _open.pop(self._place, None)
+                self._server.close()
+
+    def start(self, origin_s: float) -> None:
+        """Loop time 0 is `origin_s` of `time.monotonic`. From now on programs are answered."""
+        self._origin_s = origin_s
+        self._server.start()
+
+    def hears(self, audio: Floats, time_s: float) -> None:
+        """What the run hears, (640,), whose newest sample is of loop time `time_s`. Never blocks."""
+        at_s = self._origin_s + time_s
+        self._server.post(lambda: self._send_sound(audio, at_s))
+
+    def tells(self, kind: str, time_s: float, **values: Any) -> None:
+        """An event, or a state, that begins at loop time `time_s`. Never blocks."""
+        told = {"type": kind, "at_s": round(self._origin_s + time_s, 4), **values}
+        self._server.post(lambda: self._send_event(told))
+
+    def statistics(self) -> Mapping[str, Any]:
+        """What the server counts; sound and faces that came too late, or faster than time passes; who feeds what."""
+        feeders = {name: connection.name for name, connection in self._feeders.copy().items()}
+        return {**self._server.counts, **self._counts, "feeders": feeders}
+
+    # --- what programs send; in the server's thread ---
+
+    def received(self, connection: Connection, message: Message) -> None:
+        if isinstance(message, Hello):
+            self._greet(connection, message)
+        elif not connection.greeted:
+            raise PacketError("the first message is no hello")
+        elif isinstance(message, Hush):
+            self._allowed(connection, "speech")
+            speech = self._feeds["speech"]
+            assert isinstance(speech, NetSpeech)
+            speech.hush()
+        elif isinstance(message, Seen):
+            self._see(connection, message)
+        else:
+            self._sound(connection, message)
+
+    def gone(self, connection: Connection) -> None:
+        self._clocks.pop(connection, None)
+        for name in [each for each, feeder in self._feeders.items() if feeder is connection]:
+            del self._feeders[name]
+            logger.info("%s: %s has gone", FLAGS[name], connection.name)
+            part = self._feeds.get(name)
+            if part is not None and name != "speech":  # who has nothing to say is no loss
+                part.lost = True
+            if isinstance(part, NetSight):
+                part.see(None)
+
+    def _greet(self, connection: Connection, hello: Hello) -> None:
+        if connection.greeted:
+            raise PacketError("a second hello")
+        if self.token is not None and not hmac.compare_digest(hello.token.encode(), self.token.encode()):
+            raise PacketError("the token is not the one that the robot printed when it started")
+        if hello.name:
+            connection.name = f"{hello.name} ({connection.name})"
+        for name in sorted(hello.feeds):
+            self._claim(connection, name)
+        for name in hello.feeds:
+            self._feeders[name], self._heard_s[name] = connection, self.now()
+            self._feeds[name].lost = False
+            logger.info("%s: %s", FLAGS[name], connection.name)
+        self._clocks[connection] = SenderClock()
+        connection.greeted, connection.wants = True, hello.wants
+        connection.send(json_message(type="welcome", version=VERSION, sent_s=self.now(), takes=sorted(self._feeds)))
+        if self._state is not None and "events" in hello.wants:
+            connection.send(json_message(**self._state, sent_s=self.now()))
+
+    def _claim(self, connection: Connection, name: str) -> None:
+        if name not in self._feeds:
+            raise PacketError(f"this run takes no {name} from programs ({FLAGS[name]})")
+        feeder = self._feeders.get(name)
+        if feeder is None:
+            return
+        if name == "speech" or self.now() - self._heard_s[name] < SILENT_S:
+            raise PacketError(f"{name} comes from {feeder.name} already")
+        del self._feeders[name]
+        feeder.end(f"{name} now comes from {connection.name}: none came for {SILENT_S:g} s")
+
+    def _allowed(self, connection: Connection, name: str) -> None:
+        if self._feeders.get(name) is not connection:
+            raise PacketError(f"{name} was not announced in its hello")
+        self._heard_s[name] = self.now()
+
+    def _times(self, connection: Connection, message: Sound | Seen) -> tuple[float, float | None]:
+        """Now, and what the sender says of a time in our clock."""
+        now_s = self.now()
+        if not message.at_s:
+            return now_s, None
+        clock = self._clocks[connection]
+        clock.observe(message.sent_s, now_s)
+        return now_s, message.at_s + clock.offset_s
+
+    def _see(self, connection: Connection, message: Seen) -> None:
+        self._allowed(connection, "face")
+        now_s, at_s = self._times(connection, message)
+        if at_s is not None and at_s < now_s - OLDEST_S:
+            self._counts["old"] += 1
+            return
+        sight = self._feeds["face"]
+        assert isinstance(sight, NetSight)
+        sight.see(message.motion, None if at_s is None else min(at_s, now_s), message.attention)
+
+    def _sound(self, connection: Connection, message: Sound) -> None:
+        name = next(name for name, kind in FEEDS.items() if kind == message.kind)
+        self._allowed(connection, name)
+        now_s, at_s = self._times(connection, message)
+        if message.kind != VOICE:
+            speech = self._feeds[name]
+            assert isinstance(speech, NetSpeech)
+            speech.say(message.samples, message.rate_hz, at_s)
+            return
+        if at_s is not None and at_s < now_s - OLDEST_S:
+            self._counts["old"] += 1
+        elif self._in_time(len(message.samples) / message.rate_hz, now_s):
+            voice = self._feeds[name]
+            assert isinstance(voice, NetVoice)
+            voice.hear(message.samples, message.rate_hz, None if at_s is None else min(at_s, now_s))
+
+    def _in_time(self, piece_s: float, now_s: float) -> bool:
+        """Whether no more sound came than time has passed, and a little."""
+        self._spare_s = min(_SPARE_S, self._spare_s + (now_s - self._spared_s))
+        self._spared_s = now_s
+        if piece_s > self._spare_s:
+            self._counts["too_fast"] += 1
+            return False
+        self._spare_s -= piece_s
+        return True
+
+    def _send_sound(self, audio: Floats, at_s: float) -> None:
+        wanting = [each for each in self._server.connections() if "microphone" in each.wants]
+        if wanting:
+            samples = np.rint(np.clip(audio, -1.0, 1.0) * 32767).astype(np.int16)
+            message = sound_message(MICROPHONE, AUDIO_HZ, self.now(), at_s, samples)
+            for connection in wanting:
+                connection.send(message)
+
+    def _send_event(self, told: Mapping[str, Any]) -> None:
+        if told["type"] == "state":
+            self._state = told
+        for connection in self._server.connections():
+            if "events" in connection.wants:
+                connection.send(json_message(**told, sent_s=round(self.now(), 4)))
+
+
+class NetVoice(PushedVoice):
+    """`ports.Voice` of a person whose sound another program has."""
+
+    def __init__(self, outlet: NetPerson) -> None:
+        super().__init__(outlet.now)
+        self.outlet = outlet
+        outlet.join("voice", self)
+
+    def start(self, origin_s: float) -> None:
+        self.outlet.start(origin_s)
+        super().start(origin_s)
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {**super().statistics(), "net": self.outlet.statistics()}
+
+    def close(self) -> None:
+        self.outlet.leave("voice")
+
+
+class NetSight(PushedSight):
+    """`ports.Sight` of a person whom another program sees."""
+
+    def __init__(self, outlet: NetPerson) -> None:
+        super().__init__(outlet.now)
+        self.outlet = outlet
+        outlet.join("face", self)
+
+    def start(self, origin_s: float) -> None:
+        self.outlet.start(origin_s)
+        super().start(origin_s)
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {**super().statistics(), "net": self.outlet.statistics()}
+
+    def close(self) -> None:
+        self.outlet.leave("face")
+
+
+class NetSpeech(PushedSpeech):
+    """`ports.Voice` of a robot for which another program speaks."""
+
+    def __init__(self, outlet: NetPerson) -> None:
+        super().__init__(outlet.now)
+        self.outlet = outlet
+        outlet.join("speech", self)
+
+    def start(self, origin_s: float) -> None:
+        self.outlet.start(origin_s)
+        super().start(origin_s)
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {**super().statistics(), "net": self.outlet.statistics()}
+
+    def close(self) -> None:
+        self.outlet.leave("speech")
+
+
+def open_net_voice(argument: str) -> NetVoice:
+    """`--audio push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
+    return NetVoice(_person("--audio push", argument))
+
+
+def open_net_sight(argument: str) -> NetSight:
+    """`--face push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
+    return NetSight(_person("--face push", argument))
+
+
+def open_net_speech(argument: str) -> NetSpeech:
+    """`--agent-audio tcp[:[HOST:]PORT]`. Raises ConfigError, PortError."""
+    return NetSpeech(_person("--agent-audio tcp", argument))
+
+
+def _person(flag: str, argument: str) -> NetPerson:
+    """The one of that address; its server runs from then on."""
+    place = _parsed(flag, argument)
+    with _opening:
+        if place not in _open:
+            _open[place] = NetPerson(flag, *place)
+        return _open[place]
+
+
+def _parsed(flag: str, argument: str) -> tuple[str, int]:
+    if not argument:
+        return LOOPBACK, PORT
+    host, colon, number = argument.rpartition(":")
+    if not (number.isascii() and number.isdigit() and int(number) <= _HIGHEST_PORT) or (colon and not host):
+        raise ConfigError(
+            f"{flag}:{argument}: {argument!r} is no TCP port ({flag}, {flag}:PORT, {flag}:HOST:PORT; 0 for a free one)"
+        )
+    return host.strip("[]") if colon else LOOPBACK, int(number)

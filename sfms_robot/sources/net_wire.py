@@ -1,0 +1,167 @@
+"""How messages travel: behind their length over TCP, or as a WebSocket's own. Bytes in, bytes out; opens no socket.
+
+Both forms share one port. Who begins with "GET" speaks HTTP and wants a WebSocket: as a length that would be more than
+any message has. Pages of the web may not connect: a browser tells whose page it is (Origin), and only pages that this
+machine serves, or that came from the very address they call, are let in.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterator
+from typing import Final, Protocol
+from urllib.parse import urlsplit
+
+from websockets.exceptions import InvalidHandshake, WebSocketException
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import Request
+from websockets.server import ServerProtocol
+
+from sfms_robot.errors import PacketError
+from sfms_robot.sources.net_messages import LONGEST, MessageBuffer, framed
+
+HTTP: Final = b"GET "
+_REASON: Final = 120  # bytes of a closing frame's text
+
+
+class Wire(Protocol):
+    """One connection's form."""
+
+    def push(self, data: bytes) -> Iterator[bytes | None]:
+        """Messages that are whole now; None for what is none but was to be looked at, as a ping.
+
+        Raises PacketError for bytes after which nothing can be read.
+        """
+
+    def packed(self, message: bytes) -> bytes:
+        """A message as it is sent; empty while the other side is not ready for any."""
+
+    def closing(self, reason: str, refused: bool) -> bytes:
+        """What is sent before the connection is closed."""
+
+    def answer(self) -> bytes:
+        """What the form itself has to send: a handshake, a pong."""
+
+    @property
+    def over(self) -> bool:
+        """Whether the other side has said that it ends."""
+
+
+class TcpWire:
+    """Each message behind its length."""
+
+    over = False
+
+    def __init__(self) -> None:
+        self._buffer = MessageBuffer()
+
+    def push(self, data: bytes) -> Iterator[bytes]:
+        return self._buffer.push(data)
+
+    def packed(self, message: bytes) -> bytes:
+        return framed(message)
+
+    def closing(self, reason: str, refused: bool) -> bytes:
+        return b""
+
+    def answer(self) -> bytes:
+        return b""
+
+
+class WebSocketWire:
+    """A WebSocket (RFC 6455), server's side."""
+
+    def __init__(self) -> None:
+        self._protocol = ServerProtocol(max_size=LONGEST)
+        self._parts: list[bytes] = []
+
+    def push(self, data: bytes) -> Iterator[bytes | None]:
+        self._protocol.receive_data(data)
+        for event in self._protocol.events_received():
+            if isinstance(event, Request):
+                self._shake(event)
+            elif isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+                self._parts.append(bytes(event.data))
+                if event.fin:
+                    message, self._parts = b"".join(self._parts), []
+                    yield message
+            yield None
+        if self._protocol.handshake_exc is not None:
+            raise PacketError(f"no handshake of a WebSocket: {_line(self._protocol.handshake_exc)}")
+        if self._protocol.parser_exc is not None:
+            raise PacketError(f"no WebSocket: {_line(self._protocol.parser_exc)}")
+
+    def packed(self, message: bytes) -> bytes:
+        try:
+            if message[:1] == b"{":
+                self._protocol.send_text(message)
+            else:
+                self._protocol.send_binary(message)
+        except WebSocketException:  # the handshake is not over, or the other side closes
+            return b""
+        return self.answer()
+
+    def closing(self, reason: str, refused: bool) -> bytes:
+        code = CloseCode.POLICY_VIOLATION if refused else CloseCode.GOING_AWAY
+        try:
+            self._protocol.send_close(code, reason.encode()[:_REASON].decode(errors="ignore"))
+        except WebSocketException:
+            return b""
+        return self.answer()
+
+    def answer(self) -> bytes:
+        return b"".join(self._protocol.data_to_send())
+
+    @property
+    def over(self) -> bool:
+        return self._protocol.close_expected()
+
+    def _shake(self, request: Request) -> None:
+        problem = origin_problem(request.headers.get("Origin"), request.headers.get("Host", ""))
+        if problem is None:
+            self._protocol.send_response(self._protocol.accept(request))
+        else:
+            self._protocol.send_response(self._protocol.reject(403, problem + "\n"))
+            raise PacketError(problem)
+
+
+def origin_problem(origin: str | None, host: str) -> str | None:
+    """Why a page may not connect; None where it may, or where who connects is no browser (`origin` None).
+
+    A name that somebody else gives to this machine's address proves nothing, so what is no loopback name must be an
+    address, that of `host`.
+    """
+    if origin is None:
+        return None
+    page, here = _host(origin), _host(f"//{host}")
+    if page == "localhost" or (page is not None and _is_loopback(page)):
+        return None
+    if page is not None and page == here and _address(page) is not None:
+        return None
+    return f"a page of {origin[:80]!r} may not connect"
+
+
+def _host(url: str) -> str | None:
+    try:
+        return urlsplit(url).hostname
+    except ValueError:
+        return None
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def _is_loopback(host: str) -> bool:
+    address = _address(host)
+    return address is not None and address.is_loopback
+
+
+def _line(error: BaseException) -> str:
+    """The innermost cause, on one line."""
+    while error.__cause__ is not None and isinstance(error, InvalidHandshake):
+        error = error.__cause__
+    return " ".join(str(error).split())[:160] or type(error).__name__

@@ -1,0 +1,164 @@
+"""The protocol's bytes: what is written is read, whatever else comes is one line, at any split."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.errors import PacketError
+from sfms_robot.sources.net_clock import SenderClock
+from sfms_robot.sources.net_messages import (
+    FACE,
+    LONGEST,
+    SPEECH,
+    VOICE,
+    Hello,
+    Hush,
+    MessageBuffer,
+    Seen,
+    Sound,
+    face_message,
+    framed,
+    json_message,
+    parse_message,
+    sound_message,
+)
+
+TIMES = st.floats(allow_nan=False, allow_infinity=False, min_value=1e-3)
+HELLO = json_message(type="hello", version=1, feeds=["speech"], wants=["events"])
+
+
+@given(st.sampled_from([VOICE, SPEECH]), st.integers(4000, 384_000), TIMES, TIMES, st.lists(st.integers(-32768, 32767)))
+def test_sound_is_read_as_it_was_written(kind, rate_hz, sent_s, at_s, values):
+    told = parse_message(sound_message(kind, rate_hz, sent_s, at_s, np.array(values, np.int16)))
+    assert isinstance(told, Sound)
+    assert (told.kind, told.rate_hz, told.sent_s, told.at_s) == (kind, rate_hz, sent_s, at_s)
+    assert told.samples.dtype == np.int16 and told.samples.tolist() == values
+
+
+@given(TIMES, st.integers(0, 99), st.none() | st.floats(0, 1, width=32))
+def test_a_face_is_read_as_it_was_written(at_s, seed, attention):
+    motion = np.random.default_rng(seed).uniform(-1, 1, 58).astype(np.float32)
+    told = parse_message(face_message(1.0, at_s, motion, attention))
+    assert isinstance(told, Seen) and told.attention == attention
+    np.testing.assert_array_equal(told.motion, motion)
+    lost = parse_message(face_message(1.0, at_s, None))
+    assert isinstance(lost, Seen) and lost.motion is None
+
+
+def test_a_hello_says_what_it_feeds_and_wants():
+    assert parse_message(HELLO) == Hello(frozenset({"speech"}), frozenset({"events"}), "", "")
+    assert parse_message(b'{"type": "hush"}') == Hush()
+
+
+HEADER = struct.Struct("<BBHIdd")
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"", "of 0 bytes, shorter than a header"),
+        (bytes(23), "of 23 bytes"),
+        (bytes(LONGEST + 1), "more than 262144 bytes"),
+        (HEADER.pack(VOICE, 2, 0, 16000, 0, 0), "version 2, not 1"),
+        (HEADER.pack(9, 1, 0, 16000, 0, 0), r"kind 9, which a robot is not sent \(voice, face, speech\)"),
+        (HEADER.pack(VOICE, 1, 7, 16000, 0, 0), "kind 1"),
+        (HEADER.pack(VOICE, 1, 0, 100, 0, 0), r"sound of 100 samples a second \(4000 to 384000\)"),
+        (HEADER.pack(VOICE, 1, 0, 16000, 0, 0) + b"abc", "not of 16-bit samples"),
+        (HEADER.pack(VOICE, 1, 0, 16000, float("nan"), 0), "a time that is not finite"),
+        (HEADER.pack(VOICE, 1, 0, 16000, 0, 5), "a time without the time of sending"),
+        (HEADER.pack(FACE, 1, 0, 0, 0, 0) + bytes(4 * 57), "a face of 228 bytes, not of 58 or 59 float32"),
+        (HEADER.pack(FACE, 1, 0, 0, 0, 0) + np.full(58, np.inf, "<f4").tobytes(), "not finite"),
+        (b'{"type": "hello"', "JSON that cannot be read"),
+        (b"{" + b'"a":[' * 700, "JSON that cannot be read"),
+        (b"{" + b" " * 5000, "JSON of more than 4096 bytes"),
+        (b'{"type": "halt"}', r"type that a robot is not sent \(hello, hush\)"),
+        (b'{"type": "hello", "version": 2}', "hello: version is not 1"),
+        (b'{"type": "hello", "version": 1, "feeds": ["voices"]}', "feeds is no list of voice, face, speech"),
+        (b'{"type": "hello", "version": 1, "feeds": "voice"}', "feeds is no list"),
+        (b'{"type": "hello", "version": 1, "wants": [[]]}', "wants is no list of microphone, events"),
+        (b'{"type": "hello", "version": 1, "name": "a\\nb"}', "name is no text of up to 64"),
+        (b'{"type": "hello", "version": 1, "token": 5}', "token is no text"),
+    ],
+)
+def test_what_is_no_message_is_one_line(data, told):
+    with pytest.raises(PacketError, match=told) as raised:
+        parse_message(data)
+    assert "\n" not in str(raised.value)
+
+
+def mutated(rng, message):
+    """A message with some of its bytes changed, cut out or put in."""
+    data = bytearray(message)
+    for _ in range(rng.integers(0, 4)):
+        at = int(rng.integers(0, len(data) + 1))
+        data[at : at + int(rng.integers(0, 4))] = rng.bytes(int(rng.integers(0, 4)))
+    return bytes(data)
+
+
+def parses(data):
+    try:
+        return parse_message(data)
+    except PacketError:
+        return None
+
+
+@pytest.mark.parametrize("count", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_random_messages_raise_nothing_else_and_what_is_read_is_finite(count):
+    rng, read = np.random.default_rng(count), 0
+    good = [
+        HELLO, b'{"type": "hush"}', sound_message(VOICE, 16000, 1.0, 2.0, np.arange(8, dtype=np.int16)),
+        sound_message(SPEECH, 48000, 1.0, 0.0, np.zeros(0, np.int16)), face_message(1.0, 2.0, np.zeros(58), 0.5),
+    ]  # fmt: skip
+    for index in range(count):
+        data = rng.bytes(int(rng.integers(0, 64))) if index % 5 == 0 else mutated(rng, good[index % len(good)])
+        told = parses(data)
+        read += told is not None
+        if isinstance(told, Seen) and told.motion is not None:
+            assert np.isfinite(told.motion).all() and np.isfinite([told.sent_s, told.at_s]).all()
+    assert count / 10 < read < count
+
+
+@given(st.lists(st.binary(min_size=1, max_size=40), max_size=8), st.lists(st.integers(1, 30), min_size=1))
+def test_a_stream_is_cut_into_its_messages_however_it_arrives(messages, cuts):
+    stream, buffer, out, at = b"".join(framed(each) for each in messages), MessageBuffer(), [], 0
+    while at < len(stream):
+        size = cuts[at % len(cuts)]
+        out += buffer.push(stream[at : at + size])
+        at += size
+    assert out == messages
+
+
+@pytest.mark.parametrize("length", [0, LONGEST + 1, 2**32 - 1])
+def test_a_length_that_no_message_has_ends_the_stream(length):
+    with pytest.raises(PacketError, match=f"a message of {length} bytes"):
+        list(MessageBuffer().push(struct.pack("<I", length)))
+
+
+@given(st.floats(-1e6, 1e6), st.lists(st.floats(0.001, 0.3), min_size=40, max_size=200), st.floats(-2e-4, 2e-4))
+def test_a_senders_clock_is_never_early_and_late_by_the_quickest_way(origin_s, delays_s, drift):
+    """A message every 50 ms by a clock that drifts up to 200 ppm."""
+    clock = SenderClock()
+    for index, delay_s in enumerate(delays_s):
+        true_s = 1000.0 + index * 0.05
+        sent_s = origin_s + (true_s - 1000.0) * (1 + drift)
+        clock.observe(sent_s, true_s + delay_s)
+        late_s = sent_s + clock.offset_s - true_s
+        assert late_s >= -20.0 * abs(drift)
+        recent = delays_s[max(0, index - 190) : index + 1]
+        assert late_s <= min(recent) + 20.0 * abs(drift) + 1e-6
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
+def test_a_clock_that_is_set_is_followed_at_once(step_s):
+    clock = SenderClock()
+    clock.observe(10.0, 100.0)
+    clock.observe(10.1 + step_s, 100.1)
+    assert clock.offset_s == pytest.approx(90.0 - step_s)
+
+
+def test_json_that_is_sent_is_json():
+    assert json.loads(json_message(type="state", state="idle", why=[])) == {"type": "state", "state": "idle", "why": []}
