@@ -34,7 +34,7 @@ class StampedSource(Source):
         self._inner, self._now = inner, now
         self._origin_s = 0.0
         self.duration_s = inner.duration_s
-        self.latency_s, self.missing = inner.latency_s, inner.missing
+        self.latency_s, self.missing, self.outlets = inner.latency_s, inner.missing, inner.outlets
 
     def loop_s(self) -> float:
         """Loop time."""
@@ -48,6 +48,9 @@ class StampedSource(Source):
         frames = self._inner.read(now_s)
         self.latency_s, self.missing = self._inner.latency_s, self._inner.missing
         return frames
+
+    def moves(self, speed_rad_s: float) -> None:
+        self._inner.moves(speed_rad_s)
 
     def statistics(self) -> Mapping[str, Any]:
         return self._inner.statistics()
