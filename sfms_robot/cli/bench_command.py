@@ -61,6 +61,10 @@ def bench(
         from sfms_robot.errors import ConfigError
 
         raise ConfigError(f"--data {data}: only 'bench own-voice' takes calls")
+    if torture and name is not Bench.live:
+        from sfms_robot.errors import ConfigError
+
+        raise ConfigError("--torture: only 'bench live' is tortured")
     if name is Bench.webcam:
         _webcam(json)
         return

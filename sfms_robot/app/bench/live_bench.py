@@ -75,6 +75,7 @@ def live(minutes: float, audio: Audio, say: Say) -> dict[str, Any]:
 
     Raises ConfigError where PulseAudio is not installed and `audio` asks for it.
     """
+    check_audio(audio)
     say("an empty loop")
     idle = idle_loop(IDLE_S)
     with TemporaryDirectory() as folder, live_person(Path(folder), audio) as person:
@@ -153,14 +154,18 @@ class LivePerson:
         self.phone_silent = threading.Event()
 
 
+def check_audio(audio: Audio) -> None:
+    """Raises ConfigError where PulseAudio is needed and missing."""
+    if audio == "mic" and (missing := SoundServer.missing()) is not None:
+        raise ConfigError(f"bench live: PulseAudio is not installed ({missing}, or --audio push)")
+
+
 @contextmanager
 def live_person(folder: Path, audio: Audio) -> Iterator[LivePerson]:
-    """Somebody talks and is seen. Raises ConfigError where PulseAudio is missing."""
+    """Somebody talks and is seen."""
     with ExitStack() as stack:
         server, environment = None, {}
         if audio == "mic":
-            if (missing := SoundServer.missing()) is not None:
-                raise ConfigError(f"bench live: PulseAudio is not installed ({missing}, or --audio push)")
             server = SoundServer(folder)
             server.start(SINK)
             stack.callback(server.stop)

@@ -37,6 +37,7 @@ from sfms_robot.app.bench.live_bench import (
     Audio,
     LivePerson,
     Say,
+    check_audio,
     children,
     free_port,
     idle_loop,
@@ -91,6 +92,7 @@ def torture(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str, 
 
     Raises ConfigError without PulseAudio, BusError when the run does not begin.
     """
+    check_audio(audio)
     idle = idle_loop(3.0)
     each = max(1, round(EACH * minutes / MINUTES))
     order = [kind for kind in KINDS for _ in range(each)]
