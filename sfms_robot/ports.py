@@ -159,7 +159,9 @@ class PlanFeed(Protocol):
         """Plans that became visible by `now_s`, oldest first. Never blocks."""
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` in words, `restarts`, `skipped_frames` (the listener could not keep up), `step_ms` p50 and p99."""
+        """`state` in words, `restarts`, `skipped_frames` (the listener could not keep up), `step_ms` p50 and p99; `hop`
+        and `budget_ms` (`config.hop`) where they are known.
+        """
 
     def close(self) -> None: ...
 

@@ -450,6 +450,8 @@ def run(
             return {"version": 1, "head": opened.config.name, "port": options.port, "exit": "done", **_present(opened)}
         if isinstance(feed, ListenerProcess):
             feed.wait_loaded()
+            tick_s = 1.0 / opened.rate_hz
+            feed.choose_hop_by(lambda: source.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
         turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
         recorder = _recorder(options, opened.config)
         log = run_log(opened)

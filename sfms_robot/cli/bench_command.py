@@ -22,13 +22,27 @@ class Bench(StrEnum):
     campaign = "campaign"
     fuzz = "fuzz"
     webcam = "webcam"
+    live = "live"
+
+
+class LiveAudio(StrEnum):
+    mic = "mic"
+    push = "push"
 
 
 def bench(
     name: Bench = typer.Argument(Bench.all, help="What to measure."),
     head: str | None = typer.Option(None, help="For 'lead', and for 'retarget --frames': this head."),
     frames: int | None = typer.Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
-    minutes: float = typer.Option(0.0, min=0.0, help="For 'fuzz': go on for so long; 0 = a million bytes each."),
+    minutes: float = typer.Option(
+        0.0,
+        min=0.0,
+        help="For 'fuzz' and 'live': go on for so long; 0 = a million bytes each, 10 min, 30 of torture.",
+    ),
+    audio: LiveAudio = typer.Option(LiveAudio.mic, help="For 'live': an emulated microphone, or calls."),
+    torture: bool = typer.Option(
+        False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."
+    ),
     against: Path | None = typer.Option(
         None, help="A folder with another installation: it becomes the peer, and the two run in turn."
     ),
@@ -40,14 +54,22 @@ def bench(
 
     'campaign' tries every fault on every family of servos, 'fuzz' random bytes; both end with exit code 1 when
     something is not as it should be; 'own-voice' is what a head hears while it speaks and moves, 'webcam' what
-    MediaPipe sees of a face that is known. They and 'memory' are not part of 'all'.
+    MediaPipe sees of a face that is known, 'live' a head that hears a microphone and sees a phone. They and 'memory'
+    are not part of 'all'.
     """
     if data is not None and name is not Bench.own_voice:
         from sfms_robot.errors import ConfigError
 
         raise ConfigError(f"--data {data}: only 'bench own-voice' takes calls")
+    if torture and name is not Bench.live:
+        from sfms_robot.errors import ConfigError
+
+        raise ConfigError("--torture: only 'bench live' is tortured")
     if name is Bench.webcam:
         _webcam(json)
+        return
+    if name is Bench.live:
+        _live(minutes, audio, torture, json)
         return
     if name is Bench.own_voice:
         _own_voice(data, json)
@@ -77,6 +99,28 @@ def _webcam(json: bool) -> None:
     print_rows(webcam_bench.table(result))
     for name, ms in result["timings_ms"].items():
         print(f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})")
+
+
+def _live(minutes: float, audio: LiveAudio, torture: bool, json: bool) -> None:
+    from sfms_robot.app.bench import live_bench, torture_bench
+    from sfms_robot.cli.show import print_rows
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr)
+
+    if torture:
+        result = torture_bench.torture(minutes or torture_bench.MINUTES, audio.value, say)
+        rows, lines = torture_bench.table(result), torture_bench.words(result)
+    else:
+        result = live_bench.live(minutes or live_bench.MINUTES, audio.value, say)
+        rows, lines = live_bench.table(result), live_bench.words(result)
+    if json:
+        print(json_module.dumps(result))
+    else:
+        print_rows(rows)
+        print("\n".join(lines))
+    if torture and not result["passed"]:
+        raise typer.Exit(1)
 
 
 def _own_voice(folder: Path | None, json: bool) -> None:

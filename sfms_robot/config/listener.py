@@ -8,12 +8,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, Positive
-from sfms_robot.frames import BLENDSHAPES, FRAME_S, SPACE_CHANNELS
+from sfms_robot.config.hop import default_hop
+from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS
 
 Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
-STEP_S = 0.025  # what one plan may take at most (99th percentile, paper size, two CPU cores)
-LEAD_S = 0.080  # longest lead of a joint: the slowest servo's lag and a tick
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
 Placement = Literal["exact", "static", "static_paper", "learned_paper", "learned"]
 
@@ -107,7 +106,8 @@ class Sfms(Listener):
     `groups` are written out, or named as a whole: `{preset: one|four|all, levels: [...], keyframes: k}`.
 
     Attributes:
-        hop: frames between plans; auto: `default_hop`.
+        hop: frames between plans; auto: chosen at the start of a run by what is measured (`hop.choose_hop`), and
+            `default_hop` where nothing is.
         audio: features of the voice: mel (4 rows of 128 per frame, aligned by convolution and max-pool), mfcc78 or
             wav2vec2 (768), one row per frame.
         wav2vec2: folder of a model in the layout of transformers, beside config.yaml or absolute; only streams need it.
@@ -184,14 +184,6 @@ class Sfms(Listener):
     @property
     def window_frames(self) -> int:
         return self.past_frames + self.future_frames
-
-
-def default_hop(horizon: int, step_s: float = STEP_S, lead_s: float = LEAD_S) -> int:
-    """The largest hop that leaves plans long enough for their making and the lead: hop T + step + lead <= (H - 1) T.
-
-    At least 1.
-    """
-    return max(1, math.floor((horizon - 1) - (step_s + lead_s) / FRAME_S + 1e-9))
 
 
 def preset_groups(space: str, wanted: dict[str, Any]) -> dict[str, Any]:

@@ -11,12 +11,14 @@ minute and it stays down.
 A machine that cannot keep up must not answer what was said seconds ago: when more than half a second is waiting, the
 listener goes on at the newest frame. What it did not hear is counted, and said once.
 
-A listener that is loaded is not yet fast: it builds its graphs while the head eases in. What it did not hear meanwhile
-it hears then, as fast as it can.
+A listener that is loaded is not yet fast: it builds its graphs while the head eases in, and measures what a plan takes
+on this machine. By that, and by how late the source has been for half a second, its hop is chosen. What it did not hear
+meanwhile it hears then, as fast as it can.
 
-    parent -> child    pickle: (name, seed), then SpeakerFrame after SpeakerFrame
+    parent -> child    pickle: (name, seed), then SpeakerFrame after SpeakerFrame; between them, once, an int: the hop
     child -> parent    pickle: (kind, value, number)
         loaded         nothing is wrong with it
+        probed         value is a `Probe`; it waits for its hop
         ready          it listens
         done, plan     a frame was taken; for a plan, value is the answer and number the ms that it took
         skipped        number frames were left out
@@ -32,12 +34,16 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import IO, Any, Final
 
+import numpy as np
+
 from sfms_robot.child_process import end_child, start_child, take_pipes
+from sfms_robot.config.hop import HopChoice, Latencies, choose_hop
 from sfms_robot.errors import ModelError, RobotError
-from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -48,9 +54,23 @@ CLOSE_LIMIT_S: Final = 0.2
 HUNG_S: Final = 1.0
 RESTART_S: Final = 3.0
 RESTARTS: Final = 5  # in a minute; more than that is no accident
+PROBE_S: Final = 0.5
+PROBE_PLANS: Final = 100
+SETTLED_FRAMES: Final = FRAME_HZ // 2  # after so many a source has measured how late it is
 _MINUTE_S: Final = 60.0
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a listener measured of itself: frames of a plan, hops that it can be run with, and what a plan takes."""
+
+    horizon: int
+    hop: int
+    hops: tuple[int, ...]
+    step_p50_s: float
+    step_p99_s: float
 
 
 class ListenerProcess:
@@ -70,6 +90,10 @@ class ListenerProcess:
         self._state = "starting"
         self._waits_since_s: float | None = None  # for the answer to the oldest frame that has none yet
         self._unanswered = 0
+        self._latencies: Callable[[Probe], Latencies] | None = None
+        self._probe: Probe | None = None  # that is to be answered with a hop
+        self._choice: HopChoice | None = None
+        self._pushed = 0
         self._child = _Child(name, seed)
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
@@ -83,10 +107,20 @@ class ListenerProcess:
         self.close()
         raise ModelError(value or f"the listener process was not loaded after {limit_s:g} s")
 
+    def choose_hop_by(self, source_latency_s: Callable[[], float], lead_s: float, tick_s: float) -> None:
+        """Choose the hop when it is known what a plan takes here, for a source that is so late, a loop of `tick_s` and
+        leads up to `lead_s`. Without this call the listener keeps its own.
+        """
+        self._latencies = lambda probe: Latencies(
+            probe.horizon, source_latency_s(), probe.step_p50_s, probe.step_p99_s, lead_s, tick_s
+        )
+
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Never blocks; what a child that does not listen leaves behind is dropped, oldest first, and counted."""
         if self._state in ("starting", "given up"):
             return
+        self._pushed += 1
+        self._tell_hop()
         self._skipped += self._child.send(frame)
         self._unanswered += 1
         self._waits_since_s = now_s if self._waits_since_s is None else self._waits_since_s
@@ -107,12 +141,16 @@ class ListenerProcess:
         return self._state in ("hung", "given up") or (self._restarts > 0 and self._state != "listening")
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` (starting, building, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms`."""
+        """`state` (starting, building, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms`, `hop` and
+        `budget_ms` (see `config.hop`), None as long as no hop was chosen.
+        """
         return {
             "state": self._state,
             "restarts": self._restarts,
             "skipped_frames": self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),
+            "hop": None if self._choice is None else self._choice.hop,
+            "budget_ms": None if self._choice is None else self._choice.budget_ms,
         }
 
     def close(self) -> None:
@@ -129,6 +167,9 @@ class ListenerProcess:
             self._answered(int(number), now_s)
         elif kind == "loaded":
             self._state = "building"
+        elif kind == "probed":
+            self._probe = value
+            self._tell_hop()
         elif kind == "ready":
             if self._restarts:
                 log.warning("the listener is back")
@@ -142,6 +183,20 @@ class ListenerProcess:
                 self._step_ms.add(number)
                 return value  # type: ignore[no-any-return]
         return None
+
+    def _tell_hop(self) -> None:
+        """Answer a probe, as soon as that can be."""
+        probe = self._probe
+        if probe is None or (self._latencies is not None and self._pushed < SETTLED_FRAMES):
+            return
+        self._probe = None
+        if self._latencies is None:
+            self._child.tell_hop(probe.hop)
+            return
+        before, self._choice = self._choice, choose_hop(probe.hops, self._latencies(probe))
+        self._child.tell_hop(self._choice.hop)
+        if self._choice.given_up and (before is None or before.given_up is None):
+            log.warning("a plan every %d frames: %s", self._choice.hop, self._choice.given_up)
 
     def _answered(self, frames: int, now_s: float) -> None:
         self._unanswered = max(0, self._unanswered - frames)
@@ -161,7 +216,7 @@ class ListenerProcess:
                 self._state = "hung"
 
     def _restart(self, why: str, now_s: float) -> None:
-        self._child.close()
+        self._child.kill()
         self._restarted_s = [at_s for at_s in self._restarted_s if now_s - at_s < _MINUTE_S]
         if len(self._restarted_s) >= RESTARTS:
             log.error("the listener %s again, %d times in a minute: the head goes on without it", why, RESTARTS)
@@ -170,7 +225,7 @@ class ListenerProcess:
         log.warning("the listener %s: started anew", why)
         self._restarted_s.append(now_s)
         self._restarts += 1
-        self._state, self._waits_since_s, self._unanswered = "starting", None, 0
+        self._state, self._waits_since_s, self._unanswered, self._probe = "starting", None, 0, None
         self._child = _Child(self._name, self._seed + self._restarts)
 
 
@@ -180,6 +235,7 @@ class _Child:
     def __init__(self, name: str, seed: int) -> None:
         self._process = start_child("sfms_robot.listeners.process:main")
         self._frames: deque[Any] = deque([(name, seed)])
+        self._hop: int | None = None
         self._changed = threading.Condition()
         self._messages: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
         self.ended = False
@@ -197,6 +253,12 @@ class _Child:
             self._changed.notify()
         return dropped
 
+    def tell_hop(self, hop: int) -> None:
+        """It goes before all frames that wait, and is never dropped."""
+        with self._changed:
+            self._hop = hop
+            self._changed.notify()
+
     def message(self) -> tuple[str, Any, float] | None:
         try:
             return self._messages.get_nowait()
@@ -210,11 +272,19 @@ class _Child:
         except queue.Empty:
             return "error", None, 0.0
 
+    def kill(self) -> None:
+        """Returns at once, also where the child is stopped; the reader sees to the rest."""
+        self._process.kill()
+        self._hang_up()
+
     def close(self) -> None:
+        self._hang_up()
+        end_child(self._process, CLOSE_LIMIT_S)
+
+    def _hang_up(self) -> None:
         with self._changed:
             self._closing = True
             self._changed.notify()
-        end_child(self._process, CLOSE_LIMIT_S)
 
     def _write(self) -> None:
         pipe = self._process.stdin
@@ -222,10 +292,13 @@ class _Child:
         try:
             while True:
                 with self._changed:
-                    self._changed.wait_for(lambda: self._closing or self._frames)
+                    self._changed.wait_for(lambda: self._closing or self._frames or self._hop)
                     if self._closing:
                         break
-                    item = self._frames.popleft()
+                    if self._hop:
+                        item, self._hop = self._hop, None
+                    else:
+                        item = self._frames.popleft()
                 pickle.dump(item, pipe, protocol=5)
                 pipe.flush()
             pipe.close()
@@ -256,34 +329,59 @@ def threads() -> int:
 def main() -> None:
     """Load what the first message names, then listen until the pipe ends."""
     frames, plans = take_pipes()
-    inbox = Inbox()
+    inbox, hops = Inbox(), queue.SimpleQueue[int]()
     try:
         name, seed = pickle.load(frames)
     except (EOFError, pickle.UnpicklingError):
         return  # the parent ended before it said what to load
-    threading.Thread(target=_receive, args=(frames, inbox), daemon=True).start()
+    threading.Thread(target=_receive, args=(frames, inbox, hops), daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(NICE)
     try:
         import torch
 
-        from sfms_robot.listeners.registry import build_graphs, load_listener
+        from sfms_robot.listeners.registry import at_hop, build_graphs, hops_of, load_listener
 
         torch.set_num_threads(threads())
         listener = load_listener(name, graphs=False)
         _say(plans, "loaded")
         build_graphs(listener)
+        choices = hops_of(listener)
+        p50_s, p99_s = plan_times_s(at_hop(listener, min(choices)))
+        _say(plans, "probed", Probe(listener.horizon, listener.hop, tuple(choices), p50_s, p99_s))
     except RobotError as error:
         _say(plans, "error", str(error))
         return
-    listen(listener, seed, inbox, plans)
+    listen(at_hop(listener, hops.get()), seed, inbox, plans)
 
 
-def _receive(frames: IO[bytes], inbox: Inbox) -> None:
+def plan_times_s(listener: Listener, limit_s: float = PROBE_S) -> tuple[float, float]:
+    """Median and 99th percentile of what a plan takes, on silence; a step without one counts where no plan was made.
+
+    Blocks for `limit_s`, or `PROBE_PLANS` plans, and one step more.
+    """
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    memory = listener.start(0)
+    planned_s: list[float] = []
+    other_s: list[float] = []
+    began_s = time.perf_counter()
+    while len(planned_s) < PROBE_PLANS and (not other_s + planned_s or time.perf_counter() - began_s < limit_s):
+        step_s = time.perf_counter()
+        plan, memory = listener.step(SpeakerFrame((len(planned_s) + len(other_s) + 1) * FRAME_S, silence), memory)
+        (other_s if plan is None else planned_s).append(time.perf_counter() - step_s)
+    p50_s, p99_s = np.percentile(planned_s or other_s, [50, 99])
+    return float(p50_s), float(p99_s)
+
+
+def _receive(frames: IO[bytes], inbox: Inbox, hops: queue.SimpleQueue[int]) -> None:
     """Frames into the inbox. The end of the pipe is the end of this process, whatever it computes."""
     try:
         while True:
-            inbox.put(pickle.load(frames))
+            item = pickle.load(frames)
+            if isinstance(item, int):
+                hops.put(item)
+            else:
+                inbox.put(item)
     except (EOFError, OSError, pickle.UnpicklingError):
         os._exit(0)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from sfms_robot.config.listener_kinds import LISTENER_KINDS
 from sfms_robot.listeners.checkpoint import load_config
@@ -31,6 +32,16 @@ def build_graphs(listener: Listener) -> None:
     build = getattr(listener, "build_graphs", None)
     if build is not None:
         build()
+
+
+def hops_of(listener: Listener) -> Sequence[int]:
+    """The hops that it can be run with; its own alone, for one that names none."""
+    return tuple(getattr(listener, "hops", (listener.hop,)))
+
+
+def at_hop(listener: Listener, hop: int) -> Listener:
+    """The listener, planning every `hop` frames, one of `hops_of`."""
+    return listener if hop == listener.hop else cast(Listener, cast(Any, listener).at_hop(hop))
 
 
 def one_thread() -> None:

@@ -37,7 +37,7 @@ class InlineFeed:
 
     def statistics(self) -> Mapping[str, Any]:
         """See `ports.PlanFeed`; in virtual time a step has no duration."""
-        return IDLE_FEED
+        return {**IDLE_FEED, "hop": self._listener.hop}
 
     def close(self) -> None:
         """Nothing to give back."""

@@ -167,8 +167,10 @@ def realtime_priority(wanted: bool = True) -> Iterator[str]:
 @contextmanager
 def _fifo() -> Iterator[str]:
     try:
-        before = (os.sched_getscheduler(0), os.sched_getparam(0))
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
+        before = (os.sched_getscheduler(0) | os.SCHED_RESET_ON_FORK, os.sched_getparam(0))
+        # What is started meanwhile, such as a listener that died, is not to compete with the loop.
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
     except (AttributeError, OSError) as error:
         yield f"refused: {error}"
         return

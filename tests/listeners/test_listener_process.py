@@ -13,7 +13,15 @@ import pytest
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
 from sfms_robot.listeners import process
-from sfms_robot.listeners.process import MOST_WAITING, RESTARTS, Inbox, ListenerProcess, listen
+from sfms_robot.listeners.process import (
+    MOST_WAITING,
+    RESTARTS,
+    SETTLED_FRAMES,
+    Inbox,
+    ListenerProcess,
+    listen,
+    plan_times_s,
+)
 
 SILENCE = np.zeros(640, np.float32)
 
@@ -86,6 +94,26 @@ def test_a_slow_listener_answers_the_newest_frame_and_tells_how_many_it_left_out
     assert messages[2][2] == 59 and messages[3][1].made_at_s == pytest.approx(60 * FRAME_S)
 
 
+class Planner:
+    """Plans on every third frame."""
+
+    horizon, hop = 8, 3
+
+    def start(self, seed):
+        return 0
+
+    def step(self, speaker, memory):
+        plan = Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), np.zeros((1, 58), np.float32))
+        return None if memory % self.hop else plan, memory + 1
+
+
+def test_a_probe_measures_plans_and_ends_even_without_time():
+    p50_s, p99_s = plan_times_s(Planner(), limit_s=0.0)
+    assert 0 < p50_s == p99_s
+    p50_s, p99_s = plan_times_s(Planner())
+    assert 0 < p50_s <= p99_s
+
+
 # --- the parent and a real child -----------------------------------------------------------------------------------
 
 
@@ -125,6 +153,25 @@ def test_plans_come_back_and_torch_stays_in_the_child(listener):
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_the_hop_is_chosen_when_the_source_has_settled_and_a_new_child_is_told_one_too():
+    child = ListenerProcess("sfms-small", 3)
+    child.choose_hop_by(lambda: 0.06, 0.047, 0.01)
+    try:
+        child.wait_loaded()
+        child._take(*child._child.next(60.0), 0.0)  # probed
+        for frame in frames(SETTLED_FRAMES):
+            assert child.statistics()["hop"] is None
+            child.push(frame, 0.0)
+        assert child.statistics()["hop"] == 1 and child.statistics()["budget_ms"]["source"] == 60
+        plans = []
+        while len(plans) < SETTLED_FRAMES:
+            plan = child._take(*child._child.next(60.0), 0.0)
+            plans += [plan] if plan is not None else []
+        assert [round(plan.made_at_s / FRAME_S) for plan in plans] == list(range(1, SETTLED_FRAMES + 1))
+    finally:
+        child.close()
+
+
 def test_an_unknown_listener_is_told_by_name():
     child = ListenerProcess("nobody", 0)
     with pytest.raises(ModelError, match="nobody"):
@@ -137,7 +184,7 @@ def test_a_child_that_dies_is_started_anew_and_listens_again(listener):
     listener._child._process.wait()
     while listener.statistics()["restarts"] == 0:  # until the reading thread has seen the end of the pipe
         listener.poll(1.0)
-    for kind in ("loaded", "ready"):
+    for kind in ("loaded", "probed", "ready"):
         message = listener._child.next(60.0)
         assert message[0] == kind
         listener._take(*message, 1.0)

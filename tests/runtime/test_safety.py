@@ -1,6 +1,9 @@
 """Signals become a request to end, and easing is smooth at both ends."""
 
+import os
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -69,3 +72,11 @@ def test_priority_says_what_became_of_it() -> None:
         assert outcome == "fifo" or outcome.startswith("refused: ")
     with realtime_priority(wanted=False) as outcome:
         assert outcome == "not asked for"
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no real-time priority here")
+def test_what_is_started_meanwhile_does_not_inherit_the_priority() -> None:
+    code = "import os; print(os.sched_getscheduler(0))"
+    with realtime_priority():
+        told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(told.stdout) == os.SCHED_OTHER

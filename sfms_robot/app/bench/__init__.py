@@ -13,7 +13,8 @@
 | lead | how late the joints are | the same joints with no lead |
 | listener.plan | one plan on one thread | the time it covers: hop x 40 ms |
 
-`bench webcam` (`webcam_bench.py`), `campaign` and `fuzz` have tables of their own.
+`bench webcam` (`webcam_bench.py`), `live` (`live_bench.py`, `torture_bench.py`), `campaign` and `fuzz` have tables of
+their own.
 """
 
 from __future__ import annotations

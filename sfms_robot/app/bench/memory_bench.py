@@ -24,15 +24,16 @@ _LOOKS: Final = 20  # an hour
 
 
 class ResidentMemory:
-    """An observer that looks at the memory of its own process."""
+    """An observer that looks at the memory of its own process every so often."""
 
-    def __init__(self) -> None:
+    def __init__(self, every_s: float = _HOUR_S / _LOOKS) -> None:
+        self._every_s = every_s
         self.times_s: list[float] = []
         self.resident_mb: list[float] = []
         self._page_mb = os.sysconf("SC_PAGE_SIZE") / 2**20
 
     def tick(self, seen: Tick) -> None:
-        if seen.time_s >= len(self.times_s) * _HOUR_S / _LOOKS:
+        if seen.time_s >= len(self.times_s) * self._every_s:
             pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
             self.times_s.append(seen.time_s)
             self.resident_mb.append(pages * self._page_mb)

@@ -105,12 +105,17 @@ def _bare_mb() -> float:
     return int(done.stdout) / 1024
 
 
-def _run(env: Mapping[str, str] | None) -> WireTimes:
+def first_goal_s(words: Sequence[str], env: Mapping[str, str] | None = None) -> float | None:
+    """`run` with these words is typed -> its first goal position on the wire; None when none came. Blocks."""
+    seen = _run(env, words)
+    return None if seen.first_goal_s is None else seen.first_goal_s - seen.began_s
+
+
+def _run(env: Mapping[str, str] | None, more: Sequence[str] = ("--audio", DEFAULT_SPEAKER)) -> WireTimes:
     """One second of listening on emulated servos, in real time."""
     head = load_head(HEAD)
     with launch(emulated(head)["main"]) as chain, _relay(chain.device, head.buses["main"].baud) as (port, hosts):
-        person = ["--audio", DEFAULT_SPEAKER]
-        words = ["run", "--head", HEAD, "--port", port, *person, "--duration", str(RUN_S), "--seed", "1", "--json"]
+        words = ["run", "--head", HEAD, "--port", port, "--duration", str(RUN_S), "--seed", "1", "--json", *more]
         seen = WireTimes(time.monotonic())
         hosts.append(seen)
         process = subprocess.Popen(

@@ -42,6 +42,8 @@ def run_report(
         "tick": log.tick_report(rate_hz, elapsed_s),
         "latency_ms": _latency(log, real),
         "listener_step_ms": heard.pop("step_ms"),
+        "hop": heard.pop("hop", None),
+        "budget_ms": heard.pop("budget_ms", None),
         "listener_state": heard,
         "bus": dict(bus.statistics()),
         "limits": {

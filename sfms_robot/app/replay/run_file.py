@@ -129,6 +129,12 @@ def read_recording(folder: Path | str) -> RunRecording:
     return found.recording()
 
 
+def states_of(folder: Path) -> list[tuple[float, str, tuple[str, ...]]]:
+    """Every state of a recorded run: since when, its name, why."""
+    records = (each for file in parts_of(folder) for each in _records(file))
+    return [(told["time_s"], told["state"], tuple(told["why"])) for kind, told in records if kind == "/state"]
+
+
 def summary(recording: RunRecording) -> dict[str, Any]:
     """What is in a recording, for the command line."""
     return {

@@ -9,6 +9,7 @@ fades over `seam_frames`.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -121,6 +122,17 @@ class SfmsListener:
     @property
     def hop(self) -> int:
         return self.settings.hop_frames
+
+    @property
+    def hops(self) -> Sequence[int]:
+        """Those that `at_hop` may be asked for."""
+        return range(1, self.horizon + 1) if self.settings.hop == "auto" else (self.hop,)
+
+    def at_hop(self, hop: int) -> SfmsListener:
+        """The same weights and graphs, planning every `hop` frames."""
+        other = copy.copy(self)
+        other.settings = self.settings.model_copy(update={"hop": hop})
+        return other
 
     @property
     def horizon(self) -> int:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_sfms import guided_listener, plans_of, speech, tiny_listener
 
-from sfms_robot.config.listener import default_hop
+from sfms_robot.config.hop import default_hop
 from sfms_robot.frames import FRAME_S, SpeakerFrame
 from sfms_robot.listeners.sfms.draw import sample
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context

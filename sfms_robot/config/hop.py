@@ -1,0 +1,142 @@
+"""How often a listener plans: its hop, in frames of T = 40 ms.
+
+A sound comes at any time within a hop, and reaches the goals after
+
+    0 .. hop T      until the frame ends that is planned with
+    source          until that frame is whole, and the next tick gives it to the listener
+    step            until the plan is made, and the next tick's goals are the first of it
+    T               more where a plan is a single frame, which is played one frame late (`motion.timeline`)
+
+Half of all sounds come in the later half of a hop: that is p50, and p95 are 0.95 of it.
+
+A plan of H frames is followed until the next one is there, which is hop T + source + step after its own last speaker
+frame. What it still knows by then, of (H - 1) T, is left for leads. (A single frame that is played late knows T.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from sfms_robot.frames import FRAME_S
+
+STEP_S: Final = 0.025  # what one plan may take at most (99th percentile, paper size, two CPU cores)
+LEAD_S: Final = 0.080  # longest lead of a joint: the slowest servo's lag and a tick
+P50_S: Final = 0.095  # wanted from a sound to the first goal of a plan that knows of it
+P95_S: Final = 0.135
+_EPS_S: Final = 1e-9
+
+
+@dataclass(frozen=True)
+class Latencies:
+    """What is measured of a run before its hop is chosen, in seconds.
+
+    Attributes:
+        horizon: frames of a plan, H.
+        source_s: from the end of a frame to the moment that it is whole.
+        step_p50_s, step_p99_s: of a plan.
+        lead_s: the longest that a joint asks for.
+        tick_s: period of the servo loop.
+    """
+
+    horizon: int
+    source_s: float
+    step_p50_s: float
+    step_p99_s: float
+    lead_s: float
+    tick_s: float
+
+    def goal_s(self, hop: int, share: float, step_s: float) -> float:
+        """From a sound, `share` of a hop before the end of it, to the first goal of a plan that knows of it."""
+        heard_s = _next_tick(self.source_s, self.tick_s)
+        played_late_s = FRAME_S if self.horizon == 1 else 0.0
+        return share * hop * FRAME_S + _next_tick(heard_s + step_s, self.tick_s) + played_late_s
+
+    def p50_s(self, hop: int) -> float:
+        return self.goal_s(hop, 0.5, self.step_p50_s)
+
+    def p95_s(self, hop: int) -> float:
+        return self.goal_s(hop, 0.95, self.step_p99_s)
+
+    def left_s(self, hop: int) -> float:
+        """What a plan still knows when the next one comes; below 0: it has run out by then."""
+        return (max(self.horizon - 1, 1) - hop) * FRAME_S - self.source_s - self.step_p99_s
+
+    def fits(self, hop: int) -> bool:
+        """Whether the leads have room, sounds are answered in time, and the listener keeps up."""
+        return (
+            self.left_s(hop) >= self.lead_s - _EPS_S
+            and self.p50_s(hop) <= P50_S + _EPS_S
+            and self.p95_s(hop) <= P95_S + _EPS_S
+            and self.keeps_up(hop)
+        )
+
+    def keeps_up(self, hop: int) -> bool:
+        """A plan takes half of its hop at most: what was said while graphs were built is still to be caught up with."""
+        return self.step_p99_s <= hop * FRAME_S / 2
+
+
+@dataclass(frozen=True)
+class HopChoice:
+    """A hop, where its time goes, and in words what did not fit; None: all did."""
+
+    hop: int
+    budget_ms: dict[str, float]
+    given_up: str | None
+
+
+def default_hop(horizon: int, step_s: float = STEP_S, lead_s: float = LEAD_S) -> int:
+    """The largest hop that leaves plans long enough for their making and the lead: hop T + step + lead <= (H - 1) T.
+
+    At least 1. For virtual time and training, where nothing is measured.
+    """
+    return max(1, math.floor((horizon - 1) - (step_s + lead_s) / FRAME_S + _EPS_S))
+
+
+def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:
+    """The largest of `hops` (at least one) that fits; where none does, the smallest with which the listener keeps up:
+    of all these it gives up least.
+    """
+    fitting = [hop for hop in hops if measured.fits(hop)]
+    if fitting:
+        hop = max(fitting)
+    else:
+        hop = min((hop for hop in hops if measured.keeps_up(hop)), default=max(hops))
+    cut_s = min(max(measured.lead_s - measured.left_s(hop), 0.0), measured.lead_s)
+    budget_s = {
+        "horizon": measured.horizon * FRAME_S,
+        "hop": hop * FRAME_S,
+        "source": measured.source_s,
+        "step": measured.step_p99_s,
+        "lead": measured.lead_s,
+        "lead_cut": cut_s,
+        "tick": measured.tick_s,
+        "sound_to_goal_p50": measured.p50_s(hop),
+        "sound_to_goal_p95": measured.p95_s(hop),
+    }
+    return HopChoice(hop, {name: round(1e3 * value, 1) for name, value in budget_s.items()}, _given_up(hop, measured))
+
+
+def _given_up(hop: int, measured: Latencies) -> str | None:
+    if measured.fits(hop):
+        return None
+    lost = []
+    short_s = measured.lead_s - measured.left_s(hop)
+    if short_s > _EPS_S:
+        cut_ms = min(short_s, measured.lead_s) * 1e3
+        lost.append(f"the longest lead of {measured.lead_s * 1e3:.0f} ms is {cut_ms:.0f} ms shorter")
+    p50_s, p95_s = measured.p50_s(hop), measured.p95_s(hop)
+    if p50_s > P50_S + _EPS_S or p95_s > P95_S + _EPS_S:
+        lost.append(
+            f"a sound is answered after {p50_s * 1e3:.0f} ms, p95 {p95_s * 1e3:.0f} ms"
+            f" (wanted: {P50_S * 1e3:.0f}, {P95_S * 1e3:.0f})"
+        )
+    if not measured.keeps_up(hop):
+        lost.append(f"a plan takes {measured.step_p99_s * 1e3:.0f} of a hop's {hop * FRAME_S * 1e3:.0f} ms")
+    return "; ".join(lost)
+
+
+def _next_tick(time_s: float, tick_s: float) -> float:
+    return math.ceil(time_s / tick_s - 1e-6) * tick_s

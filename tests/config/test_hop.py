@@ -1,0 +1,75 @@
+"""The hop is the largest that leaves room for leads and answers sounds in time; else the one that gives up least."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.config.hop import P50_S, P95_S, Latencies, choose_hop
+from sfms_robot.frames import FRAME_S
+
+HOPS = range(1, 9)
+seconds = st.floats(0.0, 0.3)
+measured = st.builds(
+    lambda horizon, source, p50, more, lead, tick: Latencies(horizon, source, p50, p50 + more, lead, tick),
+    st.integers(1, 16), seconds, seconds, seconds, seconds, st.sampled_from([0.005, 0.01, 0.02, 0.04]),
+)  # fmt: skip
+
+
+@given(measured)
+def test_a_hop_that_fits_is_chosen_and_no_larger_one_fits(latencies):
+    choice = choose_hop(HOPS, latencies)
+    fitting = [hop for hop in HOPS if latencies.fits(hop)]
+    assert (choice.given_up is None) == bool(fitting)
+    if fitting:
+        assert choice.hop == max(fitting)
+
+
+@given(measured)
+def test_what_fits_keeps_the_sum_of_the_budget_and_both_figures(latencies):
+    choice = choose_hop(HOPS, latencies)
+    if choice.given_up is None:
+        spent_s = choice.hop * FRAME_S + latencies.source_s + latencies.step_p99_s + latencies.lead_s
+        assert spent_s <= max(latencies.horizon - 1, 1) * FRAME_S + 1e-6
+        assert latencies.p50_s(choice.hop) <= P50_S + 1e-6 and latencies.p95_s(choice.hop) <= P95_S + 1e-6
+        assert choice.budget_ms["lead_cut"] == 0
+
+
+@given(measured, st.integers(1, 7))
+def test_a_smaller_hop_never_fits_worse_while_the_listener_keeps_up(latencies, hop):
+    if latencies.fits(hop + 1) and latencies.keeps_up(hop):
+        assert latencies.fits(hop)
+
+
+@given(measured)
+def test_where_nothing_fits_no_hop_that_keeps_up_leaves_more_or_is_sooner(latencies):
+    choice = choose_hop(HOPS, latencies)
+    if choice.given_up is not None:
+        for hop in filter(latencies.keeps_up, HOPS):
+            assert latencies.left_s(choice.hop) >= latencies.left_s(hop) - 1e-9
+            assert latencies.p95_s(choice.hop) <= latencies.p95_s(hop) + 1e-9
+
+
+@given(measured, st.integers(1, 8))
+def test_a_hop_that_is_given_stays(latencies, hop):
+    assert choose_hop([hop], latencies).hop == hop
+
+
+@pytest.mark.parametrize("source_s, step_s, hop", [(0.0, 0.006, 3), (0.02, 0.006, 2), (0.06, 0.006, 1)])
+def test_a_later_source_asks_for_a_shorter_hop(source_s, step_s, hop):
+    choice = choose_hop(HOPS, Latencies(8, source_s, step_s, step_s, 0.047, 0.01))
+    assert (choice.hop, choice.given_up) == (hop, None)
+
+
+def test_what_is_given_up_is_said_with_its_figures():
+    slow = choose_hop(HOPS, Latencies(8, 0.15, 0.02, 0.02, 0.06, 0.01))
+    assert (slow.hop, slow.given_up) == (1, "a sound is answered after 190 ms, p95 208 ms (wanted: 95, 135)")
+    alone = choose_hop([1], Latencies(1, 0.0, 0.006, 0.007, 0.047, 0.01))
+    assert alone.given_up == "the longest lead of 47 ms is 47 ms shorter" and alone.budget_ms["lead_cut"] == 47
+    hurried = choose_hop(HOPS, Latencies(8, 0.0, 0.5, 0.6, 0.08, 0.01))
+    assert hurried.hop == 8 and "a plan takes 600 of a hop's 320 ms" in hurried.given_up
+
+
+def test_a_sound_waits_half_a_hop_then_for_two_ticks():
+    latencies = Latencies(8, 0.012, 0.006, 0.018, 0.0, 0.01)
+    assert latencies.p50_s(2) == pytest.approx(0.04 + 0.02 + 0.01)
+    assert latencies.p95_s(2) == pytest.approx(0.076 + 0.02 + 0.02)
