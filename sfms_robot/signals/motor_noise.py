@@ -1,49 +1,80 @@
-"""The noise of a head's own motors: its spectrum at every speed, learned while nobody speaks."""
+"""The noise of a head's own motors: its spectrum at every speed, learned while nobody speaks, and speech without it.
+
+A Wiener filter after Ephraim and Malah's decision-directed estimate of how much speech there is (1984). The commanded
+speed says which spectrum to expect, so noise that comes and goes with every nod needs no time to be tracked. Only the
+speech network hears the result: what the filter does to a voice is not meant for ears.
+"""
 
 from __future__ import annotations
 
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
+from sfms_robot.frames import FRAME_SAMPLES, Doubles, Floats
 
-BAND_EDGES_HZ: Final = (
-    100, 200, 300, 400, 510, 630, 770, 920, 1080, 1270, 1480, 1720, 2000, 2320, 2700, 3150, 3700, 4400, 5300,
-    6400, 7700,
-)  # fmt: skip
-SPEED_EDGES_RAD_S: Final = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # of all joints together
-STILL_RAD_S: Final = SPEED_EDGES_RAD_S[1]
-_STEP: Final = 0.05  # per frame: of a band's mean towards what is heard
-_QUIETEST: Final = 1e-10
-_CLEAREST: Final = 4  # bands that a voice must stand out in
+SPEED_EDGES_RAD_S: Final = np.geomspace(0.03, 20.0, 14)  # of all joints together
+STILL_RAD_S: Final = 0.1
+SUPPRESSION_LATENCY_SAMPLES: Final = 160  # half a window: 10 ms
+_WINDOW: Final = 2 * SUPPRESSION_LATENCY_SAMPLES
+_BINS: Final = _WINDOW // 2 + 1
+_STEP: Final = 0.0125  # per window: of a mean spectrum towards what is heard
+_OVERSUBTRACTION: Final = 1.5
+_LEAST_GAIN: Final = 0.1
+_MEMORY: Final = 0.9  # of the speech found in the window before
+_QUIETEST: Final = 1e-14
 
 
 class MotorNoise:
-    """Mean level of 20 Bark bands, one spectrum for each range of the summed speed of all joints. Memory is fixed.
+    """Mean power spectrum for each range of the summed speed of all joints. Causal; memory is fixed.
 
-    A range that was never met has the spectrum of nothing: whoever speaks there is heard.
+    A range that was never met has the spectrum of nothing: there a frame passes as it is.
     """
 
     def __init__(self) -> None:
-        self._floor_db: Doubles = np.full((len(SPEED_EDGES_RAD_S) + 1, len(BAND_EDGES_HZ) - 1), -100.0)
-        self._met = np.zeros(len(self._floor_db), np.int64)
+        self._noise: Doubles = np.full((len(SPEED_EDGES_RAD_S) + 1, _BINS), _QUIETEST)
+        self._met = np.zeros(len(self._noise), np.int64)
+        self._past: Doubles = np.zeros(SUPPRESSION_LATENCY_SAMPLES)
+        self._overlap: Doubles = np.zeros(SUPPRESSION_LATENCY_SAMPLES)
+        self._speech: Doubles = np.zeros(_BINS)  # power of the speech in the last window
+        self._last: tuple[int, Doubles] = (0, np.zeros((0, _BINS)))  # range and power spectra of the last frame
 
-    def excess_db(self, frame: Floats, speed_rad_s: ArrayLike) -> float:
-        """How far a frame (640,) stands out of the noise of that speed: mean of its four clearest bands.
+    def suppress(self, frame: Floats, speed_rad_s: ArrayLike) -> Floats:
+        """The next frame (640,) -> (640,) without the noise of that speed, `SUPPRESSION_LATENCY_SAMPLES` late.
 
         `speed_rad_s`: one number or (J,), signs do not matter.
         """
-        above = band_levels_db(frame) - self._floor_db[_range(speed_rad_s)]
-        return float(np.sort(above)[-_CLEAREST:].mean())
+        seen = np.concatenate([self._past, frame])
+        self._past = seen[FRAME_SAMPLES:]
+        windows = np.lib.stride_tricks.sliding_window_view(seen, _WINDOW)[::SUPPRESSION_LATENCY_SAMPLES]
+        spectra = np.fft.rfft(windows * _TAPER)  # (4, 161)
+        power = np.abs(spectra) ** 2
+        at = int(np.searchsorted(SPEED_EDGES_RAD_S, total_speed(speed_rad_s)))
+        self._last = at, power
+        halves = np.fft.irfft(spectra * self._gains(power, self._noise[at])) * _TAPER
+        first, second = np.split(halves, 2, axis=1)
+        clean = first + np.concatenate([self._overlap[None], second[:-1]])
+        self._overlap = second[-1]
+        out: Floats = clean.ravel().astype(np.float32)
+        return out
 
-    def learn(self, frame: Floats, speed_rad_s: ArrayLike) -> None:
-        """A frame (640,) in which nobody spoke."""
-        at = _range(speed_rad_s)
-        self._met[at] += 1
-        step = max(_STEP, 1.0 / self._met[at])
-        self._floor_db[at] += step * (band_levels_db(frame) - self._floor_db[at])
+    def learn(self) -> None:
+        """Nobody spoke in the frame that was given last."""
+        at, power = self._last
+        for spectrum in power:
+            self._met[at] += 1
+            self._noise[at] += max(_STEP, 1.0 / self._met[at]) * (spectrum - self._noise[at])
+
+    def _gains(self, power: Doubles, noise: Doubles) -> Doubles:
+        """(4, 161) each."""
+        noise = _OVERSUBTRACTION * noise + _QUIETEST
+        gains = np.empty_like(power)
+        for window, gain in zip(power, gains, strict=True):
+            speech_to_noise = (_MEMORY * self._speech + (1 - _MEMORY) * np.maximum(window - noise, 0.0)) / noise
+            gain[:] = np.maximum(speech_to_noise / (1 + speech_to_noise), _LEAST_GAIN)
+            self._speech = gain**2 * window
+        return gains
 
 
 def total_speed(speed_rad_s: ArrayLike) -> float:
@@ -51,16 +82,4 @@ def total_speed(speed_rad_s: ArrayLike) -> float:
     return float(np.abs(np.asarray(speed_rad_s, np.float64)).sum())
 
 
-def band_levels_db(frame: Floats) -> Doubles:
-    """(640,) -> (20,) dB of full scale."""
-    power = np.abs(np.fft.rfft(frame * _WINDOW)) ** 2 / FRAME_SAMPLES**2
-    levels: Doubles = 10 * np.log10(np.add.reduceat(power, _FIRST_BINS)[:-1] + _QUIETEST)
-    return levels
-
-
-def _range(speed_rad_s: ArrayLike) -> int:
-    return int(np.searchsorted(SPEED_EDGES_RAD_S, total_speed(speed_rad_s)))
-
-
-_WINDOW: Final = np.hanning(FRAME_SAMPLES)
-_FIRST_BINS: Final = np.array(BAND_EDGES_HZ) * FRAME_SAMPLES // AUDIO_HZ
+_TAPER: Final[NDArray[np.float64]] = np.sin(np.pi * np.arange(_WINDOW) / _WINDOW)  # its square adds up to one

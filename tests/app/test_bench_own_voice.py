@@ -35,3 +35,13 @@ def test_own_voice_is_not_the_person_and_the_person_is_heard():
     assert result["echo_latency_ms"] <= 10.0
     assert in_turns["own_voice_taken"] < 0.02 and in_turns["person_missed"] < 0.05
     assert talking_over["own_voice_taken"] < 0.05 and talking_over["person_missed_in_double_talk"] < 0.15
+
+
+@pytest.mark.slow
+def test_a_head_that_moves_hears_the_person_and_no_one_where_nobody_is():
+    pytest.importorskip("pyroomacoustics")
+    moving = Condition("office", None, -10.0, False)
+    alone = Condition("office", None, 0.0, False, person=False)
+    with_person, nobody = own_voice(conditions=(moving, alone))["conditions"]
+    assert with_person["person_missed"] < 0.1
+    assert nobody["person_missed"] is None and nobody["nobody_taken"] < 0.02

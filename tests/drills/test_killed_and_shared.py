@@ -49,7 +49,7 @@ def test_after_a_kill_the_watchdog_of_each_servo_has_tripped(device, chain):
 def test_the_second_run_on_a_port_is_refused_and_names_the_first(device, chain):
     with run(HEAD, device) as first:
         listening(first, chain)
-        code, out, err = command("run", "--head", HEAD, "--port", device, "--duration", 1, "--json")
+        code, out, err = command("run", "--head", HEAD, "--port", device, "--audio", "none", "--duration", 1, "--json")
         assert code == 3 and f"pid {first.pid}" in err and len(err.splitlines()) == 1
         assert json.loads(out.splitlines()[-1])["exit_code"] == 3
         listening(first, chain)  # it goes on

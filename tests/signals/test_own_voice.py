@@ -13,7 +13,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import InputError
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
-from sfms_robot.signals.motor_noise import MotorNoise
+from sfms_robot.signals.motor_noise import SUPPRESSION_LATENCY_SAMPLES, MotorNoise
 from sfms_robot.signals.own_voice_gate import OwnVoiceGate
 from sfms_robot.signals.speech_probability import WINDOW, SpeechProbability
 
@@ -115,15 +115,19 @@ def test_the_person_is_heard():
     assert len(loud) > 50 and sum(frame.voice for frame in loud) > 0.9 * len(loud)
 
 
-def test_learned_motor_noise_is_not_a_voice_and_another_speed_has_none():
+def test_learned_motor_noise_is_taken_away_and_at_another_speed_nothing_is():
     motors = MotorNoise()
-    hum = noise(640 * 100, -30)
-    for k in range(90):
-        motors.learn(hum[k * 640 : (k + 1) * 640], [0.5, -0.5])
-    fresh = hum[90 * 640 : 91 * 640]
-    assert motors.excess_db(fresh, 1.0) < 6  # the sum of speeds is what counts
-    assert motors.excess_db(fresh, 20.0) > 30  # never met: nothing is known to be noise
-    assert motors.excess_db(4 * fresh, 1.0) > 10
+    hum = noise(640 * 100, -30).reshape(-1, 640)
+    for frame in hum[:90]:
+        motors.suppress(frame, [0.5, -0.5])
+        motors.learn()
+    assert energy_db(motors.suppress(hum[90], 1.0)) < -42  # the sum of speeds is what counts
+    assert energy_db(motors.suppress(8 * hum[91], 1.0)) > -18  # louder than ever
+    motors.suppress(hum[92], 20.0)
+    late = np.concatenate([hum[93][-SUPPRESSION_LATENCY_SAMPLES:], hum[94][:-SUPPRESSION_LATENCY_SAMPLES]])
+    motors.suppress(hum[93], 20.0)
+    np.testing.assert_allclose(motors.suppress(hum[94], 20.0), late, atol=1e-6)  # never met: nothing is known
+    assert SUPPRESSION_LATENCY_SAMPLES <= 160  # 10 ms
 
 
 def test_a_window_is_judged_when_it_is_whole():

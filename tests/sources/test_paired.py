@@ -78,7 +78,7 @@ def test_an_object_that_is_no_source_is_told_what_it_lacks():
             return []
 
     with pytest.raises(
-        ConfigError, match="Hum lacks latency_s, missing, start, statistics, close: derive it from sfms_robot"
+        ConfigError, match="Hum lacks latency_s, missing, start, moves, statistics, close: derive it from sfms_robot"
     ):
         JudgedSource(Hum())
 

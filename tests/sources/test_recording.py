@@ -143,7 +143,7 @@ def test_a_robots_voice_alone_lasts_as_long_as_it_speaks():
     assert recorded(voice(3), None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
 
 
-@pytest.mark.parametrize(("name", "said"), [("gone.wav", "no such file"), ("device:x", "not available yet")])
+@pytest.mark.parametrize(("name", "said"), [("gone.wav", "no such file"), ("browser:x", "no such file")])
 def test_a_robots_voice_that_is_not_there_is_named(name, said):
     with pytest.raises(ConfigError, match=f"--agent-audio {name}: {said}"):
         open_source("none", "none", agent_audio=name)

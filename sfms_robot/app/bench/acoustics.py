@@ -6,7 +6,7 @@ Everything is float64 at 16 kHz. Levels are root mean squares over the frames in
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -33,6 +33,7 @@ _PERSON_M, _LOUDSPEAKER_M, _MOTORS_M = (1.2, 0.3, 0.2), (0.02, 0.0, -0.12), (0.0
 _LOUDSPEAKER_DELAY: Final = 640  # samples from the reference to the loudspeaker, 40 ms
 _HISS_DB: Final = -72.0
 _ORDER: Final = 30  # of reflections, at most
+_TRUTH_GAINS: Final = (2.0, 16.0)  # clean speech; truth does not change with what the gate asks
 _ALTERNATE_FRAMES: Final = 100  # own voice goes on and off by this when it talks over the person
 
 
@@ -66,10 +67,15 @@ def read_call(folder: Path, name: str) -> Call:
     return Call(name, person, speaks(person), own, speaks(own))
 
 
+def without_person(call: Call) -> Call:
+    """The same call with a silent caller."""
+    return replace(call, person=np.zeros_like(call.person), person_speaks=np.zeros_like(call.person_speaks))
+
+
 def speaks(track: Doubles) -> Bools:
     """(n * 640,) clean -> (n,): the network finds speech likely around the middle of the frame."""
     loud = track / max(1e-9, float(np.sqrt(np.mean(track**2)))) * 10 ** (-26 / 20)
-    found = np.array(SpeechProbability().push(loud.astype(np.float32)))
+    found = np.array(SpeechProbability(_TRUTH_GAINS).push(loud.astype(np.float32)))
     middles = (np.arange(len(track) // FRAME_SAMPLES) + 0.5) * FRAME_SAMPLES / WINDOW - 0.5
     likely: Bools = np.interp(middles, np.arange(len(found)), found) > 0.5
     return likely
@@ -141,6 +147,8 @@ def _talking_over(call: Call) -> tuple[Doubles, Bools]:
 
 
 def _at_level(sound: Doubles, active: Bools, level_db: float) -> Doubles:
+    if not active.any():
+        return sound
     loud = sound.reshape(-1, FRAME_SAMPLES)[active]
     return sound * 10 ** (level_db / 20) / max(1e-9, float(np.sqrt(np.mean(loud**2))))
 

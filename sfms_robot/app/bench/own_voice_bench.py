@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.bench.acoustics import Bools, Call, Scene, read_call, scene
+from sfms_robot.app.bench.acoustics import Bools, Call, Scene, read_call, scene, without_person
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
@@ -29,18 +29,20 @@ _EXCUSED_FRAMES: Final = 3  # 100 ms, in whole frames
 
 @dataclass(frozen=True)
 class Condition:
-    """Levels over the person's [dB], None: not there."""
+    """Levels over the person's [dB], None: not there. Without `person` they are the same, but he is not there."""
 
     room: str
     own_db: float | None
     motors_db: float | None
     talks_over: bool
+    person: bool = True
 
     def __str__(self) -> str:
         over = ", talks over" if self.talks_over else ""
         own = "silent" if self.own_db is None else f"{self.own_db:+.0f} dB{over}"
         motors = "still" if self.motors_db is None else f"{self.motors_db:+.0f} dB"
-        return f"{self.room} | own voice {own} | motors {motors}"
+        there = "" if self.person else ", nobody there"
+        return f"{self.room} | own voice {own} | motors {motors}{there}"
 
 
 CONDITIONS: Final = (
@@ -54,6 +56,7 @@ CONDITIONS: Final = (
     Condition("office", 10.0, None, True),
     Condition("office", None, -10.0, False),
     Condition("office", None, 0.0, False),
+    Condition("office", None, 0.0, False, person=False),
     Condition("office", 0.0, -10.0, False),
     Condition("office", 0.0, 0.0, False),
 )
@@ -156,7 +159,13 @@ def table(result: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _listen(call: Call, condition: Condition, counts: Counts) -> None:
-    heard = scene(call, condition.room, condition.own_db, condition.motors_db, condition.talks_over)
+    heard = scene(
+        call if condition.person else without_person(call),
+        condition.room,
+        condition.own_db,
+        condition.motors_db,
+        condition.talks_over,
+    )
     gate = OwnVoiceGate(speaks=condition.own_db is not None)
     began = time.process_time()
     voice = [

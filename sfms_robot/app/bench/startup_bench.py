@@ -26,6 +26,7 @@ from sfms_robot.app.bench.measure import HEAD, MAIN, Row, environment, row
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 
 REPEATS: Final = 5
 RUN_S: Final = 1.0
@@ -114,7 +115,21 @@ def _run(env: Mapping[str, str] | None, more: Sequence[str] = ()) -> WireTimes:
     """One second of listening on emulated servos, in real time."""
     head = load_head(HEAD)
     with launch(emulated(head)["main"]) as chain, _relay(chain.device, head.buses["main"].baud) as (port, hosts):
-        words = ["run", "--head", HEAD, "--port", port, "--duration", str(RUN_S), "--seed", "1", "--json", *more]
+        person = ["--audio", DEFAULT_SPEAKER]
+        words = [
+            "run",
+            "--head",
+            HEAD,
+            "--port",
+            port,
+            *person,
+            "--duration",
+            str(RUN_S),
+            "--seed",
+            "1",
+            "--json",
+            *more,
+        ]
         seen = WireTimes(time.monotonic())
         hosts.append(seen)
         process = subprocess.Popen(
