@@ -111,25 +111,11 @@ def first_goal_s(words: Sequence[str], env: Mapping[str, str] | None = None) -> 
     return None if seen.first_goal_s is None else seen.first_goal_s - seen.began_s
 
 
-def _run(env: Mapping[str, str] | None, more: Sequence[str] = ()) -> WireTimes:
+def _run(env: Mapping[str, str] | None, more: Sequence[str] = ("--audio", DEFAULT_SPEAKER)) -> WireTimes:
     """One second of listening on emulated servos, in real time."""
     head = load_head(HEAD)
     with launch(emulated(head)["main"]) as chain, _relay(chain.device, head.buses["main"].baud) as (port, hosts):
-        person = ["--audio", DEFAULT_SPEAKER]
-        words = [
-            "run",
-            "--head",
-            HEAD,
-            "--port",
-            port,
-            *person,
-            "--duration",
-            str(RUN_S),
-            "--seed",
-            "1",
-            "--json",
-            *more,
-        ]
+        words = ["run", "--head", HEAD, "--port", port, "--duration", str(RUN_S), "--seed", "1", "--json", *more]
         seen = WireTimes(time.monotonic())
         hosts.append(seen)
         process = subprocess.Popen(
