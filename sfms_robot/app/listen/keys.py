@@ -104,11 +104,12 @@ def reading_keys(found: Keyboard, pressed: Callable[[str], object]) -> Iterator[
             return
 
     thread = threading.Thread(target=work, name="keys", daemon=True)
-    thread.start()
-    try:
+    try:  # from here on: a signal may end the program before the first key
+        thread.start()
         yield
     finally:
         os.close(theirs)
-        thread.join(JOIN_S)
+        if thread.ident is not None:
+            thread.join(JOIN_S)
         found.give_back()
         os.close(ours)

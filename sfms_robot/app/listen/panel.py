@@ -129,13 +129,14 @@ def _drawing(console: Console, document: Document, interrupt: Interrupt, keys: b
 
     thread = threading.Thread(target=work, name="panel", daemon=True)
     with _logging_to(screen):
-        thread.start()
         try:
+            thread.start()
             yield screen
         finally:
             over.set()
             screen.look.set()
-            thread.join(JOIN_S)
+            if thread.ident is not None:
+                thread.join(JOIN_S)
 
 
 @contextmanager
