@@ -290,15 +290,10 @@ def _halted(parts: Parts, state: State) -> tuple[State, Command]:
 
 def _resumed(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
     """A person has released the halt: torque comes on again, and every joint eases in from where it stands."""
-    joints = parts.retargeter.joints
-    stands_rad = parts.bus.enable(joints)
-    everyone = np.ones(len(joints), np.bool_)
-    log.restart(everyone, stands_rad)
+    stands_rad = parts.bus.enable(parts.retargeter.joints)
     return replace(
-        state, limiter=parts.limiter.restart(everyone, stands_rad, state.limiter), held_rad=stands_rad,
-        since_s=np.full(len(joints), now_s), before_rad=stands_rad, here_rad=stands_rad, goals_rad=stands_rad,
-        released=False,
-    )  # fmt: skip
+        _eased_in_from(parts, log, stands_rad, np.ones(len(stands_rad), np.bool_), state, now_s), released=False
+    )
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: State, now_s: float) -> State:
@@ -307,14 +302,26 @@ def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state:
     back = np.array([joint in readings and readings[joint].rejoined for joint in joints])
     if not back.any():
         return state
-    stands = np.array(
+    stands_rad = np.array(
         [readings[joint].position_rad if there else 0.0 for joint, there in zip(joints, back, strict=True)]
     )
-    log.restart(back, stands)
-    held, since = np.where(back, stands, state.held_rad), np.where(back, now_s, state.since_s)
-    before, here = np.where(back, stands, state.before_rad), np.where(back, stands, state.here_rad)
-    limiter = parts.limiter.restart(back, stands, state.limiter)
-    return replace(state, limiter=limiter, held_rad=held, since_s=since, before_rad=before, here_rad=here)
+    return _eased_in_from(parts, log, stands_rad, back, state, now_s)
+
+
+def _eased_in_from(
+    parts: Parts, log: RunLog, stands_rad: Doubles, which: NDArray[np.bool_], state: State, now_s: float
+) -> State:
+    """`which` (J,) joints stand still at `stands_rad` (J,) from `now_s` on, and are led into the face; others go on."""
+    log.restart(which, stands_rad)
+
+    def stand(angles_rad: Doubles) -> Doubles:
+        return np.where(which, stands_rad, angles_rad)
+
+    return replace(
+        state, limiter=parts.limiter.restart(which, stands_rad, state.limiter), held_rad=stand(state.held_rad),
+        since_s=np.where(which, now_s, state.since_s), before_rad=stand(state.before_rad),
+        here_rad=stand(state.here_rad), goals_rad=stand(state.goals_rad),
+    )  # fmt: skip
 
 
 def _noticed(parts: Parts, readings: Mapping[str, Reading], state: State, now_s: float, period_s: float) -> State:
