@@ -141,6 +141,7 @@ def drive(
             for tick in tick_times(clock, rate_hz, start_s):
                 if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
                     break
+                before_rad = state.goals_rad
                 state = _heard(parts, observers, log, tick.time_s, state)
                 state = _judged(parts, log, tick.time_s, state)
                 if state.run.name == "halted":
@@ -155,7 +156,7 @@ def drive(
                 readings = parts.bus.poll(tick.time_s)
                 state = _rejoined(parts, log, readings, state, tick.time_s)
                 state = _noticed(parts, readings, state, tick.time_s, 1.0 / rate_hz)
-                parts.source.moves(float(np.abs(state.here_rad - state.before_rad).sum() * rate_hz))
+                parts.source.moves(float(np.abs(command.goals_rad - before_rad).sum() * rate_hz))
                 observers.tick(
                     Tick(tick.time_s, command.motion, command.goals_rad, readings, state.run.name, state.run.why)
                 )

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.app.session import build_bus, build_motion
@@ -52,6 +52,10 @@ class Somebody(Source):
 
     def __init__(self, gone_s: float = np.inf) -> None:
         self._given, self._gone_s = 0, gone_s
+        self.told_rad_s: list[float] = []
+
+    def moves(self, speed_rad_s: float) -> None:
+        self.told_rad_s.append(speed_rad_s)
 
     def read(self, now_s: float) -> list[SpeakerFrame]:
         frames = []
@@ -136,6 +140,7 @@ def torque(chain: Chain, joint: str) -> bool:
 
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(halted=st.integers(60, 250), resumed=st.integers(0, 120))
+@example(halted=100, resumed=0)  # the very tick in which all have eased in
 def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_is_released(chain, halted, resumed):
     seen: dict[str, bool] = {}
     late = halted + round(STOPS_S * RATE_HZ) + resumed
@@ -149,7 +154,8 @@ def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_i
 
     ran = run(chain, does, seconds=(late + 250) / RATE_HZ)
     assert ran.outcome == "done" and ran.log.audited.violations == 0
-    assert [ran.ticks[halted].state, ran.ticks[halted + 1].state] == [ran.ticks[halted - 1].state, "halted"]
+    before = "starting" if halted < EASE_S * RATE_HZ else "listening"
+    assert [ran.ticks[halted].state, ran.ticks[halted + 1].state] == [before, "halted"]
     assert ran.ticks[halted + 1].why == ("key",)
     goals = np.array([tick.goals_rad for tick in ran.ticks])
     stop = halted + round(STOPS_S * RATE_HZ)
@@ -192,3 +198,12 @@ def test_a_hot_servo_moves_less_and_then_rests(chain):
     goals = np.array([tick.goals_rad[JOINTS.index("jaw")] for tick in ran.ticks])
     assert np.abs(goals[-100:] - jaw.rest_rad).max() < 1e-6
     assert ran.log.audited.violations == 0
+
+
+def test_the_source_is_told_how_fast_joints_move_and_that_they_stand_while_they_are_halted(chain):
+    somebody = Somebody()
+    ran = run(chain, lambda latch: {150: lambda: latch.close("key")}, seconds=3.0, source=somebody)
+    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    speeds = np.abs(np.diff(goals, axis=0)).sum(axis=1) * RATE_HZ
+    assert np.allclose(somebody.told_rad_s[1:], speeds)
+    assert max(speeds[100:150]) > 0.1 and set(somebody.told_rad_s[-50:]) == {0.0}
