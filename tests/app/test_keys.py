@@ -68,6 +68,17 @@ class Shown:
         before, _, self.text = self.text.partition(part)
         return before
 
+    def stopped(self):
+        """Wait until Ctrl-Z has stopped it, reading on: who writes to a full terminal stops nowhere."""
+        for _ in range(round(LIMIT_S / 0.05)):
+            pid, state = os.waitpid(self.process.pid, os.WUNTRACED | os.WNOHANG)
+            if pid:
+                assert os.WIFSTOPPED(state)
+                return
+            if select.select([self._near], [], [], 0.05)[0]:
+                self.text += os.read(self._near, 4096).decode()
+        raise AssertionError(f"it was never stopped: {self.text[-500:]!r}")
+
     def single_keys(self):
         local = termios.tcgetattr(self.far)[3]
         return not local & (termios.ICANON | termios.ECHO)
@@ -109,3 +120,23 @@ def test_however_it_ends_the_terminal_is_as_it_was(note, how, code):
         shown.until(SHOW)
         assert shown.process.wait(LIMIT_S) in (code, -signal.SIGINT)
         assert termios.tcgetattr(shown.far) == shown.usual
+
+
+def test_a_suspended_run_leaves_the_terminal_and_takes_it_again():
+    with Shown() as shown:
+        shown.until("? help")
+        shown.press(b" ")
+        shown.until(" halted ")
+        assert shown.single_keys()
+        shown.press(b"\x1a")
+        shown.stopped()
+        assert termios.tcgetattr(shown.far) == shown.usual
+        shown.until(SHOW)
+        shown.process.send_signal(signal.SIGCONT)
+        shown.until(HIDE)
+        shown.press(b"r\n")  # a whole line, should it not have taken the terminal again yet
+        shown.until("halt released")
+        assert shown.single_keys()
+        shown.press(b"q")
+        shown.until(SHOW)
+        assert shown.process.wait(LIMIT_S) == 0

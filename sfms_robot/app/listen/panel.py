@@ -53,9 +53,9 @@ def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch) -> Ite
     found = keyboard(sys.stdin)
     with ExitStack() as stack:
         screen = stack.enter_context(_drawing(console, document, interrupt, found is not None))
+        stack.enter_context(_suspending(screen, found))  # before the terminal is taken, until it is given back
         if found is not None:
             stack.enter_context(reading_keys(found, lambda key: _pressed(key, screen, interrupt, halt)))
-        stack.enter_context(_suspending(screen, found))
         yield
 
 
