@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from stranger_process import ends
 
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
@@ -227,22 +228,10 @@ def test_the_child_ends_when_its_parent_is_killed():
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     child = int(told.stdout)
-    assert _ends(child)
+    assert ends(child)
 
 
 def test_a_child_whose_parent_goes_before_it_says_what_to_load_ends_without_a_word():
     command = [sys.executable, "-c", "from sfms_robot.listeners.process import main; main()"]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def _ends(pid):
-    """Whether a process that is not our child is gone, or soon will be: it has nothing left to wait for."""
-    for _ in range(10_000_000):
-        try:
-            with open(f"/proc/{pid}/stat") as stat:
-                if stat.read().rpartition(")")[2].split()[0] == "Z":
-                    return True
-        except FileNotFoundError:
-            return True
-    return False

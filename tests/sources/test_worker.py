@@ -8,6 +8,7 @@ import sys
 import threading
 
 import pytest
+from stranger_process import ends
 
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
 from sfms_robot.sources.worker import FIRST_PAUSE_S, LONGEST_PAUSE_S, SILENT_S, START_LIMIT_S, SourceWorker
@@ -233,19 +234,7 @@ def test_the_child_ends_when_its_parent_is_killed(tmp_path):
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=env)
     child = int(told.stdout)
-    assert _ends(child)
-
-
-def _ends(pid):
-    """Whether a process that is not our child is gone, or soon will be: it has nothing left to wait for."""
-    for _ in range(10_000_000):
-        try:
-            with open(f"/proc/{pid}/stat") as stat:
-                if stat.read().rpartition(")")[2].split()[0] == "Z":
-                    return True
-        except FileNotFoundError:
-            return True
-    return False
+    assert ends(child)
 
 
 @pytest.fixture(autouse=True)
