@@ -133,6 +133,7 @@ def _own_voice(folder: Path | None, json: bool) -> None:
         return
     print_rows(own_voice_bench.table(result))
     print(f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms")
+    print(f"parameters were chosen on other calls ({', '.join(result['chosen_on']['calls'])}), gears and movements")
 
 
 def _trial(name: Bench, minutes: float, json: bool) -> None:
