@@ -100,11 +100,13 @@ class OwnVoiceGate:
             raise InputError("a reference for a gate that was made with speaks=False")
         mic, said = _finite(mic), _finite(said)
         self._mic, self._reference = np.concatenate([self._mic, mic]), np.concatenate([self._reference, said])
-        if self._echo:
+        if self._echo is None:
+            self._left = np.concatenate([self._left, mic])
+        else:
             cancelled = self._echo.push(mic, said)
+            self._left = np.concatenate([self._left, cancelled.audio])
             self._linear = np.concatenate([self._linear, cancelled.linear])
             self._residual_power = np.concatenate([self._residual_power, cancelled.residual_power])
-        self._left = np.concatenate([self._left, cancelled.audio if self._echo else mic])
         return [self._frame(speed_rad_s) for _ in range(len(self._left) // FRAME_SAMPLES)]
 
     def _frame(self, speed_rad_s: ArrayLike) -> HeardFrame:
