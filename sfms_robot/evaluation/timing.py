@@ -15,10 +15,11 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.corpora.compose.acting import EYE_PAN_RAD, EYE_TILT_RAD
-from sfms_robot.corpora.compose.ami import Person, series
+from sfms_robot.corpora.compose.ami import Person
 from sfms_robot.corpora.compose.composed import Stretch, active, cast, speaker_of
 from sfms_robot.corpora.compose.motions import Motions
 from sfms_robot.corpora.compose.voices import Voice
+from sfms_robot.corpora.splits import series
 from sfms_robot.evaluation.nod_table import Counts, Ints, NodTable, cells
 from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, SpeakerFrame

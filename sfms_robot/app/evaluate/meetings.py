@@ -20,10 +20,11 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from sfms_robot.config import find
-from sfms_robot.corpora.compose.ami import Person, read_people, series
+from sfms_robot.corpora.compose.ami import Person, read_people
 from sfms_robot.corpora.compose.motions import Motions
 from sfms_robot.corpora.compose.motions import load as load_motions
 from sfms_robot.corpora.compose.voices import Voice, find_voices
+from sfms_robot.corpora.splits import series
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import nod_table

@@ -1,0 +1,39 @@
+"""Who and what is trained on, chosen on and tested on: one table, asked by composing, fitting and judging alike.
+
+Meetings of a series share their people, so whole series are kept apart; so are whole recordings of voices and faces.
+The series are laid out by hand so that every part has people whose gaze was annotated, and meetings in which nods were
+left without a form. Nothing is fitted, chosen or calibrated on test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Final, Literal, TypeVar
+
+Split = Literal["train", "validation", "test"]
+SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
+
+SERIES: Final[Mapping[Split, tuple[str, ...]]] = {
+    "train": ("ES2008", "IS1002", "IS1004", "IS1008", "IS1009", "TS3003"),
+    "validation": ("IS1000", "IS1005", "TS3011"),
+    "test": ("ES2003", "IS1001", "IS1006"),
+}
+_Item = TypeVar("_Item")
+
+
+def series(meeting: str) -> str:
+    """Meetings of one series share their people: "IS1008c" -> "IS1008"."""
+    return meeting.rstrip("abcdefgh")
+
+
+def split_of(meeting: str) -> Split:
+    """The part that a meeting belongs to; meetings of other series are for training."""
+    return next((split for split in SPLITS if series(meeting) in SERIES[split]), "train")
+
+
+def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:
+    """Items in their order, by part; every part is there."""
+    parts: dict[Split, list[_Item]] = {split: [] for split in SPLITS}
+    for split, item in items:
+        parts[split].append(item)
+    return parts
