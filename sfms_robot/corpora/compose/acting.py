@@ -1,8 +1,8 @@
 """From a score of events to a listener's motion: recorded primitives, stretched and laid where things happened.
 
 Everything is added to a head and a face that never stand still. Layers are joined so that neither value nor speed
-jumps: primitives start and end at rest, looks go by `signals.gaze_kinematics`, loops are crossfaded. What was laid, when
-and how large, comes back as events: they are in the motion, and nothing else of their kind is put there.
+jumps: primitives start and end at rest, looks go by `signals.gaze_kinematics`, loops are crossfaded. What was laid,
+when and how large, comes back as events. Nothing else of their kind is put there, but for what a head does that speaks.
 """
 
 from __future__ import annotations
@@ -197,7 +197,9 @@ def held(curve: Floats, frames: int) -> Floats:
     height = curve[:, _CORNERS].mean(axis=1)
     peak, seen = int(height.argmax()), int((height > 0.5 * height.max()).sum())
     if frames >= seen:
-        return np.concatenate([curve[:peak], np.repeat(curve[peak : peak + 1], frames - seen + 1, axis=0), curve[peak + 1 :]])
+        return np.concatenate(
+            [curve[:peak], np.repeat(curve[peak : peak + 1], frames - seen + 1, axis=0), curve[peak + 1 :]]
+        )
     return stretched(curve, int(len(curve) * max(0.6, frames / seen)))
 
 
@@ -261,7 +263,7 @@ class NodHabit:
 
 @dataclass(frozen=True)
 class NodManner:
-    """One nod: size [rad, peak to peak] of its first swing, how many there are, how long all take, how they die away."""
+    """One nod: size [rad, peak to peak] of its first swing, how many swings, how long all take, how they die away."""
 
     size_rad: float
     swings: int
@@ -295,9 +297,7 @@ def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> 
     return out.astype(np.float32)
 
 
-def _nod(
-    pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator
-) -> list[ListenerEvent]:
+def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
     habit, events = nod_habit(rng), []
     for start, end in spans:
         manner = nod_manner(habit, end - start, rng)
@@ -407,7 +407,9 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
         for a, b in score.shared_laughs
         if rng.random() < 0.6
     ]
-    wanted += [("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3]
+    wanted += [
+        ("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3
+    ]
     wanted += [("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.nods if rng.random() < 0.12]
     events: list[ListenerEvent] = []
     for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):
