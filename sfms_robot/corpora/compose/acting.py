@@ -150,7 +150,7 @@ def mirrored(motion: Floats) -> Floats:
 
 
 def _mirror_image(acted: Acted) -> Acted:
-    head = acted.head_of_gaze_rad * np.float32([-1, 1, -1])
+    head = acted.head_of_gaze_rad * np.array([-1, 1, -1], np.float32)
     events = tuple(
         event
         if event.target_rad is None
