@@ -15,7 +15,8 @@ A listener that is loaded is not yet fast: it builds its graphs while the head e
 on this machine. By that, and by how late the source has been for half a second, its hop is chosen. What it did not hear
 meanwhile it hears then, as fast as it can.
 
-    parent -> child    pickle: (name, seed), then SpeakerFrame after SpeakerFrame; between them, once, an int: the hop
+    parent -> child    pickle: (name, seed, calmness), then SpeakerFrame after SpeakerFrame; between them, once, an int:
+                       the hop; and whenever somebody asks for it, another Calmness
     child -> parent    pickle: (kind, value, number)
         loaded         nothing is wrong with it
         probed         value is a `Probe`; it waits for its hop
@@ -41,6 +42,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from sfms_robot.child_process import end_child, start_child, take_pipes
+from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.hop import HopChoice, Latencies, choose_hop
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
@@ -79,10 +81,11 @@ class ListenerProcess:
     Args:
         name: what `registry.load_listener` takes: a shipped listener, a folder, or a kind of another package.
         seed: of the stream.
+        calmness: how often a listener that decides events does what.
     """
 
-    def __init__(self, name: str, seed: int) -> None:
-        self._name, self._seed = name, seed
+    def __init__(self, name: str, seed: int, calmness: Calmness | None = None) -> None:
+        self._name, self._seed, self._calmness = name, seed, calmness
         self._step_ms = Quantiles()
         self._skipped = 0
         self._restarted_s: list[float] = []
@@ -94,7 +97,12 @@ class ListenerProcess:
         self._probe: Probe | None = None  # that is to be answered with a hop
         self._choice: HopChoice | None = None
         self._pushed = 0
-        self._child = _Child(name, seed)
+        self._child = _Child(name, seed, calmness)
+
+    def calm(self, calmness: Calmness) -> None:
+        """From the next frames on. Never blocks; a listener that decides nothing takes no notice."""
+        self._calmness = calmness
+        self._child.tell(calmness)
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
         """Block until the listener is loaded. Raises ModelError with its own message when it cannot be."""
@@ -191,10 +199,10 @@ class ListenerProcess:
             return
         self._probe = None
         if self._latencies is None:
-            self._child.tell_hop(probe.hop)
+            self._child.tell(probe.hop)
             return
         before, self._choice = self._choice, choose_hop(probe.hops, self._latencies(probe))
-        self._child.tell_hop(self._choice.hop)
+        self._child.tell(self._choice.hop)
         if self._choice.given_up and (before is None or before.given_up is None):
             log.warning("a plan every %d frames: %s", self._choice.hop, self._choice.given_up)
 
@@ -226,20 +234,21 @@ class ListenerProcess:
         self._restarted_s.append(now_s)
         self._restarts += 1
         self._state, self._waits_since_s, self._unanswered, self._probe = "starting", None, 0, None
-        self._child = _Child(self._name, self._seed + self._restarts)
+        self._child = _Child(self._name, self._seed + self._restarts, self._calmness)
 
 
 class _Child:
     """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
 
-    def __init__(self, name: str, seed: int) -> None:
+    def __init__(self, name: str, seed: int, calmness: Calmness | None) -> None:
         self._process = start_child("sfms_robot.listeners.process:main")
-        self._frames: deque[Any] = deque([(name, seed)])
-        self._hop: int | None = None
+        self._frames: deque[Any] = deque([(name, seed, calmness)])
+        self._urgent: deque[int | Calmness] = deque()
         self._changed = threading.Condition()
         self._messages: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
         self.ended = False
         self._closing = False
+        self._named = False  # what to load was sent: it goes before all
         for work in (self._write, self._read):
             threading.Thread(target=work, name=f"listener {work.__name__}", daemon=True).start()
 
@@ -253,10 +262,10 @@ class _Child:
             self._changed.notify()
         return dropped
 
-    def tell_hop(self, hop: int) -> None:
+    def tell(self, value: int | Calmness) -> None:
         """It goes before all frames that wait, and is never dropped."""
         with self._changed:
-            self._hop = hop
+            self._urgent.append(value)
             self._changed.notify()
 
     def message(self) -> tuple[str, Any, float] | None:
@@ -292,13 +301,11 @@ class _Child:
         try:
             while True:
                 with self._changed:
-                    self._changed.wait_for(lambda: self._closing or self._frames or self._hop)
+                    self._changed.wait_for(lambda: self._closing or self._frames or (self._urgent and self._named))
                     if self._closing:
                         break
-                    if self._hop:
-                        item, self._hop = self._hop, None
-                    else:
-                        item = self._frames.popleft()
+                    item = (self._urgent if self._urgent and self._named else self._frames).popleft()
+                    self._named = True
                 pickle.dump(item, pipe, protocol=5)
                 pipe.flush()
             pipe.close()
@@ -331,7 +338,7 @@ def main() -> None:
     frames, plans = take_pipes()
     inbox, hops = Inbox(), queue.SimpleQueue[int]()
     try:
-        name, seed = pickle.load(frames)
+        name, seed, calmness = pickle.load(frames)
     except (EOFError, pickle.UnpicklingError):
         return  # the parent ended before it said what to load
     threading.Thread(target=_receive, args=(frames, inbox, hops), daemon=True).start()
@@ -343,7 +350,7 @@ def main() -> None:
         from sfms_robot.listeners.registry import at_hop, build_graphs, hops_of, load_listener
 
         torch.set_num_threads(threads())
-        listener = load_listener(name, graphs=False)
+        listener = load_listener(name, graphs=False, calmness=calmness)
         _say(plans, "loaded")
         build_graphs(listener)
         choices = hops_of(listener)
@@ -380,6 +387,8 @@ def _receive(frames: IO[bytes], inbox: Inbox, hops: queue.SimpleQueue[int]) -> N
             item = pickle.load(frames)
             if isinstance(item, int):
                 hops.put(item)
+            elif isinstance(item, Calmness):
+                inbox.calmness = item
             else:
                 inbox.put(item)
     except (EOFError, OSError, pickle.UnpicklingError):
@@ -393,6 +402,7 @@ def listen(listener: Listener, seed: int, inbox: Inbox, plans: IO[bytes]) -> Non
     while (frame := inbox.next()) is not None:
         if inbox.skipped:
             _say(plans, "skipped", None, inbox.skipped)
+        memory = calmed(listener, memory, inbox)
         began_s = time.perf_counter()
         plan, memory = listener.step(frame, memory)
         taken_ms = (time.perf_counter() - began_s) * 1e3
@@ -404,6 +414,13 @@ def _say(plans: IO[bytes], kind: str, value: Any = None, number: float = 0.0) ->
     plans.flush()
 
 
+def calmed(listener: Listener, memory: Any, inbox: Inbox) -> Any:
+    """The memory after what was asked for since the last frame; a listener that decides nothing takes no notice."""
+    calmness, inbox.calmness = inbox.calmness, None
+    change = getattr(listener, "calmed", None)
+    return memory if calmness is None or change is None else change(memory, calmness)
+
+
 class Inbox:
     """Frames in the order in which they came, until None does; the newest alone when too many are waiting.
 
@@ -411,6 +428,7 @@ class Inbox:
 
     Attributes:
         skipped: frames left out before the last one given.
+        calmness: asked for since `calmed` looked; None: none.
     """
 
     def __init__(self, most: int = MOST_WAITING) -> None:
@@ -419,6 +437,7 @@ class Inbox:
         self._waiting: deque[SpeakerFrame | None] = deque()
         self._kept_up = False  # at least once
         self.skipped = 0
+        self.calmness: Calmness | None = None
 
     def put(self, frame: SpeakerFrame | None) -> None:
         self._queue.put(frame)
