@@ -541,7 +541,7 @@ def _recorder(options: RunOptions, head: Head) -> Recorder | None:
     if options.record is None:
         return None
     about = run_facts(
-        head, options.listener, asdict(options) | {"audio": options.hears, "calmness": _rates(options.calmness)}
+        head, options.listener, {**asdict(options), "audio": options.hears, "calmness": _rates(options.calmness)}
     )
     when_full: FullPolicy = "wait" if options.fast else "drop"
     return Recorder(options.record, list(head.joints), when_full=when_full, about=about)

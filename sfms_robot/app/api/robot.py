@@ -269,8 +269,9 @@ class Robot:
         """Call `callback` with a `ListenerEvent` before the servos do it.
 
         `kind` is one of `frames.EVENT_KINDS`: "nod", "mm_hm", "smile" and so on. A listener that decides events tells
-        all of them; of another one nods, blinks and smiles are found in its plans. It is called in a thread of its own, one event after the other; one that raises is detached and named in the
-        log. Raises InputError for another kind.
+        all of them; of another one nods, blinks and smiles are found in its plans. The callback runs in a thread of its
+        own, one event after the other; one that raises is detached and named in the log. Raises InputError for another
+        kind.
         """
         self._events.on(kind, callback)
 
