@@ -1,4 +1,4 @@
-"""`--intensity REGION=V` and `--style REGION=V` -> the knobs of a head; `--calmness KIND=V` -> what it does how often."""
+"""`--intensity` and `--style` REGION=V -> the knobs of a head; `--calmness` KIND=V -> what it does how often."""
 
 from __future__ import annotations
 
