@@ -163,7 +163,7 @@ def test_the_hop_is_chosen_when_the_source_has_settled_and_a_new_child_is_told_o
     child.choose_hop_by(lambda: 0.06, 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take(*child._child.next(60.0), 0.0)  # probed
+        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0)
         for frame in frames(SETTLED_FRAMES):
             assert child.statistics()["hop"] is None
             child.push(frame, 0.0)
