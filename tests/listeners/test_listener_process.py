@@ -163,7 +163,7 @@ def test_the_hop_is_chosen_when_the_source_has_settled_and_a_new_child_is_told_o
     child.choose_hop_by(lambda: 0.06, 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0)
+        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
         for frame in frames(SETTLED_FRAMES):
             assert child.statistics()["hop"] is None
             child.push(frame, 0.0)
@@ -183,7 +183,7 @@ def test_a_hop_gives_way_when_the_source_turns_out_later_than_it_was_and_never_g
     child.choose_hop_by(lambda: late_s[0], 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0)
+        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
         for frame in frames(SETTLED_FRAMES):
             child.push(frame, 0.0)
         assert child.statistics()["hop"] == 3
