@@ -190,7 +190,8 @@ def test_a_hop_gives_way_when_the_source_turns_out_later_than_it_was_and_never_g
         while child.statistics()["state"] != "listening":
             child._take(*child._child.next(60.0), 0.0)
         for _ in range(SETTLED_FRAMES):
-            child._take(*child._child.next(60.0), 0.0)
+            kind, value, _ = child._child.next(60.0)
+            child._take(kind, value, 5.0, 0.0)  # whatever a plan takes on this machine
         for now_s, source_s, hop in ((REVIEW_S - 0.1, 0.06, 3), (REVIEW_S, 0.06, 1), (3 * REVIEW_S, 0.0, 1)):
             late_s[0] = source_s
             child._review(now_s)
