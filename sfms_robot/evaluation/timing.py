@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.corpora.compose.acting import EYE_PAN_RAD, EYE_TILT_RAD
 from sfms_robot.corpora.compose.ami import Person
 from sfms_robot.corpora.compose.composed import Stretch, active, cast, speaker_of
 from sfms_robot.corpora.compose.motions import Motions
@@ -25,6 +24,7 @@ from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, SpeakerFrame
 from sfms_robot.signals import events, phase
 from sfms_robot.signals.events import Bools
+from sfms_robot.signals.gaze_kinematics import EYE_PAN_RAD, EYE_TILT_RAD
 
 WITHIN_S: Final = 0.5  # a generated nod this close counts for an instant
 LEAST_NODS: Final = 3  # of a person, to be ranked
