@@ -28,7 +28,7 @@ REGIONS: Final[Mapping[str, tuple[int, ...]]] = {
     "head": tuple(range(6)),
     "eyes": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith("eyeLook")),
     "lids": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith(("eyeBlink", "eyeSquint", "eyeWide"))),
-    "mouth": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith(("jaw", "mouth", "cheek", "nose", "tongue"))),
+    "mouth": tuple(CHANNEL_INDEX[n] for n in CHANNELS if n.startswith(("jaw", "mouth", "cheek", "nose", "tongue"))),
     "brows": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith("brow")),
 }
 WINDOW: Final = 2 * FRAME_HZ
