@@ -20,7 +20,7 @@ from torch.nn.functional import pad
 
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.conversational_states import UNKNOWN
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.learning.sfms.features import frames_of
 from sfms_robot.listeners.arig.stream import Memory as ArigMemory
 from sfms_robot.listeners.sfms.predictor import Context
@@ -35,10 +35,12 @@ class Rollout:
     Attributes:
         motion: (S, N, 58) faces.
         states: (S, N) int8 conversational states, -1 before the first and of listeners without.
+        events: of each stream, what it decided; nothing of listeners that decide none.
     """
 
     motion: Floats
     states: NDArray[np.int8]
+    events: tuple[tuple[ListenerEvent, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -85,15 +87,17 @@ def rollout(listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
     states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
+    events: list[list[ListenerEvent]] = [[] for _ in seeds]
     for index, frame in enumerate(speaker):
         plans, memories = _step(listener, frame, memories)
         for row, plan in enumerate(plans):
             if plan is not None:
                 motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
+                events[row] += plan.events
         for row, memory in enumerate(memories):
             if isinstance(memory, ArigMemory):
                 states[row, index + 1] = memory.state
-    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)])
+    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, events)))
 
 
 def _step(
