@@ -126,7 +126,7 @@ class Sfms(Listener):
         phase: is the speaker's place in a phrase an input? Beyond the paper; it reaches back further than 40 frames.
         sequential: does each frame know the keyframes drawn before it? Beyond the paper, which draws 8 in parallel.
         placement: where keyframes go (`listeners.sfms.placement`); max_gap_frames bounds `exact` and `penalised`.
-        ramp_frames: motion toward a keyframe begins so many frames before it at most, until then the one before is held;
+        ramp_frames: motion toward a keyframe begins so many frames before it at most; the one before is held till then;
             None: a straight line all the way, the paper's, which a stream cannot know beyond its plan.
         sway: is slow motion of the head a process of its own (`listeners.sfms.sway`), not in the tokens? Needs events.
         quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq); either has a group's number of

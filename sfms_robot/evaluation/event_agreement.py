@@ -26,8 +26,8 @@ class Agreement:
 
     Attributes:
         asked: events of the dyads.
-        recall: share of those that are seen within `IN_TIME_S` of their start; precision: share of what is seen that was
-            asked for; both one to one, the detector's own lateness taken out.
+        recall: share of those that are seen within `IN_TIME_S` of their start; precision: share of what is seen that
+            was asked for; both one to one, the detector's own lateness taken out.
         people_recall, people_precision: the same of the dyads' own listeners.
         size_ratio: median size of what is seen beside the median of what is seen in people.
     """
@@ -81,7 +81,7 @@ def _shares(asked: Sequence[Doubles], seen: Sequence[Doubles], late_s: float) ->
 
 
 def pairs_within(first_s: Doubles, second_s: Doubles, within_s: float) -> int:
-    """The most pairs of instants of two sorted lists that lie `within_s` of one another, each instant in one at most."""
+    """The most pairs of instants of two sorted lists that lie `within_s` of one another, each in one pair at most."""
     pairs, at = 0, 0
     for instant in first_s:
         while at < len(second_s) and second_s[at] < instant - within_s - 1e-9:

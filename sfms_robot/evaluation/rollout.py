@@ -97,7 +97,7 @@ class ManyStreams(Protocol):
 
 
 def control_at(listener: Listener, events: Sequence[ListenerEvent], index: int) -> Floats | None:
-    """What `listener` is told with frame `index` of the `events` of its whole life; None for one that is told nothing."""
+    """What `listener` is told with frame `index` of all the `events` of its life; None for one that is told nothing."""
     past, ahead = getattr(listener, "control_frames", (0, 0))
     if not past + ahead:
         return None

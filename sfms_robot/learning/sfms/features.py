@@ -75,8 +75,8 @@ def gather(
 def frames_of(
     dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None, settings: config.Sfms | None = None
 ) -> SfmsFrames:
-    """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one, and for a listener that
-    is told of events where the dyad does not say them.
+    """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one, and for a listener
+    that is told of events where the dyad does not say them.
     """
     control = np.zeros((len(dyad.listener), 0), np.float32)
     if settings is not None and settings.events:
@@ -108,7 +108,9 @@ def frames_of(
 def _control(dyad: Dyad) -> Floats:
     """(N, K). Raises ConfigError where the dyad does not say its events, or not at our rate."""
     if dyad.events is None:
-        raise ConfigError(f"dyad {dyad.name} does not say when its listener nods and smiles; a listener with events needs it")
+        raise ConfigError(
+            f"dyad {dyad.name} does not say when its listener nods and smiles; a listener with events needs it"
+        )
     if dyad.fps != FRAME_HZ:
         raise ConfigError(f"dyad {dyad.name} has {dyad.fps:g} frames a second; a listener with events takes {FRAME_HZ}")
     return control_track(dyad.events, 0, len(dyad.listener))
@@ -177,8 +179,8 @@ def context(
 ) -> Context:
     """What the predictor sees at the seam of each window; `tokens` (N, G), those of the future undecided.
 
-    `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms. `held` (N, G):
-    what stands at a window's first frame, where the last keyframe before it is held on to (`tokens.held_tokens`).
+    `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms.
+    `held` (N, G): what stands at a window's first frame, where the last keyframe is held on to (`tokens.held_tokens`).
     """
     frames = corpus.frames
     index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it

@@ -90,7 +90,9 @@ def listener_job(
         chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
         if phase.event_windows and len(eventful):
             busy = torch.rand(phase.batch, generator=generator) < phase.event_windows
-            chosen = torch.where(busy, eventful[torch.randint(len(eventful), (phase.batch,), generator=generator)], chosen)
+            chosen = torch.where(
+                busy, eventful[torch.randint(len(eventful), (phase.batch,), generator=generator)], chosen
+            )
         gain = None
         if listener.audio == "mel":  # microphones differ
             gain = (torch.rand(phase.batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB

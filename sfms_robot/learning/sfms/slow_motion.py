@@ -12,7 +12,7 @@ from torch import Tensor
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, ListenerEvent
 from sfms_robot.listeners.sfms.sway import BANDS, BANDS_HZ
 
-CUT_HZ: Final = 0.5
+CUT_HZ: Final = 1.0
 HEAD_KINDS: Final = ("nod", "shake", "tilt", "laugh")  # events that move the head
 MARGIN_FRAMES: Final = 2  # around an event that may still be it
 UNKNOWN: Final = 1e-6  # weight of a frame in which sway cannot be seen
@@ -23,8 +23,8 @@ def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
     """The slow part (N, S) of motion (N, S): below `CUT_HZ`, and smoothly across the events that move the head.
 
     Whittaker's smoother, the z with the least sum of w |x - z|^2 + mu |second difference of z|^2. While the head nods
-    nobody sees its sway, so those frames weigh nothing: a low-pass alone would take the mean of a nod for sway, and give
-    the nod a swing the other way before it begins.
+    nobody sees its sway, so those frames weigh nothing: a low-pass alone would take the mean of a nod for sway, and
+    give the nod a swing the other way before it begins.
     """
     from scipy.linalg import solveh_banded
 

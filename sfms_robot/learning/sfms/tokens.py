@@ -16,8 +16,8 @@ STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many win
 
 @torch.no_grad()
 def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
-    """Keyframe masks (N, G) of all dyads: each dyad as a whole where a keyframe has its cost, else stretch by stretch, so
-    that busy seconds may borrow from quiet ones of the same stretch.
+    """Keyframe masks (N, G) of all dyads: each dyad as a whole where a keyframe has its cost, else stretch by stretch,
+    so that busy seconds may borrow from quiet ones of the same stretch.
     """
     size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
     masks = []

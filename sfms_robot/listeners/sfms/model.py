@@ -20,7 +20,6 @@ from sfms_robot.listeners.sfms.sway import BANDS
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
 
-
 # Channels of any motion space that turn or move the head.
 HEAD = frozenset(
     {*POSE_CHANNELS, *(f"{part}_{axis}" for part in ("rotation", "translation", "head") for axis in "xyz")}

@@ -51,8 +51,10 @@ class Neighbours:
 
     def last(self, frames: int) -> Neighbours:
         """Of so many frames at the end alone."""
-        rest = (part[:, -frames:] for part in (self.before, self.after, self.has_before, self.has_after))
-        return Neighbours(self.frame[-frames:], *rest, ramp=self.ramp)
+        before, after, has_before, has_after = (
+            part[:, -frames:] for part in (self.before, self.after, self.has_before, self.has_after)
+        )
+        return Neighbours(self.frame[-frames:], before, after, has_before, has_after, self.ramp)
 
     @property
     def since(self) -> Tensor:

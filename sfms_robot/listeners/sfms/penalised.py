@@ -7,9 +7,9 @@ a nod, and both sides of a keyframe that two motions share are placed alike.
 
     best[j] = cost + min(before[j], min_i best[i] + stretch[i, j])
 
-`stretch[i, j]` is the error between keyframes i and j of `Neighbours.interpolate`: keyframe i is held until `ramp` frames
-before j, then a straight line. A stream draws its keyframes a few frames ahead, so it cannot begin a line earlier than
-that; where labels may, what is shown jumps onto the line when its end is drawn.
+`stretch[i, j]` is the error between keyframes i and j of `Neighbours.interpolate`: keyframe i is held until `ramp`
+frames before j, then a straight line. A stream draws its keyframes a few frames ahead, so it cannot begin a line
+earlier than that; where labels may, what is shown jumps onto the line when its end is drawn.
 
 With b = j - r the frame where the line begins, r = min(ramp, j - i), and sums over the frames of the stretch
 
@@ -58,8 +58,8 @@ def place_penalised(
 
 
 def _stretches(x: Doubles, gap: int, ramp: int | None) -> tuple[Doubles, Doubles, Doubles]:
-    """Errors of one track (T, c): held back from each frame to the start (T,), from the keyframe `gap` - d frames before
-    each frame (T, gap), held from each frame to the end (T,). Infinite where there is none or the gap is too large.
+    """Errors of one track (T, c): held back from each frame to the start (T,); to each frame from the keyframe d frames
+    before it (T, gap), at gap - d; held from each frame to the end (T,). Infinite where the gap is too large.
     """
     t = len(x)
     x = x - x.mean(axis=0)  # sums stay small

@@ -1,11 +1,12 @@
 """SFMS as it runs: one speaker frame in, and on every `hop`-th a plan of the next 8 frames out.
 
 Tokens once drawn stay drawn while what they were drawn for holds: a new plan keeps what is left of the one before and
-draws only the `hop` frames at its far end. So a keyframe is decided (future - hop) to future frames ahead, 0.16 to 0.32 s
-with hop 4, and re-planning cannot jitter. A listener that is told of events compares what it is told now with what the
-tokens were drawn under: from the first future frame on for which that differs they are drawn anew, but never the next
-frame's, which servos are already under way to. What is behind the last keyframe drawn is an extrapolation, which the next
-plan may correct: it starts where the motion was, at the speed it had, and the difference fades over `seam_frames`.
+draws only the `hop` frames at its far end. So a keyframe is decided (future - hop) to future frames ahead, 0.16 to
+0.32 s with hop 4, and re-planning cannot jitter. A listener that is told of events compares what it is told now with
+what the tokens were drawn under: from the first future frame on for which that differs they are drawn anew, but never
+the next frame's, which servos are already under way to. What is behind the last keyframe drawn is an extrapolation,
+which the next plan may correct: it starts where the motion was, at the speed it had, and the difference fades over
+`seam_frames`.
 """
 
 from __future__ import annotations
@@ -181,13 +182,11 @@ class SfmsListener:
         undecided = torch.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
         return torch.cat([self._neutral, undecided]), self.model.standardise(still_face(self.space, 2 + self.horizon))
 
-    def step(
-        self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None
-    ) -> tuple[Plan | None, Memory]:
+    def step(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Plan | None, Memory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place.
 
-        `control`: rows of `signals.control` for the `control_frames` up to this frame and after it, (P + H, K); None for
-        a listener that is not told of events.
+        `control`: rows of `signals.control` for the `control_frames` up to this frame and after it, (P + H, K); None
+        for a listener that is not told of events.
 
         Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
         """

@@ -1,15 +1,15 @@
 """Slow sway of the head, as a process of its own beside the tokens. Beyond the paper, which has tokens for all.
 
-A head at rest moves by about a degree, below half a hertz. As tokens that steps: the codes of a whole head are as far
-apart as its sway is wide. Finer levels for a slow group of its own would need hundreds of codes to move by a tenth of a
-degree, and keyframes four times a second where nothing happens; and there is nothing to predict: sway answers to nobody.
-So it is drawn from what recorded heads do (Shinozuka's spectral representation of a stationary Gaussian process),
+A head at rest moves by about a degree, most of it below half a hertz. As tokens that steps: the codes of a whole head
+are as far apart as its sway is wide. A slow group of its own would need hundreds of codes to move by a tenth of a
+degree, and keyframes where nothing happens; and there is nothing to predict, since sway answers to nobody. So it is
+drawn from what recorded heads do (Shinozuka's spectral representation of a stationary Gaussian process),
 
     x(t) = size * sum over lines l of  amplitude[l] * (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a, b ~ N(0, 1)
 
-`LINES` frequencies drawn from each of the `BANDS_HZ` per channel, amplitudes fitted to the bands' powers, `size` a stream's
-own manner. A function of time alone: any frame of the future is known, nothing adds up, and after an hour it is where it
-was. It sets in over the first `EASE_S`.
+`LINES` frequencies drawn from each of the `BANDS_HZ` per channel, amplitudes fitted to the bands' powers, `size` a
+stream's own manner. A function of time alone: any frame of the future is known, nothing adds up, and after an hour it
+is where it was. It sets in over the first `EASE_S`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import math
 import torch
 from torch import Tensor
 
-BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.15, 0.21, 0.28, 0.36, 0.46, 0.6, 0.8)  # edges
+BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1
 LINES = 3  # of each band
 EASE_S = 3.0
