@@ -15,6 +15,7 @@ Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
 Placement = Literal["exact", "static", "static_paper", "learned_paper", "learned"]
+GAZE_CHANNELS = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
 
 
 class ChannelGroup(Model):
@@ -78,6 +79,8 @@ class Listener(Model):
         neutral: face at rest in that space, one number per channel; None: the space's own.
         metres_per_unit: scale of the space's translation; None: it has none and is left out.
         flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
+        events: is it told of nods, smiles and blinks that were decided elsewhere (`signals.control`)? Then it draws
+            everything but gaze: not the eyes' direction, nor the head's part of it, which follow it by kinematics.
     """
 
     kind: str
@@ -86,10 +89,16 @@ class Listener(Model):
     neutral: tuple[Finite, ...] | None = None
     metres_per_unit: Positive | None = None
     flame_matrix: str | None = None
+    events: bool = False
 
     @property
     def channels(self) -> tuple[str, ...]:
         return SPACE_CHANNELS[self.motion_space]
+
+    @property
+    def drawn_channels(self) -> tuple[str, ...]:
+        """Those that the model draws; the others stay 0."""
+        return tuple(name for name in self.channels if not (self.events and name in GAZE_CHANNELS))
 
     @model_validator(mode="after")
     def _fits_space(self) -> Listener:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from sfms_robot.config.arig import paper_state
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
@@ -34,7 +35,7 @@ class Rollout:
 
     Attributes:
         motion: (S, N, 58) faces.
-        states: (S, N) int8 conversational states, -1 before the first and of listeners without.
+        states: (S, N) int8 of the paper's seven conversational states, -1 before the first and of listeners without.
     """
 
     motion: Floats
@@ -92,7 +93,7 @@ def rollout(listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence
                 motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
         for row, memory in enumerate(memories):
             if isinstance(memory, ArigMemory):
-                states[row, index + 1] = memory.state
+                states[row, index + 1] = paper_state(memory.state)
     return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)])
 
 

@@ -18,10 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sfms_robot.config.listener import GAZE_CHANNELS
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import usable
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, Floats
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, Floats
 from sfms_robot.listeners.space import MotionSpace
 
 if TYPE_CHECKING:
@@ -129,6 +130,17 @@ def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
 def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
     """(N, ...) cut at (B,) starts -> (B, length, ...)."""
     return values[starts[:, None] + torch.arange(length, device=starts.device)]
+
+
+def without_gaze(dyad: Dyad) -> Dyad:
+    """The same dyad with what goes with the listener's gaze taken out: eyes at rest, head less its part of looks."""
+    if dyad.space != "arkit58":
+        raise ConfigError(f"dyad {dyad.name} is in {dyad.space}: gaze is known apart in arkit58 alone")
+    motion = dyad.listener.copy()
+    motion[:, [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]] = 0.0
+    if dyad.head_of_gaze_rad is not None:
+        motion[:, :3] -= dyad.head_of_gaze_rad
+    return replace(dyad, listener=motion, head_of_gaze_rad=None)
 
 
 def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:

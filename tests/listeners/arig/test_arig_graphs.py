@@ -20,6 +20,8 @@ INTEGERS = {"width": 256, "feedforward": 512, "heads": 4, "precision": "int8"}
         {"discrete": True},
         {"interaction": "linear"},
         {"draws": "step"},
+        {"draws": "innovation"},
+        {"events": True, "draws": "innovation"},
         pytest.param(INTEGERS, marks=pytest.mark.skipif(not fast.supported(), reason="no fast integers here")),
     ],
     ids=str,
