@@ -60,19 +60,20 @@ def with_feedback(states: Tensor, rows: Tensor) -> Tensor:
 class StateUnderstanding(Part):
     """The previous state asks voice activity and cis-token what the state is now.
 
-    Where states are drawn (`drawn`) it also has what is known of them from the data: `durations` (7, 33), quantiles of
-    how many frames each of `STATES` lasts, and `possible` (2, 2, 7), which of them there are while agent and user are
-    silent or speak.
+    With events its states are `EVENT_STATES`, and it also has what is known of them from the data: `durations` (7, 33), quantiles of
+    how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for those that there are while agent and user
+    are silent or speak.
     """
 
     durations: Tensor
     possible: Tensor
 
-    def __init__(self, width: int, hidden: int, heads: int, states: int = len(STATES), drawn: bool = False) -> None:
+    def __init__(self, width: int, hidden: int, heads: int, events: bool = False) -> None:
         super().__init__()
-        if drawn:
+        states = len(EVENT_STATES if events else STATES)
+        if events:
             self.register_buffer("durations", torch.ones(len(STATES), QUANTILES))
-            self.register_buffer("possible", torch.ones(2, 2, len(STATES), dtype=torch.bool))
+            self.register_buffer("possible", torch.ones(2, 2, len(STATES)))
         self.previous = nn.Embedding(states, width)
         self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
         self.look = CrossAttention(width, hidden, heads, slots=3)
@@ -114,7 +115,7 @@ class StateUnderstanding(Part):
             before: that of the frame before.
             uniforms: (2,) in 0..1: which state, and for how long.
         """
-        possible = self.possible[int(voiced[0]), int(voiced[1])].clone()  # (7,)
+        possible = self.possible[int(voiced[0]), int(voiced[1])] > 0  # (7,)
         if before.left > 0 and possible[before.state]:
             return Sojourn(before.state, before.left - 1)
         possible[before.state] &= not bool(possible.sum() > 1)

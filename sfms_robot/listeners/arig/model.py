@@ -153,9 +153,9 @@ class ArigModel(nn.Module):
         self.short = ShortRange(d, hidden, heads, settings.chunk_frames, depths, linear)
         self.long = LongRange(d, hidden, heads, settings.context_layers, settings.chunk_frames, settings.context_chunks)
         guided, events = settings.state_guidance, settings.events
-        self.states = StateUnderstanding(d, hidden, heads, len(settings.states), events) if guided else None
+        self.states = StateUnderstanding(d, hidden, heads, events) if guided else None
         self.progress = Progressive(
-            d, hidden, heads, settings.sound_frames, settings.motion_frames, guided, settings.events
+            d, hidden, heads, settings.sound_frames, settings.motion_frames, guided, events
         )
         self.events_in = (
             nn.Sequential(Linear(CONTROL_ROWS * len(COLUMNS), d), nn.GELU(), Linear(d, d)) if events else None
