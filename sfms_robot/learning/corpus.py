@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
+GAZE = [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]
 SOUND_SAMPLE = 20_000  # frames whose sound gives means and deviations
 LEAST_SOUND_SPREAD = 1e-3
 
@@ -132,17 +133,6 @@ def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
     return values[starts[:, None] + torch.arange(length, device=starts.device)]
 
 
-def without_gaze(dyad: Dyad) -> Dyad:
-    """The same dyad with what goes with the listener's gaze taken out: eyes at rest, head less its part of looks."""
-    if dyad.space != "arkit58":
-        raise ConfigError(f"dyad {dyad.name} is in {dyad.space}: gaze is known apart in arkit58 alone")
-    motion = dyad.listener.copy()
-    motion[:, [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]] = 0.0
-    if dyad.head_of_gaze_rad is not None:
-        motion[:, :3] -= dyad.head_of_gaze_rad
-    return replace(dyad, listener=motion, head_of_gaze_rad=None)
-
-
 def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
     """Motion (N, D) of a dyad -> (N, C) in the space; rows that are not finite stay so.
 
@@ -156,6 +146,21 @@ def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
     out = np.full((len(motion), space.dim), np.nan, dtype=np.float32)
     out[known] = space.encode(motion[known])
     return torch.from_numpy(out)
+
+
+def without_gaze(dyad: Dyad) -> Dyad:
+    """The dyad with what a listener that is told of events has to draw (`config.Listener.events`): eyeLook* are 0, and
+    the head's part of a gaze shift is taken out of its pose, where that is known.
+
+    Raises ConfigError for motion that is not ours.
+    """
+    if dyad.space != "arkit58":
+        raise ConfigError(f"dyad {dyad.name} is in {dyad.space}: gaze can be taken out of arkit58 alone")
+    motion = dyad.listener.copy()
+    motion[:, GAZE] = 0.0
+    if dyad.head_of_gaze_rad is not None:
+        motion[:, :3] -= dyad.head_of_gaze_rad
+    return replace(dyad, listener=motion, head_of_gaze_rad=None)
 
 
 def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tensor]:

@@ -77,7 +77,7 @@ def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
 
 
 def frames_of(dyad: Conversation, space: MotionSpace, width: int, events: bool = False) -> LabelledDyad:
-    """One conversation (N, ...). Raises ConfigError for a motion space or sound that does not fit, or without events."""
+    """One conversation (N, ...). Raises ConfigError for a motion space, sound or events that do not fit."""
     frames = len(dyad.listener)
     control = torch.zeros(frames, 0)
     if events:

@@ -103,7 +103,7 @@ def group_of(channel: str) -> str:
 
 
 def channel_weights(settings: config.Arig, groups: Mapping[str, float]) -> Tensor:
-    """(C,) that add up to 1: a group's weight, 1 where it is not named, shared by those of its channels that are drawn."""
+    """(C,) that add up to 1: a group's weight, or 1, shared by those of its channels that are drawn."""
     drawn = set(settings.drawn_channels)
     members = Counter(group_of(name) for name in drawn)
     weights = torch.zeros(len(settings.channels))
@@ -119,8 +119,8 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     Also the motion (B, N, C) that comes after such a past.
     The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
     everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. Of a
-    head that is drawn by innovations even that tenth is left to the autoregression: where it is held tells nothing of what
-    it does next, and what a stream's head forgets is what `rho` says.
+    head that is drawn by innovations even that tenth is left to the autoregression: where it is held tells nothing of
+    what it does next, and what a stream's head forgets is what `rho` says.
     Lips are another matter while the agent speaks: its sounds say where they have to be, so their past is off by more,
     in every window, and all of it is taken back at once.
     """
@@ -179,9 +179,7 @@ def _kept(model: ArigModel) -> Tensor:
     return torch.where(head, model.rho.cpu(), kept)
 
 
-def _wander(
-    b: int, n: int, kept: Tensor, phase: config.ArigPhase, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+def _wander(b: int, n: int, kept: Tensor, phase: config.ArigPhase, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of steps.
 
     The slow part jumps once a second or so, and of it `kept` (C,) is there a frame later.

@@ -60,9 +60,9 @@ def with_feedback(states: Tensor, rows: Tensor) -> Tensor:
 class StateUnderstanding(Part):
     """The previous state asks voice activity and cis-token what the state is now.
 
-    With events its states are `EVENT_STATES`, and it also has what is known of them from the data: `durations` (7, 33), quantiles of
-    how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for those that there are while agent and user
-    are silent or speak.
+    With events its states are `EVENT_STATES`, and it also has what is known of them from the data: `durations` (7, 33),
+    quantiles of how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for those that there are while
+    agent and user are silent or speak.
     """
 
     durations: Tensor

@@ -3,8 +3,8 @@
 Offline the same parts run over all frames at once (`model.condition`, `model.generate`); that both agree is a law of
 the tests. As functions of tensors alone they can become graphs (`graphs`).
 
-N streams of one speaker, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of a
-chunk, S whole chunks in view.
+N streams of one speaker, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of
+a chunk, S whole chunks in view.
 """
 
 from __future__ import annotations

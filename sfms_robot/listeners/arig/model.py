@@ -16,9 +16,9 @@ plain units: motion of the listener's motion space, sound features of `sound.tra
 
 Beyond the paper, too:
  - `draws: innovation`: x_t = rho x_(t-1) + step_std * drawn, standardised, with the lag-1 autocorrelation `rho` < 1 of
-   the data. Whatever is drawn wrongly is forgotten at that rate, so the head's place has the spread of the data's however
-   long a stream runs: it is the place of an autoregression of order 1, not a sum of steps. What was drawn last is told to
-   the sampler beside z: how fast the face moves is too fine for the few numbers of z.
+   the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near its mean as in the data
+   however long a stream runs: its place is that of a first-order autoregression, not a sum of steps. What was drawn
+   last is told to the sampler beside z: how fast the face moves is too fine for the few numbers of z.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest.
 
@@ -154,9 +154,7 @@ class ArigModel(nn.Module):
         self.long = LongRange(d, hidden, heads, settings.context_layers, settings.chunk_frames, settings.context_chunks)
         guided, events = settings.state_guidance, settings.events
         self.states = StateUnderstanding(d, hidden, heads, events) if guided else None
-        self.progress = Progressive(
-            d, hidden, heads, settings.sound_frames, settings.motion_frames, guided, events
-        )
+        self.progress = Progressive(d, hidden, heads, settings.sound_frames, settings.motion_frames, guided, events)
         self.events_in = (
             nn.Sequential(Linear(CONTROL_ROWS * len(COLUMNS), d), nn.GELU(), Linear(d, d)) if events else None
         )
@@ -301,7 +299,7 @@ class ArigModel(nn.Module):
         return Losses(motion, wrong)
 
     def generate(self, dyad: Dyad, noise: Tensor, states: Tensor | None = None) -> Tensor:
-        """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape), states: `condition`."""
+        """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape); states: above."""
         z = self.condition(dyad, states).z
         made = self.head.sample(z.flatten(0, 1), noise.flatten(0, 1))
         last = self.standardise(dyad.agent_motion[:, :-1])

@@ -4,8 +4,8 @@ What has not changed is not computed again: behaviours of old frames, keys and v
 chunks are kept, as are the embeddings of the sampler's noise levels. Only the chunk in progress is read anew, since
 the newest sounds modulate all of it.
 
-A listener with events (`config.Listener.events`) takes two control rows a frame, of the frame heard and of the frame to be
-made. Its conversational state is drawn (`csu`), as a stream of the paper's goes on from its most probable one.
+A listener with events (`config.Listener.events`) takes two control rows a frame, of the frame heard and of the frame to
+be made. Its conversational state is drawn (`csu`); a stream of the paper's goes on from its most probable one.
 
 The robot's own voice belongs to the frame that is made, so `SpeakerFrame.agent_audio` is best given one frame early:
 its samples are those the robot says in the 40 ms after `time_s`. Given on time, lips follow one frame late.
@@ -238,7 +238,9 @@ class ArigListener:
             return torch.zeros(streams, CONTROL_ROWS * len(COLUMNS))
         rows = np.stack([np.asarray(control, np.float32) for control in controls])
         if rows.shape != (streams, CONTROL_ROWS, len(COLUMNS)):
-            raise ValueError(f"control is {rows.shape[1:]} of {len(rows)}, not {(CONTROL_ROWS, len(COLUMNS))} of {streams}")
+            raise ValueError(
+                f"control is {rows.shape[1:]} of {len(rows)}, not {(CONTROL_ROWS, len(COLUMNS))} of {streams}"
+            )
         return torch.from_numpy(rows.reshape(streams, -1))
 
     def _frame_inputs(

@@ -17,7 +17,7 @@ FRAMES = 600 * FRAME_HZ
 SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
 PPM = 200e-6
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
-# Roll, pitch and yaw less gaze of the listeners of composed dyads (`data compose`, training part): 1st, 99th percentile.
+# Roll, pitch, yaw of listeners of composed dyads (`data compose`, training), less gaze: 1st and 99th percentile.
 PEOPLE_RAD = ((-0.04, 0.04), (-0.04, 0.06), (-0.04, 0.04))
 
 

@@ -184,8 +184,9 @@ def test_states_last_as_long_as_those_of_the_data():
     states.durations.copy_(torch.linspace(5, 50, 33).expand(7, -1))
     generator, sojourn, lasted = torch.Generator().manual_seed(0), Sojourn(0, 0), [0]
     for _ in range(20_000):
-        before, sojourn = sojourn, states.draw(
-            torch.zeros(9), (False, False), sojourn, torch.rand(2, generator=generator)
+        before, sojourn = (
+            sojourn,
+            states.draw(torch.zeros(9), (False, False), sojourn, torch.rand(2, generator=generator)),
         )
         if sojourn.state != before.state:
             lasted.append(0)
@@ -232,11 +233,13 @@ def test_what_was_drawn_wrongly_is_forgotten_at_the_rate_of_the_data(rho, place,
     model.motion_high.fill_(100)
     one, two = (model.drawn(torch.full((58,), drawn), torch.full((58,), each)) for each in (place, other))
     torch.testing.assert_close(one - two, torch.full((58,), rho * (place - other)), rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(model.target(one, torch.full((58,), place)), torch.full((58,), drawn), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(
+        model.target(one, torch.full((58,), place)), torch.full((58,), drawn), rtol=1e-3, atol=1e-3
+    )
 
 
 def test_an_hour_of_independent_draws_stays_where_the_data_are():
-    """Of an autoregression whose innovations have deviation step_std the place has deviation 1, however long it runs."""
+    """Innovations of deviation step_std make places of deviation 1, however long it runs."""
     model = arig_model(draws="innovation")
     model.rho.fill_(0.99)
     model.step_std.fill_((1 - 0.99**2) ** 0.5)
