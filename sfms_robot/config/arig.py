@@ -73,8 +73,8 @@ class Arig(Listener):
             discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4).
         draws: what the sampler draws of a frame: its `motion`, as in the paper; the `step` from the frame before, which
             is small where a face is still, and with it what the sampler gets wrong, but that stays; or the
-            `innovation` of a first-order autoregression fitted on the data, a step that is forgotten as fast as people's
-            motion returns to its mean.
+            `innovation` of a first-order autoregression fitted on the data, a step that is forgotten as fast as
+            people's motion returns to its mean.
         precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
     """
 

@@ -341,7 +341,7 @@ def test_feedback_that_is_seen_has_states_of_its_own():
 
 def test_a_group_of_channels_counts_by_its_weight_not_by_its_number():
     listener = settings(listener={"events": True}).listener
-    weights = channel_weights(listener, {"head": 2.0, "brows": 0.5})
+    weights = channel_weights(listener, config.GroupWeights(head=2.0, brows=0.5))
     assert float(weights.sum()) == pytest.approx(1)
     groups = [group_of(name) for name in CHANNELS]
     of = {group: float(weights[[one == group for one in groups]].sum()) for group in set(groups)}

@@ -29,6 +29,7 @@ from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
 from sfms_robot.signals.control import control_track
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.voice_activity import levels_db
 
 SCENES: Final = ("speaking", "listening", "interaction")
@@ -145,16 +146,12 @@ def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
     """How long each of the paper's states lasts, and which there are with which voices, as the model hears them."""
     labels = corpus.frames.states
     labels = torch.where(labels >= NODDING, LISTENING, labels)  # feedback that is seen lies on top
-    runs: list[list[int]] = [[] for _ in STATES]
-    for one in torch.split(labels, list(corpus.lengths)):
-        values, counts = one.unique_consecutive(return_counts=True)
-        for value, count in zip(values.tolist(), counts.tolist(), strict=True):
-            if value != UNKNOWN:
-                runs[value].append(count)
+    of_dyads = torch.split(labels, list(corpus.lengths))
     places = torch.linspace(0, 1, QUANTILES)
-    for state, lasted in enumerate(runs):
+    for state in range(len(STATES)):
+        lasted = [float(end - start) for one in of_dyads for start, end in runs(one == state)]
         if lasted:
-            states.durations[state] = torch.quantile(torch.tensor(lasted).float(), places)
+            states.durations[state] = torch.quantile(torch.tensor(lasted), places)
     known = labels >= 0
     voices = corpus.frames.voiced[known].long()
     found = torch.zeros(2, 2, len(STATES))

@@ -10,7 +10,6 @@ sounds within fewer steps. So are weights of groups of channels: by number, (3) 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -70,7 +69,7 @@ def loss_parts(
     draws: int,
     generator: torch.Generator,
     previous: Tensor,
-    group_weights: Mapping[str, float] = {},  # noqa: B006
+    group_weights: config.GroupWeights | None = None,
 ) -> Parts:
     """Losses of frames 1..N-1.
 
@@ -80,7 +79,7 @@ def loss_parts(
         truth: (B, N, C) motion to be predicted after the past it is told.
         draws: noise levels per frame.
         previous: (B, N) the states it is told, of which each frame gets the one before.
-        group_weights: of `GROUPS` in equation (3); empty: every channel counts the same.
+        group_weights: of `GROUPS` in equation (3); None: every channel counts the same.
     """
     model = student.model
     weights = channel_weights(model.settings, group_weights).to(truth.device) if group_weights else None
@@ -102,14 +101,14 @@ def group_of(channel: str) -> str:
     return next(group for group, begins in GROUPS.items() if channel.startswith(begins))
 
 
-def channel_weights(settings: config.Arig, groups: Mapping[str, float]) -> Tensor:
-    """(C,) that add up to 1: a group's weight, or 1, shared by those of its channels that are drawn."""
+def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tensor:
+    """(C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
     drawn = set(settings.drawn_channels)
     members = Counter(group_of(name) for name in drawn)
     weights = torch.zeros(len(settings.channels))
     for index, name in enumerate(settings.channels):
         if name in drawn:
-            weights[index] = groups.get(group_of(name), 1.0) / members[group_of(name)]
+            weights[index] = getattr(groups, group_of(name)) / members[group_of(name)]
     return weights / weights.sum()
 
 

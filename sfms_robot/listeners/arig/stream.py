@@ -81,9 +81,10 @@ class ArigListener:
         self.settings = settings
         self.model = fast.with_precision(model, settings.precision).eval()
         self.space = space or MotionSpace.of(settings)
-        self._frame: Callable[..., Any] = Frame(self.model)
-        self._draw: Callable[..., Any] = Draw(self.model)
-        self._frame_of_one, self._draw_of_one = self._frame, self._draw
+        self._frame = Frame(self.model)
+        self._draw = Draw(self.model)
+        self._frame_of_one: Callable[..., Any] = self._frame  # graphs, once they are built
+        self._draw_of_one: Callable[..., Any] = self._draw
 
     @property
     def hop(self) -> int:
