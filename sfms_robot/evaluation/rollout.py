@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from sfms_robot.config.arig import paper_state
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
@@ -39,7 +40,7 @@ class Rollout:
 
     Attributes:
         motion: (S, N, 58) faces.
-        states: (S, N) int8 conversational states, -1 before the first and of listeners without.
+        states: (S, N) int8 of the paper's seven conversational states, -1 before the first and of listeners without.
         events: of each stream, what it decided; nothing of listeners that decide none.
     """
 
@@ -122,7 +123,7 @@ def rollout(
                 decided[row] += plan.events
         for row, memory in enumerate(memories):
             if isinstance(memory, ArigMemory):
-                states[row, index + 1] = memory.state
+                states[row, index + 1] = paper_state(memory.state)
     return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
 
 
