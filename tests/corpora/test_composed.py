@@ -181,9 +181,7 @@ def test_a_new_set_replaces_the_old_one_and_nothing_else(tables, tmp_path):
 
 def test_written_sets_read_back(tables, tmp_path):
     told = []
-    written = composed.compose_folder(
-        tables, tmp_path, seed=1, minutes=1, told=lambda *one: told.append(one)
-    )
+    written = composed.compose_folder(tables, tmp_path, seed=1, minutes=1, told=lambda *one: told.append(one))
     for split in SPLITS:
         assert sum(len(dyad.listener) for dyad in load(tmp_path / split)) / FRAME_HZ / 60 == pytest.approx(
             written[split]
