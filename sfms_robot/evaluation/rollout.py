@@ -20,18 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from sfms_robot.config.arig import paper_state
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.conversational_states import UNKNOWN
-from sfms_robot.frames import (
-    FRAME_S,
-    FRAME_SAMPLES,
-    MOTION_DIM,
-    FaceFrame,
-    Floats,
-    ListenerEvent,
-    Plan,
-    SpeakerFrame,
-)
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.learning.sfms.features import frames_of
 from sfms_robot.listeners.arig.stream import Memory as ArigMemory
 from sfms_robot.listeners.sfms.predictor import Context
@@ -48,11 +40,13 @@ class Rollout:
 
     Attributes:
         motion: (S, N, 58) faces.
-        states: (S, N) int8 conversational states, -1 before the first and of listeners without.
+        states: (S, N) int8 of the paper's seven conversational states, -1 before the first and of listeners without.
+        events: of each stream, what it decided; nothing of listeners that decide none.
     """
 
     motion: Floats
     states: NDArray[np.int8]
+    events: tuple[tuple[ListenerEvent, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -63,10 +57,13 @@ class OfflineRollout:
     tokens: Tensor
 
 
-def speaker_frames(audio: Floats | None, face: Floats, agent_audio: Floats | None = None) -> list[SpeakerFrame]:
+def speaker_frames(
+    audio: Floats | None, face: Floats, agent_audio: Floats | None = None, attention: Floats | None = None
+) -> list[SpeakerFrame]:
     """Sound (N * 640,) and face (N, 58) as a source gives them, and the agent's own voice (N * 640,) one frame early.
 
-    A face of NaN is None; no sound at all is no microphone.
+    A face of NaN is None, and so is an attention (N,) of NaN, or of a face that is not seen; no sound at all is no
+    microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
     frames = []
@@ -77,13 +74,14 @@ def speaker_frames(audio: Floats | None, face: Floats, agent_audio: Floats | Non
         if said is not None and len(said) < FRAME_SAMPLES:
             said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
         seen = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
-        frames.append(SpeakerFrame(time_s, heard[now], seen, said))
+        looks = None if attention is None or seen is None or np.isnan(attention[index]) else float(attention[index])
+        frames.append(SpeakerFrame(time_s, heard[now], seen, said, looks))
     return frames
 
 
 def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
     """Both tracks of a dyad as a source gives them."""
-    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio)
+    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)
 
 
 @runtime_checkable
@@ -116,15 +114,17 @@ def rollout(
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
     states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
+    decided: list[list[ListenerEvent]] = [[] for _ in seeds]
     for index, frame in enumerate(speaker):
         plans, memories = _step(listener, frame, memories, control_at(listener, events, index))
         for row, plan in enumerate(plans):
             if plan is not None:
                 motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
+                decided[row] += plan.events
         for row, memory in enumerate(memories):
             if isinstance(memory, ArigMemory):
-                states[row, index + 1] = memory.state
-    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)])
+                states[row, index + 1] = paper_state(memory.state)
+    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
 
 
 def _step(
