@@ -142,6 +142,17 @@ def autocorrelation(last: Tensor, now: Tensor) -> Tensor:
     return ((last * now).sum(0) / power.clamp(min=1e-9)).clamp(0.0, LARGEST_RHO)
 
 
+def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
+    """From standardised motion (M, C) of frames and of the frames after them."""
+    if model.settings.draws != "innovation":
+        model.step_std.copy_((now - last).std(0).clamp(min=LEAST_STEP))
+        return
+    model.rho.copy_(autocorrelation(last, now))
+    steps = now - model.expected(last)
+    model.step_std.copy_(steps.abs().median(0).values.clamp(min=LEAST_STEP))
+    model.spread.copy_((steps / model.step_std).asinh().std(0).clamp(min=LEAST_STEP))
+
+
 def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
     """How long each of the paper's states lasts, and which there are with which voices, as the model hears them."""
     labels = corpus.frames.states
@@ -173,9 +184,7 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) ->
     model.motion_high.copy_(standard.amax(0))
     of_dyads = torch.split(standard, list(corpus.lengths))
     last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(-1), slice(1, None)))
-    if model.settings.draws == "innovation":
-        model.rho.copy_(autocorrelation(last, now))
-    model.step_std.copy_((now - model.expected(last)).std(0).clamp(min=LEAST_STEP))
+    _fit_steps(model, last, now)
     if isinstance(model.head, Denoiser):
         drawn = model.target(now, last)
         model.head.low.copy_(drawn.amin(0))
