@@ -10,6 +10,7 @@ from sfms_robot.config.arig_training import (
     parse_training,
 )
 from sfms_robot.config.base import Model, load, parse
+from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.camera_mount import CameraMount
 from sfms_robot.config.drives import drives
 from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
@@ -36,6 +37,7 @@ __all__ = [
     "ArigTraining",
     "Baseline",
     "Bus",
+    "Calmness",
     "CameraMount",
     "ChannelGroup",
     "Coupling",
