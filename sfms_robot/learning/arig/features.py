@@ -34,6 +34,7 @@ from sfms_robot.signals.voice_activity import levels_db
 
 SCENES: Final = ("speaking", "listening", "interaction")
 LEAST_STEP: Final = 0.01  # of a frame, in deviations of the motion
+COMPANDED: Final = 4  # innovations above the deviation over this are companded: between what rests and what happens
 LARGEST_RHO: Final = 0.999  # of one frame to the next: a time constant of 40 s
 RARE: Final = 0.02  # of the frames with the same voices: a state so rare there is a label's edge
 
@@ -149,7 +150,7 @@ def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
         return
     model.rho.copy_(autocorrelation(last, now))
     steps = now - model.expected(last)
-    model.step_std.copy_(steps.abs().median(0).values.clamp(min=LEAST_STEP))
+    model.step_std.copy_((steps.std(0) / COMPANDED).clamp(min=LEAST_STEP))
     model.spread.copy_((steps / model.step_std).asinh().std(0).clamp(min=LEAST_STEP))
 
 
