@@ -18,9 +18,9 @@ Beyond the paper, too:
  - `draws: innovation`: x_t = rho x_(t-1) + step_std * sinh(spread * drawn), standardised, with the lag-1
    autocorrelation `rho` < 1 of the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near
    its mean as in the data however long a stream runs: its place is that of a first-order autoregression, not a sum of
-   steps. A face mostly hardly moves and at times moves a hundred times as fast: companded by asinh above `step_std`, what
-   moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast the
-   face moves is too fine for the few numbers of z.
+   steps. A face mostly hardly moves and at times moves a hundred times as fast: companded by asinh above `step_std`,
+   what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
+   the face moves is too fine for the few numbers of z.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest.
 
