@@ -1,7 +1,14 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices."""
 
 from sfms_robot.config.arig import Arig, Diffusion
-from sfms_robot.config.arig_training import ArigPhase, ArigTraining, Stage, load_training, parse_training
+from sfms_robot.config.arig_training import (
+    ArigPhase,
+    ArigTraining,
+    GroupWeights,
+    Stage,
+    load_training,
+    parse_training,
+)
 from sfms_robot.config.base import Model, load, parse
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.camera_mount import CameraMount
@@ -41,6 +48,7 @@ __all__ = [
     "FirmwareMap",
     "Fold",
     "Gaze",
+    "GroupWeights",
     "Grouped",
     "Head",
     "Idle",

@@ -1,7 +1,7 @@
 """Where the other person is in a phrase: how long it has lasted, how long it is silent, how long the last one was.
 
 This is what nods depend on, and it reaches back further than the 1.6 s that a predictor sees. `step` takes the samples
-of one frame and gives features for a predictor; the three times alone serve the table of nod rates (`learning`).
+of one frame and gives features for a predictor; the three times alone serve the table of nod rates (`evaluation`).
 
 A phrase goes on across silences under 0.2 s. Features are hat functions of each time on a logarithmic grid, so that a
 linear layer can already draw any curve over it, and are all 0 for a phase that has not been yet.
