@@ -14,6 +14,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -439,13 +440,12 @@ def run(
             stack.enter_context(halt_switch(options.halt_on, halt))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
-        if source is None:
-            source = open_source(options.hears, options.face, options.duration_s, agent_audio=options.agent_audio)
-            stack.callback(source.close)
+        opening = _opening(options, stack) if source is None else None
+        opened = stack.enter_context(open_head(options.servos))
+        source = source if opening is None else opening.result()
         duration_s = source.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
             raise ConfigError("--fast without a recording never ends: give it a --duration")
-        opened = stack.enter_context(open_head(options.servos))
         if feed is None:
             return {"version": 1, "head": opened.config.name, "port": options.port, "exit": "done", **_present(opened)}
         if isinstance(feed, ListenerProcess):
@@ -504,6 +504,17 @@ def run(
     if options.record is not None:
         write_report(options.record, report)
     return report
+
+
+def _opening(options: RunOptions, stack: ExitStack) -> Future[Source]:
+    """The person, being opened in a thread: a microphone takes a second, and so does the head."""
+    worker = ThreadPoolExecutor(1, "source")
+    opening = worker.submit(
+        open_source, options.hears, options.face, options.duration_s, agent_audio=options.agent_audio
+    )
+    worker.shutdown(wait=False)
+    stack.callback(lambda: None if opening.exception() else opening.result().close())
+    return opening
 
 
 def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:

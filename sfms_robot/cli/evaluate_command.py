@@ -153,6 +153,23 @@ def robustness(
 
 
 @app.command()
+def naturalness(
+    listener: str = LISTENER,
+    data: Path = typer.Option(..., help="Composed dyads (`sfms-robot data compose`)."),
+    split: str = typer.Option("test", metavar="validation|test", help="Whose motion it is held against."),
+    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
+    drift: float = typer.Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    json: bool = JSON,
+) -> None:
+    """How a listener moves beside people whose motion it never saw: nods, smiles, gaze, sway, and a network's guess."""
+    from sfms_robot.app.evaluate.naturalness import evaluate_naturalness
+    from sfms_robot.cli.show_learning import print_figures, show
+
+    show(evaluate_naturalness(listener, data, split, clips, drift, seed), json, print_figures)
+
+
+@app.command()
 def interaction(
     listener: str = typer.Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
     data: Path = typer.Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),

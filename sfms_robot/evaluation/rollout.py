@@ -51,10 +51,13 @@ class OfflineRollout:
     tokens: Tensor
 
 
-def speaker_frames(audio: Floats | None, face: Floats, agent_audio: Floats | None = None) -> list[SpeakerFrame]:
+def speaker_frames(
+    audio: Floats | None, face: Floats, agent_audio: Floats | None = None, attention: Floats | None = None
+) -> list[SpeakerFrame]:
     """Sound (N * 640,) and face (N, 58) as a source gives them, and the agent's own voice (N * 640,) one frame early.
 
-    A face of NaN is None; no sound at all is no microphone.
+    A face of NaN is None, and so is an attention (N,) of NaN, or of a face that is not seen; no sound at all is no
+    microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
     frames = []
@@ -65,13 +68,14 @@ def speaker_frames(audio: Floats | None, face: Floats, agent_audio: Floats | Non
         if said is not None and len(said) < FRAME_SAMPLES:
             said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
         seen = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
-        frames.append(SpeakerFrame(time_s, heard[now], seen, said))
+        looks = None if attention is None or seen is None or np.isnan(attention[index]) else float(attention[index])
+        frames.append(SpeakerFrame(time_s, heard[now], seen, said, looks))
     return frames
 
 
 def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
     """Both tracks of a dyad as a source gives them."""
-    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio)
+    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)
 
 
 @runtime_checkable

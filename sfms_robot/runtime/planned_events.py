@@ -54,11 +54,16 @@ class PlannedEvents:
 
     def add(self, plan: Plan) -> list[MotionEvent]:
         """Events that this plan completes, in the order in which they begin."""
-        self._join(plan)
+        self.join(plan)
+        return self.news()
+
+    def news(self) -> list[MotionEvent]:
+        """Events that the plans so far hold and that were not told yet; ask within `NEWS` frames of each other."""
         found = [event for row, kind in enumerate(MOTION_EVENTS) for event in self._new(kind, self._signals[row])]
         return sorted(found, key=lambda event: event.start_s)
 
-    def _join(self, plan: Plan) -> None:
+    def join(self, plan: Plan) -> None:
+        """Take a plan, look at nothing."""
         columns = np.array([kind.signal(plan.frames) for kind in MOTION_EVENTS.values()], np.float64)
         begins = round(float(plan.times_s[0]) * FRAME_HZ)
         known = self._signals.shape[1]
