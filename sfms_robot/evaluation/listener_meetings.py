@@ -128,11 +128,10 @@ def listener_meeting(
     floor = _floor(person, whole)
     attention = _looks(person, whole, floor)
     audio, face = _others(whole, voice, laughter, motions, attention, rng)
-    frames = zip(speaker_frames(audio, face, said), attention, strict=True)
     return ListenerMeeting(
         f"{person.meeting}_{person.agent}",
         person.participant,
-        tuple(replace(frame, attention=None if np.isnan(looks) else float(looks)) for frame, looks in frames),
+        tuple(speaker_frames(audio, face, said, attention.astype(np.float32))),
         _annotated(person, whole),
         _aside(person, floor),
         active(person.others, whole),

@@ -167,14 +167,7 @@ def heard_and_seen(
         face = np.resize(speaker.face, face.shape).astype(np.float32)
         face = condition.face(face, rng) if condition.face else face
     attention = condition.attention(frames) if condition.attention else np.ones(frames, np.float32)
-    return [
-        frame if frame.face is None else _looking(frame, float(looks))
-        for frame, looks in zip(speaker_frames(None if inputs == "face" else voice, face), attention, strict=True)
-    ]
-
-
-def _looking(frame: SpeakerFrame, attention: float) -> SpeakerFrame:
-    return SpeakerFrame(frame.time_s, frame.audio, frame.face, frame.agent_audio, attention)
+    return speaker_frames(None if inputs == "face" else voice, face, attention=attention)
 
 
 def counted(played: Rollout) -> dict[str, list[int]]:
