@@ -142,9 +142,7 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[GazeFrame, GazeSt
     head = (yaw[0] + body[0], pitch[0] + body[1])
     wanted = [
         begun + part * (aim + spot + drift * since_s - begun)
-        for begun, aim, spot, drift in zip(
-            state.from_rad, target, state.spot_rad, state.drift_rad_s, strict=True
-        )
+        for begun, aim, spot, drift in zip(state.from_rad, target, state.spot_rad, state.drift_rad_s, strict=True)
     ]
     pan, tilt = wanted[0] - head[0], wanted[1] - head[1]
     pan, tilt = max(-EYE_PAN_RAD, min(pan, EYE_PAN_RAD)), max(-EYE_TILT_RAD, min(tilt, EYE_TILT_RAD))

@@ -197,7 +197,9 @@ def held(curve: Floats, frames: int) -> Floats:
     height = curve[:, _CORNERS].mean(axis=1)
     peak, seen = int(height.argmax()), int((height > 0.5 * height.max()).sum())
     if frames >= seen:
-        return np.concatenate([curve[:peak], np.repeat(curve[peak : peak + 1], frames - seen + 1, axis=0), curve[peak + 1 :]])
+        return np.concatenate(
+            [curve[:peak], np.repeat(curve[peak : peak + 1], frames - seen + 1, axis=0), curve[peak + 1 :]]
+        )
     return stretched(curve, int(len(curve) * max(0.6, frames / seen)))
 
 
@@ -295,9 +297,7 @@ def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> 
     return out.astype(np.float32)
 
 
-def _nod(
-    pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator
-) -> list[ListenerEvent]:
+def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
     habit, events = nod_habit(rng), []
     for start, end in spans:
         manner = nod_manner(habit, end - start, rng)
@@ -407,7 +407,9 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
         for a, b in score.shared_laughs
         if rng.random() < 0.6
     ]
-    wanted += [("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3]
+    wanted += [
+        ("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3
+    ]
     wanted += [("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.nods if rng.random() < 0.12]
     events: list[ListenerEvent] = []
     for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):

@@ -7,7 +7,7 @@ Times are seconds of the meeting; an interval table is (K, 2) start, end, sorted
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -55,6 +55,7 @@ class Person:
         others_nods: (start, end, agent) nods of each of the others.
         looked_at: (start, end, agent) of each of the others looking at him.
         gaze_known: the others whose gaze was annotated.
+        words: every single one, by agent, his own among them.
     """
 
     meeting: str
@@ -78,6 +79,7 @@ class Person:
     others_nods: tuple[tuple[float, float, str], ...] = ()
     looked_at: tuple[tuple[float, float, str], ...] = ()
     gaze_known: frozenset[str] = frozenset()
+    words: Mapping[str, Doubles] = field(default_factory=dict)
 
 
 def read_people(folder: Path) -> list[Person]:
@@ -88,6 +90,7 @@ def read_people(folder: Path) -> list[Person]:
     agents = defaultdict(list)
     for meeting, agent in zip(listed["meeting"], listed["agent"], strict=True):
         agents[meeting].append(agent)
+    said = {key: np.array(_spoken(found), np.float64).reshape(-1, 2) for key, found in list(words.items())}
     people = []
     for row in zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True):
         meeting, agent, participant, until, has_gaze = row
@@ -123,6 +126,7 @@ def read_people(folder: Path) -> list[Person]:
                 others_nods=_of_others(gestures, others, NODS),
                 looked_at=_of_others(gaze, others, (agent,)),
                 gaze_known=frozenset(other[1] for other in others if gaze[other]),
+                words={one: said[meeting, one] for one in agents[meeting] if (meeting, one) in said},
             )
         )
     if not people:

@@ -114,9 +114,7 @@ def read_material(ami: Path, voices: Sequence[Path], motions: Path) -> dict[Spli
     people = split_series(read_people(ami))
     spoken, laughter, moves = split_voices(find_voices(voices)), find_laughter(voices), load_motions(motions)
     dwell = learn_dwell(people["train"])
-    return {
-        split: Material(people[split], spoken[split], laughter[split], moves[split], dwell) for split in SPLITS
-    }
+    return {split: Material(people[split], spoken[split], laughter[split], moves[split], dwell) for split in SPLITS}
 
 
 def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> dict[Split, list[Dyad]]:

@@ -85,7 +85,9 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
         rows = table(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
         if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
             continue
-        said = list(zip(rows["clip"], map(float, rows["start_s"]), map(float, rows["end_s"]), rows["kind"], strict=True))
+        said = list(
+            zip(rows["clip"], map(float, rows["start_s"]), map(float, rows["end_s"]), rows["kind"], strict=True)
+        )
         for (clip, start, end, _), text in zip(said, rows["text"], strict=True):
             spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind in said)
             if text == "laugh" and end - start >= _LAUGH_S and not spoken_into and (folder / clip).is_file():
@@ -94,9 +96,7 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
     return by_split(found)
 
 
-def laugh(
-    speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Floats], rng: np.random.Generator
-) -> Floats:
+def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Floats], rng: np.random.Generator) -> Floats:
     """Speech (n,) with laughs in the spans (K, 2); as it is where there is no laughter to take."""
     out = speech.copy()
     for start_s, end_s in spans_s if laughter else ():
