@@ -85,12 +85,14 @@ class ListenerMeeting:
 
     @property
     def history(self) -> tuple[ListenerEvent, ...]:
-        """What he did, as events in their order."""
+        """What he did that a listener might have, as events in their order: nods, while he listened."""
+        heard = self.listening[self.instants("nod")]
+        spans_s = {**self.spans_s, "nod": self.spans_s["nod"][heard]}
         found = [
             ListenerEvent(
                 kind, float(start), float(end - start), SIZES.get(kind, 0.5), target_rad=self._target(kind, at)
             )
-            for kind, spans in self.spans_s.items()
+            for kind, spans in spans_s.items()
             for at, (start, end) in enumerate(spans)
         ]
         return tuple(sorted(found, key=lambda event: event.start_s))

@@ -27,7 +27,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import timing
 from sfms_robot.evaluation.bootstrap import LEVEL, Estimate, Sums, estimates
-from sfms_robot.evaluation.deciding import decisions, forced_hazards, sensed
+from sfms_robot.evaluation.deciding import decisions, delayed, forced_hazards, sensed
 from sfms_robot.evaluation.detection import SIZES, Calibration, Sightings, added_up, asked_and_seen, figures
 from sfms_robot.evaluation.listener_meetings import ListenerMeeting, listener_meeting, part, shifted, without_own_voice
 from sfms_robot.evaluation.reference_hazard import ReferenceHazard
@@ -213,7 +213,7 @@ def _by_events(
     """How its hazards, given his own history, rank what he did; and what it decides, left to itself."""
     history = one.history
     heard = sensed(model, alone, calmness)
-    speaking = forced_hazards(model, sensed(model, one.speaker, calmness), history, calmness)
+    speaking = delayed(forced_hazards(model, sensed(model, one.speaker, calmness), history, calmness))
     silent = forced_hazards(model, heard, history, calmness)
     other = forced_hazards(model, sensed(model, shifted(alone), calmness), history, calmness)
     sums = timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
