@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import soxr
+from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
 from sfms_robot.evaluation.detection import seen
@@ -199,9 +200,9 @@ def outside(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _rms(values: Floats) -> float:
+def _rms(values: NDArray[np.floating]) -> float:
     return float(np.sqrt(np.mean(np.asarray(values, np.float64) ** 2))) + 1e-12
 
 
-def _clipped(values: Floats) -> Floats:
+def _clipped(values: NDArray[np.floating]) -> Floats:
     return np.asarray(np.clip(values, -1, 1), np.float32)

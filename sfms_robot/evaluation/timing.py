@@ -142,17 +142,13 @@ def _minutes(mask: Bools) -> float:
 def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Bools | None = None) -> Doubles:
     """[AUC * K, K]: how scores (N,) rank the instants before his K events above the others at which he might begin.
 
-    He might where he listens and is not in the middle of one. Nothing of fewer than three events, or of a kind that
-    was not annotated.
+    See `ListenerMeeting.begins`. Nothing of fewer than three events, or of a kind that was not annotated.
     """
     if kind not in one.spans_s:
         return np.zeros(2)
-    might = one.listening & ~one.inside(kind)
+    onsets, others = one.begins(kind)
     if within is not None:
-        might &= within
-    onsets = one.instants(kind)
-    onsets = onsets[might[onsets]]
-    others = might.copy()
+        onsets, others = onsets[within[onsets]], others & within
     others[onsets] = False
     if len(onsets) < LEAST or not others.any():
         return np.zeros(2)
