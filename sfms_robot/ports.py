@@ -251,15 +251,18 @@ class Bus(Protocol):
 
 
 class Observer(Protocol):
-    """Sees every tick, may drop, never blocks."""
+    """Sees every tick, may drop, never blocks. A class that derives from it needs only what it looks at."""
 
     def tick(self, seen: Tick) -> None: ...
 
-    def heard(self, frame: SpeakerFrame) -> None: ...
+    def heard(self, frame: SpeakerFrame) -> None:
+        return
 
-    def planned(self, plan: Plan) -> None: ...
+    def planned(self, plan: Plan) -> None:
+        return
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        return
 
 
 @dataclass(frozen=True)
@@ -272,6 +275,7 @@ class Tick:
         goals_rad: (J,) what was written.
         readings: freshest reading per joint.
         state, why: of the run, see docs/safety.md; `why` names what is lost, or who halted.
+        written_s: loop time at which the goals were on the wire; None where nobody looked.
     """
 
     time_s: float
@@ -280,6 +284,7 @@ class Tick:
     readings: Mapping[str, Reading]
     state: str = "starting"
     why: tuple[str, ...] = ()
+    written_s: float | None = None
 
 
 class Clock(Protocol):

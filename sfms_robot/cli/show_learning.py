@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sfms_robot.cli.show import print_rows, screen
+from sfms_robot.cli.show import cell, print_rows, screen
 
 _SHOWN = 3  # names of a problem; --json has them all
 
@@ -58,12 +58,40 @@ def _print_parts(rows: Sequence[Mapping[str, Any]]) -> None:
         if keys:
             table = Table("", "from", *(key.removeprefix(part).strip() for key in keys), title=part or None)
             for row in rows:
-                table.add_row(row["name"], row["source"], *(_cell(row.get(key)) for key in keys))
+                table.add_row(row["name"], row["source"], *(cell(row.get(key)) for key in keys))
             screen().print(table)
 
 
-def _cell(value: object) -> str:
-    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+# --- evaluate timing, evaluate robustness -----------------------------------------------------------------------
+
+
+def print_timing(result: Mapping[str, Any]) -> None:
+    """Figures with their intervals; how well events are seen in motion; what has to be said with it."""
+    print_rows(result["rows"])
+    console = screen()
+    for title, told in (("known events", result["detector"]), ("events asked for", result["asked_and_seen"])):
+        for kind, one in told.items():
+            shares = ", ".join(f"{name} {cell(one[name])}" for name in ("recall", "precision"))
+            console.print(
+                f"{title}: of {one['asked']} {kind}s {one['seen']} seen, {shares}, late by {cell(one['offset_s'])} s"
+            )
+    console.print(
+        f"{result['people']} people of {result['split']}, {result['meetings']} meetings, "
+        f"{result['minutes']:g} minutes, {result['seeds']} seeds; in brackets 95 % intervals over people. "
+        + "; ".join((*result["notes"], "")),
+        soft_wrap=True,
+    )
+
+
+def print_robustness(result: Mapping[str, Any]) -> None:
+    """A row for every speaker in every way; then what is not as people do."""
+    print_rows(result["rows"])
+    ranges = ", ".join(
+        f"{name.replace('_', ' ')} {low:g} to {high:g}" for name, (low, high) in result["people"].items()
+    )
+    screen().print(
+        f"people: {ranges}; {len(result['outside'])} of {len(result['rows'])} rows are outside.", soft_wrap=True
+    )
 
 
 # --- evaluate interaction ---------------------------------------------------------------------------------------
