@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 WINDOW: Final = 512  # samples, 32 ms
 GAINS: Final = (2.0, 6.0, 16.0)  # the network misses quiet voices, in noise above all, and those that clip
-FORGETS_WINDOWS: Final = 16  # of nobody, 0.5 s: then a network that heard noise begins anew
+FORGETS_WINDOWS: Final = 16  # of nobody, 0.5 s: then a network in noise begins anew
 _NOBODY: Final = 0.1
 
 
@@ -52,15 +52,13 @@ class _Network:
         self._gain = gain
         self._silero = _load()
         self._nobody_windows = 0
-        self._heard_noise = False
 
     def judge(self, window: Floats, noise: bool) -> float:
         probability = float(self._silero.process_samples(np.clip(self._gain * window, -1.0, 1.0).tolist()))
-        self._heard_noise |= noise
         self._nobody_windows = self._nobody_windows + 1 if probability < _NOBODY else 0
-        if self._heard_noise and self._nobody_windows >= FORGETS_WINDOWS:
+        if noise and self._nobody_windows >= FORGETS_WINDOWS:
             self._silero.reset()
-            self._heard_noise, self._nobody_windows = False, 0
+            self._nobody_windows = 0
         return probability
 
 
