@@ -14,6 +14,7 @@ from typing import Final
 from sfms_robot.app.bench.lead import Waves
 from sfms_robot.app.bench.measure import Row, row
 from sfms_robot.app.session import RunOptions, run
+from sfms_robot.errors import BusError
 from sfms_robot.ports import Observer, Tick
 
 HEAD: Final = "interbotix_wxxms"  # two servos: hours pass quickly
@@ -39,11 +40,16 @@ class ResidentMemory(Observer):
 
 
 def memory(hours: float = HOURS) -> dict[str, Row]:
-    """Growth after the first hour in MB, beside what was resident then; Linux only."""
+    """Growth after the first hour in MB, beside what was resident then; Linux only.
+
+    Raises BusError when the run does not come to its end.
+    """
     looks = ResidentMemory()
     with TemporaryDirectory() as folder:
         options = RunOptions(head=HEAD, fast=True, audio="none", duration_s=hours * _HOUR_S, record=Path(folder))
-        run(options, feed=Waves(), observers=[looks], signals=False)
+        report = run(options, feed=Waves(), observers=[looks], signals=False)
+    if report["exit"] != "done":
+        raise BusError(f"bench memory: the run ended early ({report['exit']}: {report['error']})")
     settled = _between(looks, min(1.0, hours / 2) * _HOUR_S, float("inf"))
     return {"memory.growth": row([settled[-1] - settled[0]], [settled[0]], "MB", "resident after the first hour")}
 
