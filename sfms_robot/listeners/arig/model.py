@@ -224,7 +224,7 @@ class ArigModel(nn.Module):
         generator: torch.Generator | None = None,
         weights: Tensor | None = None,
     ) -> Tensor:
-        """Equation (3) of `target` (N, C) at `draws` noise levels each, or the codes' loss, and that of the mean, (N,)."""
+        """Equation (3) of `target` (N, C) at `draws` noise levels, or the loss of codes, and that of the mean, (N,)."""
         mean = torch.zeros_like(wanted) if self.mean is None else self.mean(z)
         left, z = (each.repeat(draws, 1) for each in (wanted - mean.detach(), z))
         drawn = self.head.loss(z, left, generator, weights).view(draws, -1).mean(0)
