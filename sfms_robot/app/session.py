@@ -32,7 +32,7 @@ from sfms_robot.app.listen.run_teller import RunTeller
 from sfms_robot.app.listen.status_server import status_server
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
-from sfms_robot.config import Head, Joint, load_head
+from sfms_robot.config import Calmness, Head, Joint, load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError, RobotError
@@ -384,6 +384,7 @@ class RunOptions:
     without: tuple[str, ...] = ()
     halt_on: str | None = None
     status: int | None = None
+    calmness: Calmness | None = None
 
     @property
     def hears(self) -> str:
@@ -440,9 +441,9 @@ def run(
             stack.enter_context(halt_switch(options.halt_on, halt))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
-        opening = _opening(options, stack) if source is None else None
+        opening = _opening(options, stack, source)
         opened = stack.enter_context(open_head(options.servos))
-        source = source if opening is None else opening.result()
+        source = opening.result()
         duration_s = source.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
             raise ConfigError("--fast without a recording never ends: give it a --duration")
@@ -506,8 +507,12 @@ def run(
     return report
 
 
-def _opening(options: RunOptions, stack: ExitStack) -> Future[Source]:
-    """The person, being opened in a thread: a microphone takes a second, and so does the head."""
+def _opening(options: RunOptions, stack: ExitStack, given: Source | None) -> Future[Source]:
+    """The person, being opened in a thread: a microphone takes a second, and so does the head. One given is open."""
+    opening: Future[Source] = Future()
+    if given is not None:
+        opening.set_result(given)
+        return opening
     worker = ThreadPoolExecutor(1, "source")
     opening = worker.submit(
         open_source, options.hears, options.face, options.duration_s, agent_audio=options.agent_audio
@@ -525,17 +530,23 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
         from sfms_robot.listeners.registry import load_listener, one_thread  # torch: only here in this process
 
         one_thread()
-        feed = InlineFeed(load_listener(options.listener), options.seed, FAST_LATENCY_S)
+        feed = InlineFeed(load_listener(options.listener, calmness=options.calmness), options.seed, FAST_LATENCY_S)
     else:
-        feed = ListenerProcess(options.listener, options.seed)
+        feed = ListenerProcess(options.listener, options.seed, options.calmness)
     stack.callback(feed.close)
     return feed
+
+
+def _rates(calmness: Calmness | None) -> dict[str, Any] | None:
+    return None if calmness is None else calmness.model_dump(exclude_none=True)
 
 
 def _recorder(options: RunOptions, head: Head) -> Recorder | None:
     if options.record is None:
         return None
-    about = run_facts(head, options.listener, asdict(options) | {"audio": options.hears})
+    about = run_facts(
+        head, options.listener, {**asdict(options), "audio": options.hears, "calmness": _rates(options.calmness)}
+    )
     when_full: FullPolicy = "wait" if options.fast else "drop"
     return Recorder(options.record, list(head.joints), when_full=when_full, about=about)
 

@@ -5,9 +5,10 @@ value is dropped and counted, never waited for - except in virtual time, where w
 be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
 goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
-Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /event (nods, blinks and smiles that
-plans hold), /face (per tick: the 58 channels asked for), /joints (per tick and joint: goal, present, age, fault),
-/servos (once a second: what else they tell), /state (when it changes).
+Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /event (what was decided, and why; of
+a listener that decides nothing, nods, blinks and smiles found in its plans), /face (per tick: the 58 channels asked
+for), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: what else they tell), /state
+(when it changes).
 """
 
 from __future__ import annotations
@@ -75,8 +76,19 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "made_at_s": _NUMBER,
         "times_s": {"type": "array", "items": _NUMBER},
         "frames": {"type": "array", "items": {"type": "array", "items": _NUMBER}},
+        "hazards_hz": {"type": "object", "additionalProperties": _NUMBER},
     },
-    "/event": {"kind": {"type": "string"}, "start_s": _NUMBER, "end_s": _NUMBER, "size": _NUMBER},
+    "/event": {
+        "kind": {"type": "string"},
+        "start_s": _NUMBER,
+        "duration_s": _NUMBER,
+        "size": _NUMBER,
+        "swings": _NUMBER,
+        "target_rad": {"type": ["array", "null"], "items": _NUMBER},
+        "probability": _NUMBER_OR_NULL,
+        "draw": _NUMBER_OR_NULL,
+        "evidence": {"type": "object", "additionalProperties": _NUMBER},
+    },
     "/face": {"time_s": _NUMBER, **_CHANNELS},
     "/joints": {"time_s": _NUMBER, "joints": {"type": "object", "additionalProperties": _JOINT}},
     "/servos": {"time_s": _NUMBER, "servos": {"type": "object"}},
@@ -277,6 +289,7 @@ def _plan_body(plan: Plan) -> dict[str, Any]:
         "made_at_s": plan.made_at_s,
         "times_s": _numbers(plan.times_s),
         "frames": [_numbers(frame) for frame in plan.frames],
+        "hazards_hz": {kind: _number(hazard) for kind, hazard in plan.hazards_hz.items()},
     }
 
 
