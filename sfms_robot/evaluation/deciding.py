@@ -45,6 +45,11 @@ def forced_hazards(
     return hazards_hz
 
 
+def delayed(hazards_hz: dict[str, Doubles]) -> dict[str, Doubles]:
+    """A frame late. A head is told its own voice a frame before it sounds, which would tell its own "mm-hm"."""
+    return {kind: np.concatenate([values[:1], values[:-1]]) for kind, values in hazards_hz.items()}
+
+
 def decisions(
     model: EventModel, heard: Sequence[Sensed], seeds: Sequence[int], calmness: Calmness | None = None
 ) -> list[tuple[ListenerEvent, ...]]:

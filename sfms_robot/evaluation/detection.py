@@ -184,6 +184,7 @@ def busy_minute(rng: np.random.Generator) -> Score:
         shakes=spans(60, 0.5, 1.5),
         tilts=spans(40, 0.5, 2),
         laughs=spans(30, 0.5, 2),
+        shared_laughs=spans(15, 0.5, 2),
         gaze=tuple(looks),
     )
 

@@ -77,20 +77,22 @@ class ListenerMeeting:
 
     @property
     def addressed(self) -> Bools:
-        return self.spoken_to & (self.attention == 1)
+        return np.asarray(self.spoken_to & (self.attention == 1))
 
     @property
     def bystander(self) -> Bools:
-        return self.spoken_to & (self.attention == 0)
+        return np.asarray(self.spoken_to & (self.attention == 0))
 
     @property
     def history(self) -> tuple[ListenerEvent, ...]:
-        """What he did, as events in their order."""
+        """What he did that a listener might have, as events in their order: nods, while he listened."""
+        heard = self.listening[self.instants("nod")]
+        spans_s = {**self.spans_s, "nod": self.spans_s["nod"][heard]}
         found = [
             ListenerEvent(
                 kind, float(start), float(end - start), SIZES.get(kind, 0.5), target_rad=self._target(kind, at)
             )
-            for kind, spans in self.spans_s.items()
+            for kind, spans in spans_s.items()
             for at, (start, end) in enumerate(spans)
         ]
         return tuple(sorted(found, key=lambda event: event.start_s))
@@ -99,6 +101,27 @@ class ListenerMeeting:
         if kind != "gaze_shift":
             return None
         return (SIZES[kind], 0.0) if self.aside[at] else (0.0, 0.0)
+
+    def begins(self, kind: str) -> tuple[Ints, Bools]:
+        """(K,) last frames before his events of a kind, of those that begin where they might; and where (N,) that is.
+
+        They might where he listens and is not in the middle of one; a look aside might where he looks at whoever
+        speaks or has the floor, and other shifts of gaze are left out.
+        """
+        instants = self.instants(kind)
+        if kind == "gaze_shift":
+            might = self.listening & self.looks_at_speaker
+            instants = instants[self.aside]
+        else:
+            might = self.listening & ~self.inside(kind)
+        return instants[might[instants]], might
+
+    @property
+    def looks_at_speaker(self) -> Bools:
+        """(N,) the newest of his looks did not go aside."""
+        shifts = self.instants("gaze_shift") + 1
+        newest = np.searchsorted(shifts, np.arange(self.frames), side="right") - 1
+        return np.asarray((newest >= 0) & ~np.r_[self.aside, False][newest])
 
     def instants(self, kind: str) -> Ints:
         """(K,) the last frame that is over when each event of the kind begins."""
@@ -128,11 +151,10 @@ def listener_meeting(
     floor = _floor(person, whole)
     attention = _looks(person, whole, floor)
     audio, face = _others(whole, voice, laughter, motions, attention, rng)
-    frames = zip(speaker_frames(audio, face, said), attention, strict=True)
     return ListenerMeeting(
         f"{person.meeting}_{person.agent}",
         person.participant,
-        tuple(replace(frame, attention=None if np.isnan(looks) else float(looks)) for frame, looks in frames),
+        tuple(speaker_frames(audio, face, said, attention.astype(np.float32))),
         _annotated(person, whole),
         _aside(person, floor),
         active(person.others, whole),
@@ -183,7 +205,7 @@ def _speakers(person: Person, stretch: Stretch) -> Ints:
     """(N,) how many of the others speak."""
     agents = sorted({agent for _, _, agent in person.floor})
     masks = [active(_spans(person.floor, agent), stretch) for agent in agents]
-    return np.sum([np.zeros(stretch.frames, np.int64), *masks], axis=0)
+    return np.asarray(np.sum([np.zeros(stretch.frames, np.int64), *masks], axis=0), np.int64)
 
 
 def _floor(person: Person, stretch: Stretch) -> NDArray[np.str_]:

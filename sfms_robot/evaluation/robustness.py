@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import soxr
+from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
 from sfms_robot.evaluation.detection import seen
@@ -167,14 +168,7 @@ def heard_and_seen(
         face = np.resize(speaker.face, face.shape).astype(np.float32)
         face = condition.face(face, rng) if condition.face else face
     attention = condition.attention(frames) if condition.attention else np.ones(frames, np.float32)
-    return [
-        frame if frame.face is None else _looking(frame, float(looks))
-        for frame, looks in zip(speaker_frames(None if inputs == "face" else voice, face), attention, strict=True)
-    ]
-
-
-def _looking(frame: SpeakerFrame, attention: float) -> SpeakerFrame:
-    return SpeakerFrame(frame.time_s, frame.audio, frame.face, frame.agent_audio, attention)
+    return speaker_frames(None if inputs == "face" else voice, face, attention=attention)
 
 
 def counted(played: Rollout) -> dict[str, list[int]]:
@@ -206,9 +200,9 @@ def outside(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _rms(values: Floats) -> float:
+def _rms(values: NDArray[np.floating]) -> float:
     return float(np.sqrt(np.mean(np.asarray(values, np.float64) ** 2))) + 1e-12
 
 
-def _clipped(values: Floats) -> Floats:
+def _clipped(values: NDArray[np.floating]) -> Floats:
     return np.asarray(np.clip(values, -1, 1), np.float32)

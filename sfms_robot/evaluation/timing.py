@@ -103,7 +103,7 @@ def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]
     """What a listener decided, left to itself, once for each seed."""
     nods = [spans_of(decided, "nod") for decided in streams]
     sums = nod_sums("decided_", one, nods)
-    sums |= nod_contingency("decided_nod_auc", nods, one, np.ones(one.frames, bool))
+    sums |= nod_contingency("decided_", nods, one, np.ones(one.frames, bool))
     for kind in (*ANNOTATED, "smile", "blink"):
         sums |= other_sums("decided_", one, kind, [spans_of(decided, kind) for decided in streams])
     return sums
@@ -124,7 +124,7 @@ def motion_sums(one: ListenerMeeting, motions: Floats, first: int, calibration: 
     minutes = runs * frames * FRAME_S / 60
     return {
         **nod_sums("", one, nods, played, calibration.nods_per_seen_nod),
-        **nod_contingency("nod_auc", nods, one, played),
+        **nod_contingency("", nods, one, played),
         "nod_deg_sizes": np.histogram(sizes, SIZES_DEG)[0].astype(np.float64),
         "blinks_per_minute": np.array([sum(map(len, found["blink"])), minutes]),
         "smiles_per_minute": np.array([sum(map(len, found["smile"])), minutes]),
@@ -142,17 +142,13 @@ def _minutes(mask: Bools) -> float:
 def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Bools | None = None) -> Doubles:
     """[AUC * K, K]: how scores (N,) rank the instants before his K events above the others at which he might begin.
 
-    He might where he listens and is not in the middle of one. Nothing of fewer than three events, or of a kind that
-    was not annotated.
+    See `ListenerMeeting.begins`. Nothing of fewer than three events, or of a kind that was not annotated.
     """
     if kind not in one.spans_s:
         return np.zeros(2)
-    might = one.listening & ~one.inside(kind)
+    onsets, others = one.begins(kind)
     if within is not None:
-        might &= within
-    onsets = one.instants(kind)
-    onsets = onsets[might[onsets]]
-    others = might.copy()
+        onsets, others = onsets[within[onsets]], others & within
     others[onsets] = False
     if len(onsets) < LEAST or not others.any():
         return np.zeros(2)
@@ -160,7 +156,7 @@ def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Boo
 
 
 def contingent(
-    name: str, matched: Doubles, shifted: Sequence[Doubles], one: ListenerMeeting, within: Bools | None = None
+    who: str, name: str, matched: Doubles, shifted: Sequence[Doubles], one: ListenerMeeting, within: Bools | None = None
 ) -> Sums:
     """How scores (N,) rank his nods; likewise those that belong to other minutes, in the mean; and by how much less."""
     own = ranked(matched, one, "nod", within)
@@ -168,17 +164,16 @@ def contingent(
     if shifted:
         other = np.mean([ranked(scores, one, "nod", within) for scores in shifted], axis=0)
     difference = np.array([own[0] - other[0], own[1]]) if other[1] else np.zeros(2)
-    return {name: own, f"shifted_{name}": other, f"{name}_matched_minus_shifted": difference}
+    return {f"{who}{name}": own, f"{who}shifted_{name}": other, f"{who}{name}_matched_minus_shifted": difference}
 
 
 def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubles, other: Doubles) -> Sums:
     """How hazards (N,) rank his nods: given his own speech, without it, and without it while the others are shifted."""
-    ranks = contingent("nod_hazard_auc", silent, [other], one)
+    ranks = contingent(who, "nod_hazard_auc", silent, [other], one)
     return {
+        f"{who}nod_hazard_auc_without_own_speech": ranks[f"{who}nod_hazard_auc"],
+        **ranks,
         f"{who}nod_hazard_auc": ranked(speaking, one),
-        f"{who}nod_hazard_auc_without_own_speech": ranks["nod_hazard_auc"],
-        f"{who}shifted_nod_hazard_auc": ranks["shifted_nod_hazard_auc"],
-        f"{who}nod_hazard_auc_matched_minus_shifted": ranks["nod_hazard_auc_matched_minus_shifted"],
     }
 
 
@@ -187,7 +182,7 @@ def nod_share(runs: Runs, frames: int) -> Doubles:
     return np.asarray(np.mean([events.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in runs], axis=0), np.float64)
 
 
-def nod_contingency(name: str, runs: Runs, one: ListenerMeeting, within: Bools) -> Sums:
+def nod_contingency(who: str, runs: Runs, one: ListenerMeeting, within: Bools) -> Sums:
     """`contingent` of nods that a listener made itself.
 
     Its history is its own, so what it did while it heard another minute is what it did then: its nods are moved, by
@@ -201,7 +196,7 @@ def nod_contingency(name: str, runs: Runs, one: ListenerMeeting, within: Bools) 
         other = share.copy()
         other[played] = np.roll(share[played], shift)
         moved.append(other)
-    return contingent(name, share, moved, one, within)
+    return contingent(who, "nod_auc", share, moved, one, within)
 
 
 def table_rates(people: Sequence[Person]) -> Doubles:

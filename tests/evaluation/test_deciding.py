@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from sfms_robot.listeners.events.hazards import EventTables
-from sfms_robot.listeners.events.model import EventModel
 
 from sfms_robot.evaluation import timing
-from sfms_robot.evaluation.deciding import decisions, forced_hazards, sensed, spans_of
+from sfms_robot.evaluation.deciding import decisions, delayed, forced_hazards, sensed, spans_of
 from sfms_robot.evaluation.listener_meetings import ListenerMeeting, shifted
 from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_SAMPLES
+from sfms_robot.listeners.events.hazards import EventTables
+from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.signals.events import runs
 
 MINUTES = 6
@@ -57,7 +57,7 @@ def contingency(decides, speaker, one):
     matched, other = (
         forced_hazards(decides, sensed(decides, frames), one.history)["nod"] for frames in (speaker, shifted(speaker))
     )
-    found = timing.contingent("x", matched, [other], one)
+    found = timing.contingent("", "x", matched, [other], one)
     return found["x"][0] / found["x"][1], found["x_matched_minus_shifted"][0] / found["x"][1]
 
 
@@ -90,3 +90,7 @@ def test_a_seed_decides_the_same_alone_and_beside_others(speaker):
     assert together[0] != together[1]
     nods = spans_of(together[0], "nod")
     assert len(nods) > 3 and (np.diff(nods[:, 0]) > 0).all() and not len(spans_of(together[0], "blink"))
+
+
+def test_delayed_hazards_know_a_frame_less():
+    assert delayed({"nod": np.array([1.0, 2.0, 3.0])})["nod"].tolist() == [1.0, 1.0, 2.0]

@@ -79,6 +79,18 @@ def test_inside_a_nod_is_after_its_first_instant_and_before_its_end(one):
     assert (one.instants("nod")[0] + 1) * FRAME_S <= start + 1e-9
 
 
+def test_a_look_aside_might_begin_while_he_looks_at_the_speaker(one):
+    onsets, might = one.begins("gaze_shift")
+    assert onsets.tolist() == [at(40) - 1]
+    assert one.looks_at_speaker[at(2.1) : at(40)].all() and not one.looks_at_speaker[at(40) : at(50)].any()
+    assert not (might & ~one.listening).any() and might[at(39)]
+
+
+def test_nods_might_begin_where_none_is_under_way(one):
+    onsets, might = one.begins("nod")
+    assert not (might & one.inside("nod")).any() and might[onsets].all() and len(onsets) > 15
+
+
 def frames(count):
     """Each says in every input which one it is."""
     return [

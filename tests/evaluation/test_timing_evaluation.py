@@ -88,7 +88,7 @@ def test_nods_at_random_know_no_phrase_ends_and_rank_nothing():
     runs = [spans(anywhere(4000, seed)) for seed in range(8)]
     everything = np.ones(FRAMES, bool)
     found = figures(
-        (one, timing.nod_sums("decided_", one, runs) | timing.nod_contingency("decided_nod_auc", runs, one, everything))
+        (one, timing.nod_sums("decided_", one, runs) | timing.nod_contingency("decided_", runs, one, everything))
     )
     assert found["decided_phrase_end_ratio"] == pytest.approx(1.0, abs=0.05)
     assert found["decided_nod_auc"] == pytest.approx(0.5, abs=0.05)
@@ -172,7 +172,7 @@ def shift(values):
 
 def test_shifting_the_others_takes_all_from_a_listener_that_copies_their_phase():
     one = meeting(answering(talk()))
-    found = timing.contingent("x", phase_hazard(one.others), [phase_hazard(shift(one.others))], one)
+    found = timing.contingent("", "x", phase_hazard(one.others), [phase_hazard(shift(one.others))], one)
     matched, shifted, difference = (numbers[0] / numbers[1] for numbers in found.values())
     assert matched > 0.9 and shifted == pytest.approx(0.5, abs=0.05)
     assert difference == pytest.approx(matched - shifted)
@@ -182,7 +182,7 @@ def test_shifting_the_others_takes_nothing_from_a_listener_that_follows_its_own_
     first = anywhere(60)
     one = meeting(np.sort(np.r_[first, first + 1.5]))
     hazard = history_hazard(one)
-    found = timing.contingent("x", hazard, [hazard], one)
+    found = timing.contingent("", "x", hazard, [hazard], one)
     assert found["x"][0] / found["x"][1] > 0.65
     assert found["x_matched_minus_shifted"][0] == 0
 
@@ -191,17 +191,21 @@ def test_moving_a_listeners_own_nods_tells_the_same():
     one = meeting(answering(talk()))
     everything = np.ones(FRAMES, bool)
     runs = [spans(answering(talk(), seed=seed)) for seed in range(1, 9)]
-    found = timing.nod_contingency("x", runs, one, everything)
-    assert found["x"][0] / found["x"][1] > 0.8
-    assert found["shifted_x"][0] / found["shifted_x"][1] == pytest.approx(0.5, abs=0.03)
-    own = timing.nod_contingency("x", [spans(anywhere(80, seed)) for seed in range(8)], one, everything)
-    assert own["x_matched_minus_shifted"][0] / own["x"][1] == pytest.approx(0, abs=0.05)
+    found = timing.nod_contingency("", runs, one, everything)
+    assert found["nod_auc"][0] / found["nod_auc"][1] > 0.8
+    assert found["shifted_nod_auc"][0] / found["shifted_nod_auc"][1] == pytest.approx(0.5, abs=0.03)
+    own = timing.nod_contingency("", [spans(anywhere(80, seed)) for seed in range(8)], one, everything)
+    assert own["nod_auc_matched_minus_shifted"][0] / own["nod_auc"][1] == pytest.approx(0, abs=0.05)
 
 
 def test_too_short_a_part_cannot_be_shifted():
     one = meeting(answering(talk()))
-    found = timing.nod_contingency("x", [one.spans_s["nod"]], one, np.arange(FRAMES) < 90 * FRAME_HZ)
-    assert found["x"][1] > 0 and not found["shifted_x"].any() and not found["x_matched_minus_shifted"].any()
+    found = timing.nod_contingency("", [one.spans_s["nod"]], one, np.arange(FRAMES) < 90 * FRAME_HZ)
+    assert (
+        found["nod_auc"][1] > 0
+        and not found["shifted_nod_auc"].any()
+        and not found["nod_auc_matched_minus_shifted"].any()
+    )
 
 
 def test_an_instant_is_ranked_by_what_is_known_before_it():

@@ -14,8 +14,7 @@ from typing import Final
 from sfms_robot.app.bench.lead import Waves
 from sfms_robot.app.bench.measure import Row, row
 from sfms_robot.app.session import RunOptions, run
-from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.ports import Observer, Tick
 
 HEAD: Final = "interbotix_wxxms"  # two servos: hours pass quickly
 HOURS: Final = 4.0
@@ -23,7 +22,7 @@ _HOUR_S: Final = 3600.0
 _LOOKS: Final = 20  # an hour
 
 
-class ResidentMemory:
+class ResidentMemory(Observer):
     """An observer that looks at the memory of its own process every so often."""
 
     def __init__(self, every_s: float = _HOUR_S / _LOOKS) -> None:
@@ -37,12 +36,6 @@ class ResidentMemory:
             pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
             self.times_s.append(seen.time_s)
             self.resident_mb.append(pages * self._page_mb)
-
-    def heard(self, frame: SpeakerFrame) -> None: ...
-
-    def planned(self, plan: Plan) -> None: ...
-
-    def close(self) -> None: ...
 
 
 def memory(hours: float = HOURS) -> dict[str, Row]:

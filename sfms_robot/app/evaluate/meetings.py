@@ -16,7 +16,8 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.evaluate.task_pool import done_in_processes
-from sfms_robot.config import find
+from sfms_robot.app.evaluate.unseen_speakers import voice_folders
+from sfms_robot.config import Calmness, find
 from sfms_robot.corpora.compose.ami import Person, read_people, split_series
 from sfms_robot.corpora.compose.motions import Motions
 from sfms_robot.corpora.compose.motions import load as load_motions
@@ -26,13 +27,14 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import timing
 from sfms_robot.evaluation.bootstrap import LEVEL, Estimate, Sums, estimates
-from sfms_robot.evaluation.deciding import decisions, forced_hazards, sensed
+from sfms_robot.evaluation.deciding import decisions, delayed, forced_hazards, sensed
 from sfms_robot.evaluation.detection import SIZES, Calibration, Sightings, added_up, asked_and_seen, figures
 from sfms_robot.evaluation.listener_meetings import ListenerMeeting, listener_meeting, part, shifted, without_own_voice
 from sfms_robot.evaluation.reference_hazard import ReferenceHazard
 from sfms_robot.evaluation.rollout import rollout
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame
 from sfms_robot.listeners.eventful import EventfulListener
+from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.registry import load_listener
 from sfms_robot.ports import Listener
 
@@ -44,6 +46,7 @@ class TimingOptions:
     """What to play.
 
     Attributes:
+        listener: shipped name, folder, or a file of hazards (`train events`), which has no motion.
         split: of the people; `allow_training` has to be said for those who were trained on.
         meetings: at most so many, spread over them all; None: all.
         minutes: of motion from the middle of each meeting; 0: none, which takes minutes instead of hours.
@@ -67,12 +70,13 @@ class _Task:
     """One person's meeting, and what he is judged by.
 
     Attributes:
+        where: folder of the listener, or its file of hazards.
         number: place in the tables.
         table: (CELLS,) nods a minute by speech phase, and `reference`: of training people; None without any.
     """
 
     options: TimingOptions
-    folder: Path
+    where: Path
     person: Person
     number: int
     table: Doubles | None
@@ -93,11 +97,12 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
 
     Raises ConfigError or ModelError.
     """
-    folder = find("listeners", options.listener, "config.yaml")
-    load_listener(folder)  # what is wrong with it is said here, not by a process
+    where = Path(options.listener) if options.listener.endswith(".yaml") else None
+    where = where or find("listeners", options.listener, "config.yaml")
+    _listener(where)  # what is wrong with it is said here, not by a process
     everybody = read_people(tables(options.data))
     chosen = spread(people_of(everybody, options.split, options.allow_training), options.meetings)
-    tasks = list(_tasks(options, folder, everybody, chosen))
+    tasks = list(_tasks(options, where, everybody, chosen))
     played = done_in_processes(_play, tasks, options.jobs, "people listening")
     people = timing.per_person((one.participant, one.sums) for one in played)
     found = estimates(timing.figures_of(people[0]), people, options.seed)
@@ -155,23 +160,23 @@ def tables(data: Path) -> Path:
 
 
 def _tasks(
-    options: TimingOptions, folder: Path, everybody: Sequence[Person], chosen: Sequence[Person]
+    options: TimingOptions, where: Path, everybody: Sequence[Person], chosen: Sequence[Person]
 ) -> Iterator[_Task]:
     training = split_series(everybody)["train"]
     table = timing.table_rates(training) if training else None
     reference = ReferenceHazard.of(training) if training else None
     calibration = _calibration(options.split)
     for person in chosen:
-        yield _Task(options, folder, person, everybody.index(person), table, reference, calibration)
+        yield _Task(options, where, person, everybody.index(person), table, reference, calibration)
 
 
 def _play(task: _Task) -> _Played:
     """One meeting: what he did, what the listener would have done, and what it did."""
-    options, (voices, laughter, motions) = task.options, _bundled(task.options.split)
+    options, (voices, laughter, motions) = task.options, _material(task.options.split, task.options.data)
     rng = np.random.default_rng([options.seed, task.number])
     one = listener_meeting(task.person, voices, laughter, motions, rng)
-    listener, alone = _listener(task.folder), without_own_voice(one.speaker)
-    first, frames = middle(one.frames, options.minutes)
+    listener, alone = _listener(task.where), without_own_voice(one.speaker)
+    first, frames = middle(one.frames, 0.0 if isinstance(listener, EventModel) else options.minutes)
     played = np.zeros(one.frames, bool)
     played[first : first + frames] = True
     sums = timing.people_sums(one, played)
@@ -180,9 +185,11 @@ def _play(task: _Task) -> _Played:
         sums |= timing.hazard_sums("r2_", one, *task.reference.scores(task.person, one.frames))
     seeds = range(1000 * (options.seed + task.number), 1000 * (options.seed + task.number) + options.seeds)
     if isinstance(listener, EventfulListener):
-        sums |= _by_events(listener, one, alone, seeds)
+        sums |= _by_events(listener.when, listener.calmness, one, alone, seeds)
+    if isinstance(listener, EventModel):
+        sums |= _by_events(listener, Calmness(), one, alone, seeds)
     sightings: Mapping[str, Sightings] = {}
-    if frames:
+    if frames and not isinstance(listener, EventModel):
         rolled = rollout(listener, part(alone, first, frames), seeds)
         sums |= timing.motion_sums(one, rolled.motion, first, task.calibration)
         streams = zip(rolled.events, rolled.motion, strict=True)
@@ -197,12 +204,16 @@ def middle(frames: int, minutes: float) -> tuple[int, int]:
 
 
 def _by_events(
-    listener: EventfulListener, one: ListenerMeeting, alone: Sequence[SpeakerFrame], seeds: Sequence[int]
+    model: EventModel,
+    calmness: Calmness,
+    one: ListenerMeeting,
+    alone: Sequence[SpeakerFrame],
+    seeds: Sequence[int],
 ) -> Sums:
     """How its hazards, given his own history, rank what he did; and what it decides, left to itself."""
-    model, calmness, history = listener.when, listener.calmness, one.history
+    history = one.history
     heard = sensed(model, alone, calmness)
-    speaking = forced_hazards(model, sensed(model, one.speaker, calmness), history, calmness)
+    speaking = delayed(forced_hazards(model, sensed(model, one.speaker, calmness), history, calmness))
     silent = forced_hazards(model, heard, history, calmness)
     other = forced_hazards(model, sensed(model, shifted(alone), calmness), history, calmness)
     sums = timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
@@ -212,22 +223,24 @@ def _by_events(
 
 
 @cache
-def _listener(folder: Path) -> Listener:
-    return load_listener(folder)
+def _listener(where: Path) -> Listener | EventModel:
+    return EventModel.load(where) if where.suffix == ".yaml" else load_listener(where)
 
 
 @cache
-def _bundled(split: Split) -> tuple[tuple[Voice, ...], tuple[Floats, ...], Motions]:
-    """Voices, laughter and motions that belong to that part."""
-    sim = data_dir("sim")
-    voices = split_voices(find_voices([sim / "speakers"]))[split]
-    motions = load_motions(sim / "listeners" / "motions.npz")[split]
-    return tuple(voices), tuple(find_laughter([sim / "speakers"])[split]), motions
+def _material(split: Split, data: Path) -> tuple[Sequence[Voice], Sequence[Floats], Motions]:
+    """Voices, laughter and motions of that part."""
+    folders = voice_folders(data)
+    return split_voices(find_voices(folders))[split], find_laughter(folders)[split], _motions(split)
+
+
+def _motions(split: Split) -> Motions:
+    return load_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
 
 
 @cache
 def _calibration(split: Split) -> Calibration:
-    return Calibration.of(_bundled(split)[2])
+    return Calibration.of(_motions(split))
 
 
 # --- telling ----------------------------------------------------------------------------------------------------
@@ -262,7 +275,7 @@ def _notes(found: Mapping[str, Estimate]) -> Iterator[str]:
     if "nod_hazard_auc" not in found:
         yield "this listener has no hazards that could be asked: nod_hazard_auc and its kin cannot be told"
     if "nods_per_minute" not in found:
-        yield "no motion was played (--minutes 0)"
+        yield "no motion was played"
     if "r2_nod_hazard_auc" not in found:
         yield "the tables hold nobody to fit the reference on"
 

@@ -30,7 +30,11 @@ def done_in_processes(
         bar = progress.add_task(title, total=len(tasks))
         if workers <= 1:
             one_thread()
-            return [(work(task), progress.advance(bar))[0] for task in tasks]
+            results = []
+            for task in tasks:
+                results.append(work(task))
+                progress.advance(bar)
+            return results
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(workers, mp_context=context, initializer=one_thread)
         try:
