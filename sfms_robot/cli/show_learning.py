@@ -94,7 +94,9 @@ def print_robustness(result: Mapping[str, Any]) -> None:
         f"{name.replace('_', ' ')} {low:g} to {high:g}" for name, (low, high) in result["people"].items()
     )
     screen().print(
-        f"people: {ranges}; {len(result['outside'])} of {len(result['rows'])} rows are outside.", soft_wrap=True
+        f"people: {ranges}; {len(result['outside'])} of {len(result['rows'])} rows are outside. Variance over mean of "
+        f"nods, median: {_cell(result['nods_variance_over_mean'])}.",
+        soft_wrap=True,
     )
 
 
