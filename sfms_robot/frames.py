@@ -230,14 +230,6 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class JointCommand:
-    """Joint angles [rad] (J,) float64 in the joint order of the head."""
-
-    time_s: float
-    angles_rad: Doubles
-
-
-@dataclass(frozen=True)
 class Reading:
     """What a bus knows of one joint.
 

@@ -251,15 +251,18 @@ class Bus(Protocol):
 
 
 class Observer(Protocol):
-    """Sees every tick, may drop, never blocks."""
+    """Sees every tick, may drop, never blocks. A class that derives from it needs only what it looks at."""
 
     def tick(self, seen: Tick) -> None: ...
 
-    def heard(self, frame: SpeakerFrame) -> None: ...
+    def heard(self, frame: SpeakerFrame) -> None:
+        return
 
-    def planned(self, plan: Plan) -> None: ...
+    def planned(self, plan: Plan) -> None:
+        return
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        return
 
 
 @dataclass(frozen=True)

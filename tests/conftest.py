@@ -1,7 +1,10 @@
 """`--port FAMILY=DEVICE[,MODEL:IDS[@BAUD]]` runs the contract of the servo buses on real servos."""
 
 import pytest
+from ended import Ended
 from sound_server import SoundServer
+
+from sfms_robot.cli.main import main
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -47,3 +50,15 @@ def sound_server(_sound_servers, monkeypatch):
     _sound_servers.start("person")
     yield _sound_servers
     _sound_servers.stop()
+
+
+@pytest.fixture
+def command_line(capsys):
+    """Run `sfms-robot ARGUMENTS` in this process."""
+
+    def run(*words: object) -> Ended:
+        with pytest.raises(SystemExit) as ended:
+            main([str(word) for word in words])
+        return Ended(int(ended.value.code or 0), *capsys.readouterr())
+
+    return run

@@ -441,9 +441,9 @@ def run(
             stack.enter_context(halt_switch(options.halt_on, halt))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
-        opening = _opening(options, stack) if source is None else None
+        opening = _opening(options, stack, source)
         opened = stack.enter_context(open_head(options.servos))
-        source = source if opening is None else opening.result()
+        source = opening.result()
         duration_s = source.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
             raise ConfigError("--fast without a recording never ends: give it a --duration")
@@ -507,8 +507,12 @@ def run(
     return report
 
 
-def _opening(options: RunOptions, stack: ExitStack) -> Future[Source]:
-    """The person, being opened in a thread: a microphone takes a second, and so does the head."""
+def _opening(options: RunOptions, stack: ExitStack, given: Source | None) -> Future[Source]:
+    """The person, being opened in a thread: a microphone takes a second, and so does the head. One given is open."""
+    opening: Future[Source] = Future()
+    if given is not None:
+        opening.set_result(given)
+        return opening
     worker = ThreadPoolExecutor(1, "source")
     opening = worker.submit(
         open_source, options.hears, options.face, options.duration_s, agent_audio=options.agent_audio

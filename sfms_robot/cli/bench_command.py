@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json as json_module
 import sys
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -88,51 +90,49 @@ def bench(
         print_bench(result)
 
 
-def _webcam(json: bool) -> None:
-    from sfms_robot.app.bench import webcam_bench
-    from sfms_robot.cli.show import print_rows
-
-    result = webcam_bench.webcam()
+def _tell(result: Any, rows: Sequence[Mapping[str, Any]], lines: Sequence[str], json: bool) -> None:
+    """A result as one JSON object, or as a table and what it leaves out."""
     if json:
         print(json_module.dumps(result))
         return
-    print_rows(webcam_bench.table(result))
-    for name, ms in result["timings_ms"].items():
-        print(f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})")
+    from sfms_robot.cli.show import print_rows
+
+    print_rows(rows)
+    for line in lines:
+        print(line)
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def _webcam(json: bool) -> None:
+    from sfms_robot.app.bench import webcam_bench
+
+    result = webcam_bench.webcam()
+    times = [f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})" for name, ms in result["timings_ms"].items()]
+    _tell(result, webcam_bench.table(result), times, json)
 
 
 def _live(minutes: float, audio: LiveAudio, torture: bool, json: bool) -> None:
     from sfms_robot.app.bench import live_bench, torture_bench
-    from sfms_robot.cli.show import print_rows
-
-    def say(line: str) -> None:
-        print(line, file=sys.stderr)
 
     if torture:
-        result = torture_bench.torture(minutes or torture_bench.MINUTES, audio.value, say)
-        rows, lines = torture_bench.table(result), torture_bench.words(result)
+        result = torture_bench.torture(minutes or torture_bench.MINUTES, audio.value, _say)
+        _tell(result, torture_bench.table(result), torture_bench.words(result), json)
+        if not result["passed"]:
+            raise typer.Exit(1)
     else:
-        result = live_bench.live(minutes or live_bench.MINUTES, audio.value, say)
-        rows, lines = live_bench.table(result), live_bench.words(result)
-    if json:
-        print(json_module.dumps(result))
-    else:
-        print_rows(rows)
-        print("\n".join(lines))
-    if torture and not result["passed"]:
-        raise typer.Exit(1)
+        result = live_bench.live(minutes or live_bench.MINUTES, audio.value, _say)
+        _tell(result, live_bench.table(result), live_bench.words(result), json)
 
 
 def _own_voice(folder: Path | None, json: bool) -> None:
     from sfms_robot.app.bench import own_voice_bench
-    from sfms_robot.cli.show import print_rows
 
     result = own_voice_bench.own_voice(folder)
-    if json:
-        print(json_module.dumps(result))
-        return
-    print_rows(own_voice_bench.table(result))
-    print(f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms")
+    line = f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms"
+    _tell(result, own_voice_bench.table(result), [line], json)
 
 
 def _trial(name: Bench, minutes: float, json: bool) -> None:
@@ -141,23 +141,15 @@ def _trial(name: Bench, minutes: float, json: bool) -> None:
     from dataclasses import asdict
 
     from sfms_robot.app.bench import campaign, fuzz
-    from sfms_robot.cli.show import print_rows
 
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
-
-    def say(line: str) -> None:
-        print(line, file=sys.stderr)
-
     if name is Bench.campaign:
-        outcomes = campaign.run_campaign(progress=say)
+        outcomes = campaign.run_campaign(progress=_say)
         rows, plain = campaign.table(outcomes), [asdict(each) | {"passed": each.passed} for each in outcomes]
     else:
-        fuzzed = fuzz.run_fuzz(minutes, progress=say)
+        fuzzed = fuzz.run_fuzz(minutes, progress=_say)
         rows, plain = fuzz.table(fuzzed), [asdict(each) | {"passed": each.passed} for each in fuzzed]
     passed = all(each["passed"] for each in plain)
-    if json:
-        print(json_module.dumps({"passed": passed, "runs": plain}))
-    else:
-        print_rows(rows)
+    _tell({"passed": passed, "runs": plain}, rows, [], json)
     if not passed:
         raise typer.Exit(1)

@@ -54,10 +54,7 @@ def scan(
 
 @app.command()
 @on_wire
-def ping(
-    on: Wiring,
-    ids: Ids,
-) -> None:
+def ping(on: Wiring, ids: Ids) -> None:
     """Whether servos answer, and who they are."""
     rows: list[dict[str, Any]] = []
     with on.open() as wire:
@@ -135,12 +132,9 @@ def dump(
     """All registers of servos into a YAML file."""
     from sfms_robot.app.servo.dump import dump as taken
     from sfms_robot.app.servo.dump import save_dump
-    from sfms_robot.app.servo.single_servo import scan as look
 
     with on.open() as wire, _bar("reading", hidden=on.json) as progress:
-        servos = [wire.find(servo) for servo in _parsed(ids)] if ids is not None else look(wire, None, progress)
-        if not servos:
-            raise BusError(f"{wire.port.name}: nobody answers")
+        servos = _chosen(wire, ids, progress)
         save_dump(taken(wire, servos), file)
     _show([seen.row() for seen in servos], {"file": str(file), "servos": [seen.row() for seen in servos]}, on.json)
 
@@ -187,12 +181,7 @@ def set_id(
     """Give a servo another id. Best with that one servo on the wire."""
     from sfms_robot.app.servo.single_servo import set_id as change
 
-    _each(
-        str(old),
-        on,
-        lambda wire, seen: [change(wire, seen, new, confirmation(yes), in_chain).row()],
-        "servos",
-    )
+    _each(str(old), on, lambda wire, seen: [change(wire, seen, new, confirmation(yes), in_chain).row()], "servos")
 
 
 @app.command("set-baud")
@@ -207,31 +196,17 @@ def set_baud(
     from sfms_robot.app.servo.single_servo import set_baud as change
 
     confirm = confirmation(yes, ids)
-    _each(
-        ids,
-        on,
-        lambda wire, seen: [change(wire, seen, rate, confirm).row()],
-        "servos",
-    )
+    _each(ids, on, lambda wire, seen: [change(wire, seen, rate, confirm).row()], "servos")
 
 
 @app.command()
 @on_wire
-def reboot(
-    on: Wiring,
-    ids: Ids,
-    yes: YesOption = False,
-) -> None:
+def reboot(on: Wiring, ids: Ids, yes: YesOption = False) -> None:
     """Start servos over: torque goes off, latched hardware errors go away."""
     from sfms_robot.app.servo.single_servo import reboot as restart
 
     confirm = confirmation(yes, ids)
-    _each(
-        ids,
-        on,
-        lambda wire, seen: [restart(wire, seen, confirm).row()],
-        "servos",
-    )
+    _each(ids, on, lambda wire, seen: [restart(wire, seen, confirm).row()], "servos")
 
 
 @app.command("factory-reset")
@@ -245,12 +220,7 @@ def factory_reset(
     """Put a servo's settings back to what they were when it was new."""
     from sfms_robot.app.servo.single_servo import factory_reset as reset
 
-    _each(
-        str(servo),
-        on,
-        lambda wire, seen: [reset(wire, seen, keep.value, confirmation(yes)).row()],
-        "servos",
-    )
+    _each(str(servo), on, lambda wire, seen: [reset(wire, seen, keep.value, confirmation(yes)).row()], "servos")
 
 
 @app.command()
@@ -263,25 +233,19 @@ def monitor(
 ) -> None:
     """Position, load, voltage, temperature and faults, live. Reads only."""
     from sfms_robot.app.servo.register_view import samples as looks
-    from sfms_robot.app.servo.single_servo import scan as look
 
     taken: list[list[dict[str, Any]]] = []
     with on.open() as wire:
-        asked = _parsed(ids) if ids is not None else None
         with _bar("looking for servos", hidden=on.json) as progress:
-            servos = [wire.find(servo) for servo in asked] if asked is not None else look(wire, None, progress)
-        if not servos:
-            raise BusError(f"{wire.port.name}: nobody answers")
+            servos = _chosen(wire, ids, progress)
         count = samples if samples is not None else 1 if on.json else None
         if on.json:
             taken = list(looks(wire, servos, 1.0 / rate, count))
         else:
             from sfms_robot.cli.show_servo import live
 
-            live(
-                looks(wire, servos, 1.0 / rate, count),
-                f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends",
-            )
+            title = f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends"
+            live(looks(wire, servos, 1.0 / rate, count), title)
     if on.json:
         print(json_module.dumps({"samples": taken}))
 
@@ -321,12 +285,17 @@ def _parsed(ids: str) -> list[int]:
     return parse_ids(ids)
 
 
-def _each(
-    ids: str,
-    on: Wiring,
-    work: Callable[[Wire, FoundServo], list[dict[str, Any]]],
-    key: str,
-) -> None:
+def _chosen(wire: Wire, ids: str | None, progress: Any) -> list[FoundServo]:
+    """Those of `ids`, or everybody. Raises BusError when nobody answers."""
+    from sfms_robot.app.servo.single_servo import scan as look
+
+    servos = [wire.find(servo) for servo in _parsed(ids)] if ids is not None else look(wire, None, progress)
+    if not servos:
+        raise BusError(f"{wire.port.name}: nobody answers")
+    return servos
+
+
+def _each(ids: str, on: Wiring, work: Callable[[Wire, FoundServo], list[dict[str, Any]]], key: str) -> None:
     """Do `work` for every id; what was done is shown even when a later one fails."""
     rows: list[dict[str, Any]] = []
     servos = _parsed(ids)

@@ -35,10 +35,10 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
     rows = [
         ("face", f"{motion['nods']} nods, {motion['blinks']} blinks, {motion['smiles']} smiles"),
         ("ticks", _ticks(report["ticks"], tick)),
-        ("latency", f"frame to wire p50 {_or(report['latency_ms']['frame_to_wire']['p50'], '-')} ms, "
-                    f"speech to wire p50 {_or(report['latency_ms']['speech_to_wire']['p50'], '-')} ms"),
-        ("listener", f"{report['listener']}, a plan in p50 {_or(report['listener_step_ms']['p50'], '-')} ms, "
-                     f"p99 {_or(report['listener_step_ms']['p99'], '-')} ms"),
+        ("latency", f"frame to wire p50 {cell(report['latency_ms']['frame_to_wire']['p50'])} ms, "
+                    f"speech to wire p50 {cell(report['latency_ms']['speech_to_wire']['p50'])} ms"),
+        ("listener", f"{report['listener']}, a plan in p50 {cell(report['listener_step_ms']['p50'])} ms, "
+                     f"p99 {cell(report['listener_step_ms']['p99'])} ms"),
         ("limits", f"{limits['violations']} violations, {limits['clamped']} samples held back"),
         ("bus", f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
                 f"silent: {bus['silent'] or 'none'}"),
@@ -60,7 +60,7 @@ def _ticks(count: int, tick: Mapping[str, Any]) -> str:
         return f"{count} in virtual time, {tick['target_hz']:g} a second"
     return (
         f"{count} at {tick['achieved_hz']:.4g} Hz of {tick['target_hz']:g}, "
-        f"{tick['late']} late, jitter p99 {_or(tick['jitter_ms']['p99'], '-')} ms"
+        f"{tick['late']} late, jitter p99 {cell(tick['jitter_ms']['p99'])} ms"
     )
 
 
@@ -68,7 +68,7 @@ def print_dry_run(report: Mapping[str, Any]) -> None:
     """Where every joint stands; torque was not touched."""
     table = Table("joint", "rad", "fault", title=f"{report['head']} on {report['port']}: torque untouched")
     for name, reading in report["readings"].items():
-        table.add_row(name, _or(reading["position_rad"], "no answer"), reading["fault"] or "")
+        table.add_row(name, cell(reading["position_rad"], "no answer"), reading["fault"] or "")
     screen().print(table)
 
 
@@ -80,7 +80,7 @@ def print_sound_check(told: Mapping[str, Any]) -> None:
     table.add_row("noise floor", f"{told['noise_floor_dbfs']:g} dBFS")
     table.add_row("clipped", f"{told['clipped']:.2%}")
     table.add_row("missing", f"{told['missing_frames']} frames")
-    table.add_row("latency", f"{_or(voice.get('latency_ms'), '-')} ms")
+    table.add_row("latency", f"{cell(voice.get('latency_ms'))} ms")
     console = screen(highlight=False)
     console.print(table)
     for line in told["findings"] or ["fit to be listened to"]:
@@ -92,7 +92,7 @@ def print_bench(result: Mapping[str, Mapping[str, Any]]) -> None:
     table = Table("measured", "median", "p99", "ratio", "to")
     for name, row in result.items():
         table.add_row(
-            name, f"{row['median']:.4g} {row['unit']}", _or(row.get("p99"), "-"), f"{row['ratio']:.3g}", row["peer"]
+            name, f"{row['median']:.4g} {row['unit']}", cell(row.get("p99")), f"{row['ratio']:.3g}", row["peer"]
         )
     screen().print(table)
 
@@ -101,11 +101,11 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
     """A table of rows, with the keys of the first as its columns."""
     table = Table(*rows[0])
     for row in rows:
-        table.add_row(*(_or(row.get(key), "-") for key in rows[0]))
+        table.add_row(*(cell(row.get(key)) for key in rows[0]))
     screen().print(table)
 
 
-def _or(value: object, otherwise: str) -> str:
+def cell(value: object, otherwise: str = "-") -> str:
     if value is None:
         return otherwise
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -128,4 +128,4 @@ def print_list(key: str, rows: Sequence[Mapping[str, Any]], json: bool) -> None:
 def _fact(name: str, value: object) -> str:
     if not value:
         return ""
-    return name if value is True else f"{name} {_or(value, '')}"
+    return name if value is True else f"{name} {cell(value)}"

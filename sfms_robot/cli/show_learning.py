@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sfms_robot.cli.show import print_rows, screen
+from sfms_robot.cli.show import cell, print_rows, screen
 
 _SHOWN = 3  # names of a problem; --json has them all
 
@@ -58,12 +58,8 @@ def _print_parts(rows: Sequence[Mapping[str, Any]]) -> None:
         if keys:
             table = Table("", "from", *(key.removeprefix(part).strip() for key in keys), title=part or None)
             for row in rows:
-                table.add_row(row["name"], row["source"], *(_cell(row.get(key)) for key in keys))
+                table.add_row(row["name"], row["source"], *(cell(row.get(key)) for key in keys))
             screen().print(table)
-
-
-def _cell(value: object) -> str:
-    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 # --- evaluate timing, evaluate robustness -----------------------------------------------------------------------
@@ -75,9 +71,9 @@ def print_timing(result: Mapping[str, Any]) -> None:
     console = screen()
     for title, told in (("known events", result["detector"]), ("events asked for", result["asked_and_seen"])):
         for kind, one in told.items():
-            shares = ", ".join(f"{name} {_cell(one[name])}" for name in ("recall", "precision"))
+            shares = ", ".join(f"{name} {cell(one[name])}" for name in ("recall", "precision"))
             console.print(
-                f"{title}: of {one['asked']} {kind}s {one['seen']} seen, {shares}, late by {_cell(one['offset_s'])} s"
+                f"{title}: of {one['asked']} {kind}s {one['seen']} seen, {shares}, late by {cell(one['offset_s'])} s"
             )
     console.print(
         f"{result['people']} people of {result['split']}, {result['meetings']} meetings, "

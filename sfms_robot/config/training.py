@@ -75,6 +75,8 @@ class PredictorTraining(Phase):
         dtw_weight, dtw_gamma: of the soft-DTW on the keyframe indicator (IV-D3), and how soft its minima are.
         neutral_prefix: share of windows that begin as a stream does; drop_audio, drop_face: that lack a modality.
         history_noise: share of past keyframes that are one level off.
+        missed_keyframes: share of windows and groups whose last keyframes are missing, as in a roll-out, and have to be
+            made up for (`learning.sfms.missed_keyframes`); of placement `penalised`.
         group_weights: of each group's loss; 1 where it is not named.
         event_windows: share of windows in whose future an event other than a blink is under way, for listeners that are
             told; what is told decides it, so it changes no odds.
@@ -88,6 +90,7 @@ class PredictorTraining(Phase):
     drop_audio: Share = 0.1
     drop_face: Share = 0.3
     history_noise: Share = 0.05
+    missed_keyframes: Share = 0.0
     gain_db: NonNegative = 6.0
     group_weights: dict[Name, Positive] = {}
     event_windows: Share = 0.0

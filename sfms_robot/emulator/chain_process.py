@@ -24,7 +24,6 @@ control socket says how many there are and what time it is. Control requests and
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import select
@@ -38,7 +37,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from sfms_robot.emulator.device import Device
+from sfms_robot.emulator.device import plugged
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.pseudo_terminal import PseudoTerminal
@@ -48,13 +48,6 @@ from sfms_robot.servo.registers import Table
 _CHUNK: Final = 4096
 _PATIENCE_S: Final = 1.0  # for bytes that a client said it had written
 _IDLE_S: Final = 0.25  # the longest that motors are left alone in real time
-_DEVICES: Final = {  # (family, protocol) -> class; imported only when something of it is plugged in
-    ("dynamixel", 2): "sfms_robot.emulator.dynamixel2_chain:Dynamixel2Chain",
-    ("dynamixel", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
-    ("feetech", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
-    ("maestro", None): "sfms_robot.emulator.pulse_boards:MaestroBoard",
-    ("ssc32", None): "sfms_robot.emulator.pulse_boards:Ssc32Board",
-}
 
 
 @dataclass
@@ -225,17 +218,15 @@ class Server:
             return f"error no such servo: {' '.join(words)}"
         servo.advance(now_s)
         if name == "state":
-            return f"json {json.dumps(servo.state(now_s))}" if hasattr(servo, "state") else "error it has no state"
+            return f"json {json.dumps(servo.state(now_s))}"
         if name in ("kill", "revive"):
             servo.dead = name == "kill"
         elif name == "fault":
             servo.fail(int(words[2]), now_s)
         elif name == "heat":
             servo.plant.temperature_C = float(words[2])
-        elif hasattr(servo, "turn"):
-            servo.turn(float(words[2]), now_s)
         else:
-            servo.plant.position = float(words[2])
+            servo.turn(float(words[2]), now_s)
         return "ok"
 
     def _happen(self, words: list[str], now_s: float) -> None:
@@ -257,26 +248,12 @@ class Server:
 
 
 def _wire(description: Mapping[str, Any]) -> EmulatedWire:
-    """Every protocol's servos are one device; every board is one."""
+    """What is plugged in, with its faults."""
     tables = {name: Table.from_plain(plain) for name, plain in description["tables"].items()}
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in description["servos"]:
-        table = tables[row["model"]]
-        where = _DEVICES[table.family, table.protocol]
-        groups.setdefault((where, "" if table.channels is None else table.model), []).append(row)
-    devices = [_device(where, rows, tables, description["behind_silent"]) for (where, _), rows in groups.items()]
+    servos = [EmulatedServo(**row) for row in description["servos"]]
+    devices = plugged(servos, tables, description["behind_silent"] != "skip")
     faults = [parse_fault(text) for text in description["faults"]]
     return EmulatedWire(devices, description["timing"], faults, description["seed"])
-
-
-def _device(where: str, rows: list[dict[str, Any]], tables: Mapping[str, Table], behind_silent: str) -> Device:
-    module, _, name = where.partition(":")
-    kind: Any = getattr(importlib.import_module(module), name)
-    if tables[rows[0]["model"]].channels is not None:
-        board: Device = kind(tables[rows[0]["model"]], rows)
-        return board
-    servos: Device = kind.from_rows(rows, tables, behind_silent != "skip")
-    return servos
 
 
 def main() -> None:

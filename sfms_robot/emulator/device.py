@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+import importlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, Protocol
+
+from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.servo.registers import Table
+
+_DEVICES: Final = {  # (family, protocol) -> class; imported only when something of it is plugged in
+    ("dynamixel", 2): "sfms_robot.emulator.dynamixel2_chain:Dynamixel2Chain",
+    ("dynamixel", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
+    ("feetech", 1): "sfms_robot.emulator.protocol1_chain:Protocol1Chain",
+    ("maestro", None): "sfms_robot.emulator.pulse_boards:MaestroBoard",
+    ("ssc32", None): "sfms_robot.emulator.pulse_boards:Ssc32Board",
+}
 
 
 class Reply(NamedTuple):
@@ -17,8 +29,8 @@ class Reply(NamedTuple):
 class Device(Protocol):
     """All that is plugged in of one protocol, or one board. It hears every byte of the wire and keeps its own place.
 
-    It may also have `replies(data, baud, now_s)`, a sequence of `Reply` or of packets, which `receive` joins: with it
-    the wire knows who says what, and when.
+    It may also have `replies(data, baud, now_s)`, a sequence of `Reply`, which `receive` joins: with it the wire knows
+    who says what, and when.
     """
 
     def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes: ...
@@ -28,6 +40,21 @@ class Device(Protocol):
 
     def advance(self, now_s: float) -> None:
         """Move everything on to `now_s`."""
+
+
+def plugged(servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> list[Device]:
+    """Every protocol's servos as one device, and every board; `tables` by model."""
+    groups: dict[tuple[str, str], list[EmulatedServo]] = {}
+    for servo in servos:
+        table = tables[servo.model]
+        where = _DEVICES[table.family, table.protocol]
+        groups.setdefault((where, "" if table.channels is None else table.model), []).append(servo)
+    devices: list[Device] = []
+    for (where, board), members in groups.items():
+        module, _, name = where.partition(":")
+        kind: Any = getattr(importlib.import_module(module), name)
+        devices.append(kind(tables[board], members) if board else kind.of(members, tables, chain_break))
+    return devices
 
 
 def servos_of(device: Device) -> Iterator[Any]:
@@ -41,14 +68,8 @@ def servos_of(device: Device) -> Iterator[Any]:
 def replies_of(device: Device, data: bytes, baud: int | None, now_s: float) -> Sequence[Reply]:
     """What a device answers, packet by packet as far as it tells them apart."""
     replies = getattr(device, "replies", None)
-    if replies is None:
-        answer = device.receive(data, baud, now_s)
-        return [Reply((), answer)] if answer else ()
-    return [each if isinstance(each, Reply) else _reply(device, each) for each in replies(data, baud, now_s)]
-
-
-def _reply(device: Device, frame: bytes) -> Reply:
-    """A frame `FF FF | id | ...` says itself who sends it."""
-    if len(frame) < 3:
-        return Reply((), frame)
-    return Reply((frame[2],), frame, getattr(device.servo(frame[2]), "return_delay_s", 0.0))
+    if replies is not None:
+        told: Sequence[Reply] = replies(data, baud, now_s)
+        return told
+    answer = device.receive(data, baud, now_s)
+    return [Reply((), answer)] if answer else ()

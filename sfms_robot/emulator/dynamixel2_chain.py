@@ -1,26 +1,22 @@
-"""Emulated Protocol 2.0 servos on one wire: bytes from the host in, packets of the servos out. Opens nothing.
+"""Emulated Protocol 2.0 servos on one wire.
 
-The rules of the wire: an instruction to an id that nobody has stays unanswered; only servos set to the host's baud
-hear it; on a sync or bulk read each servo waits for the one before it, so behind a silent id all are silent
-(`chain_break`; without it those behind it answer all the same). Two servos with one id talk over
-one another.
+The rules of the wire, beside those of `servo_chain`: on a sync or bulk read each servo waits for the one before it, and
+two servos with one id talk over one another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Self
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
 
 from sfms_robot.emulator.device import Reply
 from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.emulator.servo_chain import ServoChain, same_baud
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_status
-from sfms_robot.servo.registers import Table
 
 FAST_BULK_READ: Final = 0x9A
-_GAP_S: Final = 0.05  # an unfinished packet older than this is forgotten
 _SLOT_S: Final = 0.003  # a broadcast ping is answered in the order of ids, each in its own slot
-_BAUD_TOLERANCE: Final = 0.03  # what a UART forgives
 _FAST_FIRMWARE: Final = 45  # from here on a servo knows fast reads
 Request = tuple[int, int, int]  # id, address, length
 
@@ -37,57 +33,12 @@ class Listening(NamedTuple):
         return there + self.second[servo_id] if servo_id in self.second else there
 
 
-class Dynamixel2Chain:
+class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
     """All Protocol 2.0 servos of one wire."""
 
-    def __init__(self, servos: Sequence[Dynamixel2Servo], chain_break: bool = True) -> None:
-        self._servos = list(servos)
-        self._chain_break = chain_break
-        self._buffer = bytearray()
-        self._received_at_s = 0.0
+    _servo_class = Dynamixel2Servo
 
-    @classmethod
-    def from_rows(
-        cls, rows: Sequence[Mapping[str, Any]], tables: Mapping[str, Table], chain_break: bool = True
-    ) -> Self:
-        """From the plain rows of a description; `tables` by model."""
-        return cls(
-            [
-                Dynamixel2Servo(
-                    row["id"],
-                    tables[row["model"]],
-                    row["baud"],
-                    row["start_ticks"],
-                    row["firmware"],
-                    row["registers"],
-                    row["supply_v"],
-                )
-                for row in rows
-            ],
-            chain_break,
-        )
-
-    def servo(self, servo_id: int) -> Dynamixel2Servo | None:
-        return next((servo for servo in self._servos if servo.id == servo_id), None)
-
-    @property
-    def servos(self) -> Sequence[Dynamixel2Servo]:
-        return self._servos
-
-    def advance(self, now_s: float) -> None:
-        for servo in self._servos:
-            servo.advance(now_s)
-
-    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
-        """Take bytes that the host sent at `baud` (None = unknown) and give what the servos answer."""
-        return b"".join(reply.data for reply in self.replies(data, baud, now_s))
-
-    def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
-        """The same, packet by packet."""
-        if now_s - self._received_at_s > _GAP_S:
-            self._buffer.clear()
-        self._received_at_s = now_s
-        self._buffer += data
+    def _obey_all(self, baud: int | None, now_s: float) -> list[Reply]:
         out: list[Reply] = []
         while (packet := dxl2.maybe_packet(self._buffer)) is not None:
             if packet.instruction == dxl2.STATUS:
@@ -103,8 +54,8 @@ class Dynamixel2Chain:
         """Those who hear a packet; hearing one feeds their watchdog."""
         own: dict[int, list[Dynamixel2Servo]] = {}
         second: dict[int, list[Dynamixel2Servo]] = {}
-        for servo in self._servos:
-            if _same(servo.baud, baud) and servo.hears(now_s):
+        for servo in self.servos:
+            if same_baud(servo.baud, baud) and servo.hears(now_s):
                 servo.feed_watchdog(now_s)
                 own.setdefault(servo.id, []).append(servo)
                 if servo.second_id is not None and servo.second_id != servo.id:
@@ -138,7 +89,7 @@ class Dynamixel2Chain:
         for servo_id, address, length in requests:
             there = [s for s in listening.own.get(servo_id, ()) if s.return_level >= 1 and not (fast and _is_old(s))]
             if not there:
-                if not self._chain_break and not fast:
+                if not self.chain_break and not fast:
                     continue
                 break
             answers = [(servo, *servo.read(address, length, now_s)) for servo in there]
@@ -156,10 +107,6 @@ class Dynamixel2Chain:
 
 def _word(data: bytes, offset: int = 0) -> int:
     return data[offset] | data[offset + 1] << 8
-
-
-def _same(baud: int | None, host: int | None) -> bool:
-    return baud is not None and host is not None and abs(baud - host) <= _BAUD_TOLERANCE * baud
 
 
 def _is_old(servo: Dynamixel2Servo) -> bool:
@@ -262,9 +209,8 @@ def _bulk_write(params: bytes, listening: Listening, now_s: float) -> None:
 
 def _fast(parts: Sequence[tuple[Dynamixel2Servo, int, bytes]], lengths: Sequence[int]) -> bytes:
     """The one packet of a fast read. It is announced whole, and stops short at the first servo that is silent."""
-    out = bytearray(b"\xff\xff\xfd\x00\xfe" + (1 + sum(lengths) + 4 * len(lengths)).to_bytes(2, "little"))
-    out.append(dxl2.STATUS)
-    for (servo, error, data), length in zip(parts, lengths, strict=False):
-        out += bytes([error | (dxl2.ALERT if servo.fault_status else 0), servo.id]) + (data or bytes(length))
-        out += dxl2.crc16(out).to_bytes(2, "little")
-    return bytes(out)
+    replies = [
+        (servo.id, error | (dxl2.ALERT if servo.fault_status else 0), data or bytes(length))
+        for (servo, error, data), length in zip(parts, lengths, strict=False)
+    ]
+    return dxl2.encode_fast_status(replies, 1 + sum(lengths) + 4 * len(lengths))

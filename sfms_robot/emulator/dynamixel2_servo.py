@@ -6,21 +6,19 @@ middle of its range, wherever it stands, so a host that enables torque before it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import groupby
-from typing import Any, Final
+from typing import Final
 
 from sfms_robot.emulator.dynamixel2_modes import POSITION, TORQUE_ON_BY_GOAL, TickFrames, motor_command
-from sfms_robot.emulator.plant import MotorCommand, Plant
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.emulator.present_values import PresentValues
-from sfms_robot.emulator.register_file import RegisterFile
+from sfms_robot.emulator.register_servo import RegisterServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Field, Table
 
 WATCHDOG_TICK_S: Final = 0.02
 REBOOT_S: Final = 0.3  # deaf and dumb after a reboot
 _DELAY_TICK_S: Final = 2e-6
-_BROWN_OUT: Final = 0.7  # of the lowest supply it allows: below that the controller itself stops
 _MAX_ID: Final = dxl2.MAX_ID
 _RESULT_FAIL: Final = 1
 _GOALS: Final = frozenset({"goal_pwm", "goal_current", "goal_velocity", "goal_position"})
@@ -29,48 +27,25 @@ _TURNS_CLEARED: Final = b"\x01\x44\x58\x4c\x22"  # parameters of `clear`
 FAULT_BITS: Final = {"voltage": 0, "overheating": 2, "overload": 5}  # of the X series; others say it in the map
 
 
-class Dynamixel2Servo:
-    """A servo that answers instructions. All times are seconds of the chain's clock.
+class Dynamixel2Servo(RegisterServo):
+    """`fault_status` is what `hardware_error_status` reads: latched until a reboot."""
 
-    Attributes:
-        dead: silent, as with its cable out; its motor keeps doing what it was told.
-        mute: it obeys, and never answers.
-        plant: what turns; its ticks are those of the shaft.
-    """
+    _frame: TickFrames
 
-    def __init__(
-        self,
-        servo_id: int,
-        table: Table,
-        baud: int,
-        start_ticks: int,
-        firmware: int,
-        registers: Mapping[str, int] | None = None,
-        supply_v: float | None = None,
-    ) -> None:
-        self.table = table
-        self.dead = self.mute = False
-        self.fault_status = 0
-        self.firmware = firmware
-        self.supply_v = _usual_supply(table) if supply_v is None else supply_v
-        self._file = RegisterFile(table)
-        self._get, self._put = self._file.get, self._file.put
+    def __init__(self, what: EmulatedServo, table: Table) -> None:
+        super().__init__(table)
+        self.firmware = what.firmware
+        self.supply_v = _usual_supply(table) if what.supply_v is None else what.supply_v
         self._registered = b""
         self._heard_at_s = 0.0
         self._deaf_until_s = 0.0
-        self._powered = True
         self._tripped = False
-        self._drive: MotorCommand | None = None
         self._live = PresentValues(table)
         self._bits = _fault_bits(table)
         self._reset(keep={}, areas=(True, False))
-        self._put("id", servo_id)
-        self._put("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == baud))
-        for name, value in (registers or {}).items():
-            self._put(name, value)
+        self._take_stored(what)
         self._put("torque_limit", self._get("max_torque"))
-        self.plant = Plant(0.0)
-        self.plant.position = self.plant.reference = TickFrames(self._file).shaft(float(start_ticks))
+        self.plant.position = self.plant.reference = TickFrames(self._file).shaft(float(what.start_ticks))
         self._put("goal_position", table.center_ticks)
         self._settings()
         self._watch_supply()
@@ -146,7 +121,7 @@ class Dynamixel2Servo:
             return _RESULT_FAIL
         self.plant.position %= self.table.ticks_per_revolution
         self.plant.reference = self.plant.position
-        self._put("goal_position", round(self._frames.reported(self.plant.position)))
+        self._put("goal_position", round(self._frame.reported(self.plant.position)))
         self._settings()
         return 0
 
@@ -175,39 +150,15 @@ class Dynamixel2Servo:
         self.advance(now_s)
         self._latch(status)
 
-    def fail_named(self, fault: str, now_s: float) -> None:
-        """The same by name: voltage, overheating, overload."""
-        self.fail(self._bits[fault], now_s)
+    def _lose_power(self) -> None:
+        self._put("torque_enable", 0)
+        self._settings()
 
-    def set_supply(self, volts: float, now_s: float) -> None:
-        """Too low stops the controller; when it comes back the servo starts anew."""
-        self.advance(now_s)
-        self.supply_v = volts
-        powered = volts >= _BROWN_OUT * self._volts("min_voltage_limit")
-        if not powered:
-            self._put("torque_enable", 0)
-            self._settings()
-        elif not self._powered:
-            self.reboot(now_s)
-        self._powered = powered
-        self._watch_supply()
+    def _start_anew(self, now_s: float) -> None:
+        self.reboot(now_s)
 
-    def turn(self, ticks: float, now_s: float) -> None:
-        """Somebody turns the shaft by hand, to where its position reads `ticks`."""
-        self.advance(now_s)
-        self.plant.position = self._frames.shaft(ticks)
-
-    def state(self, now_s: float) -> dict[str, Any]:
-        """What an onlooker sees, whatever the wire says."""
-        self.advance(now_s)
-        return {
-            "position": self._frames.reported(self.plant.position),
-            "speed": self._frames.sign * self.plant.speed,
-            "goal": self._get("goal_position"),
-            "torque": bool(self.torque),
-            "faults": self.table.fault_names(self.fault_status),
-            "temperature_C": self.plant.temperature_C,
-        }
+    def _fault_names(self) -> str:
+        return self.table.fault_names(self.fault_status)
 
     def feed_watchdog(self, now_s: float) -> None:
         """Any instruction packet on the wire does."""
@@ -224,7 +175,7 @@ class Dynamixel2Servo:
                 self._put("bus_watchdog", -1)
                 self._tripped = True
                 if self.table.watchdog != "flags_only":
-                    self._put("goal_position", round(self._frames.reported(self.plant.position)))
+                    self._put("goal_position", round(self._frame.reported(self.plant.position)))
                     self._put("goal_velocity", 0)
                 self._settings()
         self.plant.advance(now_s, self._drive)
@@ -268,16 +219,13 @@ class Dynamixel2Servo:
         if self._powered and not self._volts("min_voltage_limit") <= self.supply_v <= self._volts("max_voltage_limit"):
             self._latch(self._bits["voltage"])
 
-    def _volts(self, name: str) -> float:
-        return self.table[name].to_unit(self._get(name))
-
     def _goal_written(self) -> None:
         if not self.torque and self._get("drive_mode") & TORQUE_ON_BY_GOAL:
             if not self.fault_status & self._get("shutdown"):
                 self._put("torque_enable", 1)
                 self._settings()
         elif self._drive is not None:
-            goal = self._frames.shaft(float(self._get("goal_position")))
+            goal = self._frame.shaft(float(self._get("goal_position")))
             if self._by_time:
                 self._settings()
             elif not self._drive.by_speed:
@@ -285,10 +233,10 @@ class Dynamixel2Servo:
 
     def _written(self, names: set[str]) -> None:
         if "operating_mode" in names:
-            self._frames = TickFrames(self._file)
+            self._frame = TickFrames(self._file)
             for name in ("profile_velocity", "profile_acceleration", "goal_velocity", "goal_pwm", "goal_current"):
                 self._put(name, 0)
-            self._put("goal_position", round(self._frames.reported(self.plant.position)))
+            self._put("goal_position", round(self._frame.reported(self.plant.position)))
         if "bus_watchdog" in names:
             self._tripped = False
         self._settings()
@@ -300,16 +248,16 @@ class Dynamixel2Servo:
     def _settings(self) -> None:
         """Take over what the registers say now; called after every change but a goal."""
         get = self._get
-        self.id: int = get("id")
+        self.id = get("id")
         second = get("secondary_id", 255)
         self.second_id: int | None = second if second <= _MAX_ID else None
-        self.baud: int | None = self.table.baud_codes.get(get("baud_rate"))
+        self.baud = self.table.baud_codes.get(get("baud_rate"))
         self._return_level: int = get("status_return_level", 2)
         self.return_delay_s: float = get("return_delay_time") * _DELAY_TICK_S
         self.torque: int = get("torque_enable")
         self.watchdog: int = get("bus_watchdog")
-        self._frames = TickFrames(self._file)
-        self.mode: int = self._frames.mode
+        self._frame = TickFrames(self._file)
+        self.mode: int = self._frame.mode
         self._by_time = bool(get("drive_mode") & 0x04)
         ends = [get(name) for name in ("min_position_limit", "cw_angle_limit") if name in self.table.fields]
         self._lowest: int = ends[0] if ends else 0
@@ -318,10 +266,10 @@ class Dynamixel2Servo:
         self._hottest_c: float = float(get("temperature_limit", 255))
         self._drive = None
         if self.torque:
-            self._drive = motor_command(self._file, self._frames, self.plant.reference, self.table.top_speed_ticks_s)
+            self._drive = motor_command(self._file, self._frame, self.plant.reference, self.table.top_speed_ticks_s)
 
     def _live_values(self, now_s: float) -> tuple[int, ...]:
-        plant, table, sign = self.plant, self.table, self._frames.sign
+        plant, table, sign = self.plant, self.table, self._frame.sign
         per_tick = self._live.speed_per_tick
         top = table.top_speed_ticks_s
         speed, current = sign * plant.speed, sign * plant.current_mA(top)
@@ -340,9 +288,9 @@ class Dynamixel2Servo:
             round(1000.0 * sign * plant.effort),
             round(speed * per_tick),
             round(speed * per_tick),
-            round(self._frames.reported(plant.position)),
+            round(self._frame.reported(plant.position)),
             round(sign * plant.reference_speed * per_tick),
-            round(self._frames.reported(plant.reference)),
+            round(self._frame.reported(plant.reference)),
             volts,
             volts,
             round(plant.temperature_C),

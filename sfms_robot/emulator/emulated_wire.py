@@ -209,8 +209,6 @@ class EmulatedWire:
                     _feed(servo, self._before_brownout, fault.value, began, now_s)
                     continue
                 servo.dead = began
-                if not began and hasattr(servo, "power_cycle"):
-                    servo.power_cycle(now_s)
             if hasattr(device, "restart"):
                 device.restart(now_s)  # without a supply there are no pulses either
 

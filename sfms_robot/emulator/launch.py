@@ -18,33 +18,18 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from types import TracebackType
 from typing import IO, Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
 
+__all__ = ["Chain", "EmulatedServo", "launch", "wait"]
+
 _START_S = 20.0
-
-
-@dataclass(frozen=True)
-class EmulatedServo:
-    """What is plugged in, or on a board one of its channels.
-
-    `start_ticks`: what its position reads when the host comes, torque off: outside its limits, or beyond one turn where
-    somebody has turned it by hand since it was switched on. `registers`: what somebody stored in it before, by name
-    (homing offset, position limits, shutdown, ...). `supply_v` None: a voltage that it is content with.
-    """
-
-    id: int
-    model: str = "xl330-m288"
-    baud: int = 1_000_000
-    start_ticks: int = 2048
-    firmware: int = 53
-    registers: Mapping[str, int] = field(default_factory=dict)
-    supply_v: float | None = None
 
 
 class Chain:

@@ -1,91 +1,35 @@
-"""Emulated servos that speak the FF FF frame, Dynamixel 1.0 and Feetech, on one wire: bytes in, bytes out.
+"""Emulated servos that speak the FF FF frame, Dynamixel 1.0 and Feetech, on one wire.
 
-An instruction to an id that nobody has stays unanswered, and only servos set to the host's baud rate hear it. On a
-bulk or sync read each servo waits for the one before it: behind a silent id all are silent (`chain_break`), or the
-chain goes on without it. Frames of Protocol 2.0 on the same wire look like rubbish to these servos.
+On a bulk or sync read each servo waits for the one before it. Frames of Protocol 2.0 on the same wire look like rubbish
+to these servos.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Iterator, Sequence
 
+from sfms_robot.emulator.device import Reply
 from sfms_robot.emulator.protocol1_servo import Protocol1Servo
+from sfms_robot.emulator.servo_chain import ServoChain
 from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
-from sfms_robot.servo.registers import Table
-
-_GAP_S: Final = 0.05  # an unfinished frame older than this is forgotten
 
 
-class Protocol1Chain:
+class Protocol1Chain(ServoChain[Protocol1Servo]):
     """All servos of one wire that speak this frame."""
 
-    def __init__(self, servos: Sequence[Protocol1Servo], chain_break: bool = True) -> None:
-        self.servos = list(servos)
-        self.chain_break = chain_break
-        self._buffer = bytearray()
-        self._received_at_s = 0.0
+    _servo_class = Protocol1Servo
 
-    @classmethod
-    def from_rows(
-        cls, rows: Sequence[Mapping[str, Any]], tables: Mapping[str, Table], chain_break: bool = True
-    ) -> Protocol1Chain:
-        """From plain rows (see `launch.EmulatedServo`) and the models' tables."""
-        servos = [
-            Protocol1Servo(
-                row["id"],
-                tables[row["model"]],
-                row["baud"],
-                row["start_ticks"],
-                row["firmware"],
-                row.get("registers"),
-                row.get("supply_v"),
-            )
-            for row in rows
-        ]
-        return cls(servos, chain_break)
-
-    def servo(self, servo_id: int) -> Protocol1Servo | None:
-        return next((servo for servo in self.servos if servo.id == servo_id), None)
-
-    def kill(self, servo_id: int) -> None:
-        """Its cable is out. Raises KeyError for an id that nobody has."""
-        self._named(servo_id).dead = True
-
-    def revive(self, servo_id: int) -> None:
-        self._named(servo_id).dead = False
-
-    def advance(self, now_s: float) -> None:
-        for servo in self.servos:
-            servo.advance(now_s)
-
-    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
-        """Take bytes that the host sent at `baud` (None = unknown) and give what the servos answer."""
-        return b"".join(self.replies(data, baud, now_s))
-
-    def replies(self, data: bytes, baud: int | None, now_s: float) -> list[bytes]:
-        """As `receive`, one item per answer."""
-        if now_s - self._received_at_s > _GAP_S:
-            self._buffer.clear()
-        self._received_at_s = now_s
+    def _obey_all(self, baud: int | None, now_s: float) -> list[Reply]:
         listening = [servo for servo in self.servos if servo.hears(baud)]
         if not listening:
             self._buffer.clear()  # at another baud there is nothing but noise
-            return []
-        self._buffer += data
-        out: list[bytes] = []
+        out: list[Reply] = []
         while (frame := maybe_frame(self._buffer)) is not None:
             out += self._answers(frame, listening, now_s)
         return out
 
-    def _named(self, servo_id: int) -> Protocol1Servo:
-        servo = self.servo(servo_id)
-        if servo is None:
-            raise KeyError(f"no servo with id {servo_id} on this wire")
-        return servo
-
-    def _answers(self, frame: Frame, listening: Sequence[Protocol1Servo], now_s: float) -> Iterator[bytes]:
+    def _answers(self, frame: Frame, listening: Sequence[Protocol1Servo], now_s: float) -> Iterator[Reply]:
         code, params = frame.code, frame.params
         try:
             if code == protocol1.SYNC_WRITE:
@@ -99,31 +43,25 @@ class Protocol1Chain:
                 yield from self._group([(servo_id, address, length) for servo_id in ids], readers, now_s)
             elif code == dxl1.BULK_READ:
                 readers = [servo for servo in listening if servo.is_bulk_reader]
-                yield from self._group(
-                    [(servo_id, address, length) for servo_id, address, length in dxl1.bulk_read_parts(params)],
-                    readers,
-                    now_s,
-                )
+                yield from self._group(dxl1.bulk_read_parts(params), readers, now_s)
             elif frame.servo == BROADCAST:
                 for servo in sorted(listening, key=lambda servo: servo.id):
-                    answer = _single(servo, code, params, now_s)
-                    if code == protocol1.PING and servo.table.family == "feetech" and answer is not None:
-                        yield answer
+                    answers = list(_single(servo, code, params, now_s))
+                    if code == protocol1.PING and servo.table.family == "feetech":
+                        yield from answers
             else:
                 for servo in list(_of(listening, frame.servo)):
-                    answer = _single(servo, code, params, now_s)
-                    if answer is not None:
-                        yield answer
+                    yield from _single(servo, code, params, now_s)
         except IndexError:
             return  # parameters are missing: no servo knows what was meant
 
     def _group(
         self, requests: Sequence[tuple[int, int, int]], readers: Sequence[Protocol1Servo], now_s: float
-    ) -> Iterator[bytes]:
+    ) -> Iterator[Reply]:
         for servo_id, address, length in requests:
             servo = next(_of(readers, servo_id), None)
             if servo is not None and servo.answers_reads:
-                yield _status(servo, *servo.read(address, length, now_s))
+                yield _reply(servo, servo_id, *servo.read(address, length, now_s))
             elif self.chain_break:
                 return
 
@@ -133,8 +71,8 @@ def _of(servos: Sequence[Protocol1Servo], servo_id: int) -> Iterator[Protocol1Se
     return (servo for servo in servos if servo.id == servo_id)
 
 
-def _single(servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> bytes | None:
-    """What one servo answers to an instruction of its own, or None."""
+def _single(servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> Iterator[Reply]:
+    """What one servo answers to an instruction of its own, if it does."""
     is_feetech = servo.table.family == "feetech"
     asked = servo.id  # it answers under this one also when the request changes it
     error, data, answers = 0, b"", servo.answers_writes
@@ -159,8 +97,9 @@ def _single(servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> by
         servo.reset_turns(now_s)
     else:
         error, answers = dxl1.INSTRUCTION, not is_feetech and servo.answers_writes
-    return encode(asked, error | servo.fault_status, data) if answers else None
+    if answers:
+        yield _reply(servo, asked, error, data)
 
 
-def _status(servo: Protocol1Servo, error: int, data: bytes) -> bytes:
-    return encode(servo.id, error | servo.fault_status, data)
+def _reply(servo: Protocol1Servo, servo_id: int, error: int, data: bytes) -> Reply:
+    return Reply((servo_id,), encode(servo_id, error | servo.fault_status, data), servo.return_delay_s)

@@ -69,6 +69,8 @@ def mode_of(file: RegisterFile) -> Mode:
 class PositionFrame:
     """Position registers <-> ticks of the shaft, as the registers stand."""
 
+    sign = 1.0
+
     def __init__(self, file: RegisterFile, mode: Mode) -> None:
         table = file.table
         self._turn = table.ticks_per_revolution

@@ -10,66 +10,43 @@ Where the sources are silent it does the least helpful thing. A frame with a wro
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
-from sfms_robot.emulator.plant import MotorCommand, Plant
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.emulator.protocol1_modes import POSITIONING, Mode, PositionFrame, angle_limits, mode_of, motor_command
-from sfms_robot.emulator.register_file import RegisterFile
+from sfms_robot.emulator.register_servo import RegisterServo
+from sfms_robot.emulator.servo_chain import same_baud
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.registers import Field, Table
 
 _CHECK_S: Final = 0.1  # how often it looks whether its motor is overloaded
-_BAUD_TOLERANCE: Final = 0.03  # what a UART forgives
 _BITS: Final = {"overload": 0x20, "overheating": 0x04}  # of the status byte, in both families
 _VOLTAGE: Final = 0x01
 _FULL_TORQUE: Final = 1000
-_BROWN_OUT: Final = 0.7  # of the lowest supply it allows: below that the controller itself stops
 _CENTER_ON_STS: Final = 2048
 _WHOLE_FILE: Final = 256  # a Feetech answers a read of any address
 _PENDING: Final = ("registered", "async_write_flag")  # 1 from REG WRITE to ACTION; Dynamixel, Feetech
 
 
-class Protocol1Servo:
-    """A servo that answers instructions. All times are seconds of the wire's clock.
+class Protocol1Servo(RegisterServo):
+    """`fault_status` is what every answer carries."""
 
-    Attributes:
-        dead: True while its cable is out; its motor keeps doing what it was told.
-        mute: it obeys, and never answers.
-        fault_status: bits that every answer carries.
-    """
+    _bits = _BITS
+    _frame: PositionFrame
 
-    def __init__(
-        self,
-        servo_id: int,
-        table: Table,
-        baud: int,
-        start_ticks: int,
-        firmware: int,
-        registers: Mapping[str, int] | None = None,
-        supply_v: float | None = None,
-    ) -> None:
-        self.table = table
-        self.dead = self.mute = False
-        self.fault_status = 0
+    def __init__(self, what: EmulatedServo, table: Table) -> None:
         self._feetech = table.family == "feetech"
-        self._file = RegisterFile(table, _WHOLE_FILE if self._feetech else None)
-        self._get, self._put = self._file.get, self._file.put
-        self._firmware = firmware
+        super().__init__(table, _WHOLE_FILE if self._feetech else None)
+        self._firmware = what.firmware
         self._registered: tuple[int, bytes] | None = None
         self._checks = 0
-        self._drive: MotorCommand | None = None
         self._reset_registers()
-        self._put_role("id", servo_id)
-        self._put_role("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == baud))
-        for name, value in (registers or {}).items():
-            self._put(name, value)
+        self._take_stored(what)
         self._stored = bytes(self._file.raw)
         self._mode = mode_of(self._file)
         self._frame = PositionFrame(self._file, self._mode)
-        self.plant = Plant(0.0)
-        self.plant.position = self.plant.reference = self._frame.shaft(float(start_ticks))
-        self.supply_v = self._content_v() if supply_v is None else supply_v
-        self._powered = True
+        self.plant.position = self.plant.reference = self._frame.shaft(float(what.start_ticks))
+        self.supply_v = self._content_v() if what.supply_v is None else what.supply_v
         self._power_up()
 
     # --- what the wire asks -------------------------------------------------------------------------------------
@@ -97,9 +74,7 @@ class Protocol1Servo:
         return 2e-6 * self._role("return_delay")
 
     def hears(self, baud: int | None) -> bool:
-        if self.dead or not self._powered or baud is None or self.baud is None:
-            return False
-        return abs(baud - self.baud) <= _BAUD_TOLERANCE * self.baud
+        return not self.dead and self._powered and same_baud(self.baud, baud)
 
     def read(self, address: int, length: int, now_s: float) -> tuple[int, bytes]:
         """(error, data)."""
@@ -184,38 +159,14 @@ class Protocol1Servo:
         """What caused these faults is over."""
         self.fault_status &= ~status
 
-    def fail_named(self, fault: str, now_s: float) -> None:
-        """The same by name: overheating, overload."""
-        self.fail(_BITS[fault], now_s)
+    def _lose_power(self) -> None:
+        self._drive = None
 
-    def set_supply(self, volts: float, now_s: float) -> None:
-        """Too low stops the controller; when it comes back the servo starts anew."""
-        self.advance(now_s)
-        self.supply_v = volts
-        powered = volts >= _BROWN_OUT * self._volts("min_voltage_limit")
-        if powered and not self._powered:
-            self.power_cycle(now_s)
-        elif not powered:
-            self._drive = None
-        self._powered = powered
-        self._watch_supply()
+    def _start_anew(self, now_s: float) -> None:
+        self.power_cycle(now_s)
 
-    def turn(self, ticks: float, now_s: float) -> None:
-        """Somebody turns the shaft by hand, to where its position reads `ticks`."""
-        self.advance(now_s)
-        self.plant.position = self._frame.shaft(ticks)
-
-    def state(self, now_s: float) -> dict[str, Any]:
-        """What an onlooker sees, whatever the wire says."""
-        self.advance(now_s)
-        return {
-            "position": self._frame.reported(self.plant.position),
-            "speed": self.plant.speed,
-            "goal": self._get("goal_position"),
-            "torque": self._powered and self._role("torque_enable") == 1,
-            "faults": self.table.status_fault_names(self.fault_status),
-            "temperature_C": self.plant.temperature_C,
-        }
+    def _fault_names(self) -> str:
+        return self.table.status_fault_names(self.fault_status)
 
     def advance(self, now_s: float) -> None:
         """Move the plant on; on a fixed grid of time, it notices that the motor is overloaded."""
@@ -307,8 +258,8 @@ class Protocol1Servo:
 
     def _settings(self, stepped: float | None = None) -> None:
         """Take over what the registers say now. `stepped`: as `_stepped`; None: no step was written."""
-        self.id: int = self._role("id")
-        self.baud: int | None = self.table.baud_codes.get(self._role("baud_rate"))
+        self.id = self._role("id")
+        self.baud = self.table.baud_codes.get(self._role("baud_rate"))
         stepped = self._stepped({}) if stepped is None else stepped
         self._mode = mode_of(self._file)
         self._frame = PositionFrame(self._file, self._mode)
@@ -343,9 +294,6 @@ class Protocol1Servo:
             self._put_role(role, value)
         self._put("moving", int(plant.speed != 0.0))
 
-    def _volts(self, name: str) -> float:
-        return self.table[name].to_unit(self._get(name))
-
     def _content_v(self) -> float:
         """A supply that the model is content with."""
         return 7.4 if self._volts("max_voltage_limit") <= 9.0 else 12.0
@@ -366,13 +314,3 @@ class Protocol1Servo:
         self._put("firmware_version", self._firmware)
         self._put("firmware_major", self._firmware)
         self._put("endianness_flag", int(self.table.byte_order == "big"))
-
-    def _role(self, role: str) -> int:
-        """Value of a role's register; a role that the model does not have reads as 1: it limits nothing."""
-        field = self.table.role(role)
-        return 1 if field is None else self._get(field.name)
-
-    def _put_role(self, role: str, value: int) -> None:
-        field = self.table.role(role)
-        if field is not None:
-            self._put(field.name, value)

@@ -4,7 +4,7 @@ A board makes pulses; the servos behind it only follow them and tell nobody wher
 things: the pulse, which the board knows and moves under its speed limits, and a shaft, which a plant moves and only a
 test can see. Nothing about the shaft ever reaches the wire.
 
-Every row of a description is one channel with a servo on it; a board all of whose channels are dead is unplugged, one
+Everything plugged in is one channel with a servo on it; a board all of whose channels are dead is unplugged, one
 all of whose channels are mute obeys and never answers.
 
 Not modelled: the script, serial timeout, PWM output and daisy chain of a Maestro; the inputs, sequencer and offsets
@@ -14,9 +14,10 @@ of an SSC-32.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.registers import Table
@@ -92,15 +93,15 @@ class Channel:
 
 
 class Board(ABC):
-    """What the boards have in common. `rows` are plain: `id` is the channel; `baud`, `start_ticks`."""
+    """What the boards have in common. The id of a servo is its channel."""
 
-    def __init__(self, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
         if table.channels is None or table.pulse_us is None or table.tick_us is None:
             raise ValueError(f"{table.model} is no servo board")
         self.table = table
         self.errors = 0
-        self._plugged = {int(row["id"]) for row in rows}
-        starts = {int(row["id"]): int(row["start_ticks"]) for row in rows}
+        self._plugged = {servo.id for servo in servos}
+        starts = {servo.id: servo.start_ticks for servo in servos}
         self.channels = [Channel(i, self, starts.get(i, table.center_ticks)) for i in range(table.channels)]
         self.limits = [self._ticks(*table.pulse_us) for _ in self.channels]  # shortest and longest pulse, ticks
         self._buffer = bytearray()
@@ -113,12 +114,6 @@ class Board(ABC):
     def servo(self, channel: int) -> Channel | None:
         """The channel, where a servo is plugged in."""
         return self.channels[channel] if channel in self._plugged else None
-
-    def kill(self, channel: int) -> None:
-        self.channels[channel].dead = True
-
-    def revive(self, channel: int) -> None:
-        self.channels[channel].dead = False
 
     def advance(self, now_s: float) -> None:
         for channel in self.channels:
@@ -162,8 +157,8 @@ class Board(ABC):
 class MaestroBoard(Board):
     """A Pololu Maestro as it leaves the factory: it detects its baud rate, home is off, an error sends all home."""
 
-    def __init__(self, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
-        super().__init__(table, rows)
+    def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
+        super().__init__(table, servos)
         self.baud: int | None = None
         self.limits = [self._ticks(*maestro.FACTORY_PULSE_US) for _ in self.channels]
 
@@ -240,11 +235,11 @@ class MaestroBoard(Board):
 
 
 class Ssc32Board(Board):
-    """A Lynxmotion SSC-32 with its rate set by jumpers: that of the first row."""
+    """A Lynxmotion SSC-32 with its rate set by jumpers: that of the first servo."""
 
-    def __init__(self, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
-        super().__init__(table, rows)
-        self.baud: int = rows[0]["baud"]
+    def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
+        super().__init__(table, servos)
+        self.baud = servos[0].baud
 
     def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes:
         if baud != self.baud:

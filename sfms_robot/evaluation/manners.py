@@ -23,7 +23,7 @@ SHIFT_RAD: Final = np.deg2rad(5.0)
 SWAY_BANDS_HZ: Final = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.4))
 SWAY_WINDOW: Final = 20 * FRAME_HZ
 SLOW: Final = 10 * FRAME_HZ  # frames of which the median is a slow pose
-FindEvents = Callable[[Doubles, float], Sequence[events.Event]]
+FindEvents = Callable[[Floats, float], Sequence[events.Event]]
 _HEAD: Final = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
 
 

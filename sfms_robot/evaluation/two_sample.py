@@ -124,7 +124,7 @@ def _scores(values: Tensor, label: NDArray[np.intp], unseen: Tensor, seed: int) 
             schedule.step()
         network.eval()
         with torch.no_grad():
-            parts = [network(_channels_first((part - mean) / deviation))[:, 0] for part in unseen.split(_CHUNK)]
+            parts = [network(_channels_first((part - mean) / deviation))[:, 0] for part in torch.split(unseen, _CHUNK)]
     return np.asarray(torch.cat(parts).double().numpy(), np.float64)
 
 

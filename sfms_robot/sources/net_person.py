@@ -17,7 +17,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 
@@ -247,61 +247,43 @@ class NetPerson:
                 connection.send(json_message(**told, sent_s=round(self.now(), 4)))
 
 
-class NetVoice(PushedVoice):
+class _NetPart:
+    """Of what another program feeds: it joins the server, which runs from its start to its close."""
+
+    feed: ClassVar[str]
+
+    def __init__(self, outlet: NetPerson) -> None:
+        super().__init__(outlet.now)  # type: ignore[call-arg]
+        self.outlet = outlet
+        outlet.join(self.feed, cast(Any, self))
+
+    def start(self, origin_s: float) -> None:
+        self.outlet.start(origin_s)
+        super().start(origin_s)  # type: ignore[misc]
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {**super().statistics(), "net": self.outlet.statistics()}  # type: ignore[misc]
+
+    def close(self) -> None:
+        self.outlet.leave(self.feed)
+
+
+class NetVoice(_NetPart, PushedVoice):
     """`ports.Voice` of a person whose sound another program has."""
 
-    def __init__(self, outlet: NetPerson) -> None:
-        super().__init__(outlet.now)
-        self.outlet = outlet
-        outlet.join("voice", self)
-
-    def start(self, origin_s: float) -> None:
-        self.outlet.start(origin_s)
-        super().start(origin_s)
-
-    def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), "net": self.outlet.statistics()}
-
-    def close(self) -> None:
-        self.outlet.leave("voice")
+    feed = "voice"
 
 
-class NetSight(PushedSight):
+class NetSight(_NetPart, PushedSight):
     """`ports.Sight` of a person whom another program sees."""
 
-    def __init__(self, outlet: NetPerson) -> None:
-        super().__init__(outlet.now)
-        self.outlet = outlet
-        outlet.join("face", self)
-
-    def start(self, origin_s: float) -> None:
-        self.outlet.start(origin_s)
-        super().start(origin_s)
-
-    def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), "net": self.outlet.statistics()}
-
-    def close(self) -> None:
-        self.outlet.leave("face")
+    feed = "face"
 
 
-class NetSpeech(PushedSpeech):
+class NetSpeech(_NetPart, PushedSpeech):
     """`ports.Voice` of a robot for which another program speaks."""
 
-    def __init__(self, outlet: NetPerson) -> None:
-        super().__init__(outlet.now)
-        self.outlet = outlet
-        outlet.join("speech", self)
-
-    def start(self, origin_s: float) -> None:
-        self.outlet.start(origin_s)
-        super().start(origin_s)
-
-    def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), "net": self.outlet.statistics()}
-
-    def close(self) -> None:
-        self.outlet.leave("speech")
+    feed = "speech"
 
 
 def open_net_voice(argument: str) -> NetVoice:

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.adversary import CHUNK, adversarial, torment
+from sfms_robot.app.bench.adversary import CHUNK, adversarial, torment, wild
 from sfms_robot.app.bench.lead import delay_ticks, delays
 from sfms_robot.app.bench.retarget_bench import retarget
+from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
 QUICK = ["op3_head", "open_duck_mini_v2_head", "poppy_head", "reachy_mini", "inmoov2_ssc32"]
@@ -42,6 +44,14 @@ def test_led_by_its_lag_every_joint_of_the_larger_heads_is_less_than_a_tick_late
     found = delays(name)
     moved = np.isfinite(found.led_s)
     assert moved.mean() > 0.8 and np.abs(found.led_s[moved]).max() < 0.010
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_wild_faces_move_every_joint_that_anything_moves(name):
+    retargeter = HeadRetargeter(load_head(name))
+    faces = wild(np.random.default_rng(0), 1000)[:, None].repeat(len(retargeter.joints), axis=1)
+    travel = np.ptp(retargeter.angles(faces), axis=0)
+    assert (travel > 0.01).sum() >= len(travel) - len(retargeter.dead_joints)
 
 
 @pytest.mark.parametrize("name", HEADS)

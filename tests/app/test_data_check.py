@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.train.datasets import check_data
-from sfms_robot.cli.main import main
 from sfms_robot.corpora.formats import open_dataset, with_feature
 from sfms_robot.errors import ConfigError
 from sfms_robot.signals.audio_features import MFCC78
@@ -106,12 +105,11 @@ def test_features_that_nobody_ships_are_a_count_of_none(tmp_path):
     assert not found and split["features"] == {"attributes": 0, "speaker_attributes": 0}
 
 
-def test_swapped_order_makes_a_set_unusable_until_it_is_said(tmp_path, capsys):
+def test_swapped_order_makes_a_set_unusable_until_it_is_said(tmp_path, command_line):
     write.l2l(tmp_path, pose_first=True)
-    with pytest.raises(SystemExit) as stop:
-        main(["data", "check", str(tmp_path), "--json"])
-    report = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert stop.value.code == 2 and not report["usable"]
+    ended = command_line("data", "check", tmp_path, "--json")
+    report = ended.told
+    assert ended.code == 2 and not report["usable"]
     assert problems(report, "test")[0]["swapped order"] == (1, ["test"])
     assert check_data(tmp_path, order="pose-first")["usable"]
 
@@ -125,27 +123,23 @@ def test_missing_list_is_said_and_other_splits_are_still_looked_at(tmp_path):
     assert report["usable"] and problems(report, "validation")[1]["clips"] == 4
 
 
-def test_table_names_what_is_left_out_and_the_command_ends_well(tmp_path, capsys):
+def test_table_names_what_is_left_out_and_the_command_ends_well(tmp_path, command_line):
     write.react2025(tmp_path, lengths=(20, 60, 75))
-    with pytest.raises(SystemExit) as stop:
-        main(["data", "check", str(tmp_path), "--window", "48", "--channels"])
-    shown = capsys.readouterr().out
-    assert stop.value.code == 0
+    ended = command_line("data", "check", tmp_path, "--window", 48, "--channels")
+    shown = ended.out
+    assert ended.code == 0
     assert "too short" in shown and "session0+take_0" in shown and "rotation_x" in shown
 
 
-def test_set_of_which_nothing_can_be_used_ends_with_2(tmp_path, capsys):
+def test_set_of_which_nothing_can_be_used_ends_with_2(tmp_path, command_line):
     write.react2025(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        main(["data", "check", str(tmp_path), "--window", "4800"])
-    assert stop.value.code == 2 and "not usable as it is" in capsys.readouterr().out
+    ended = command_line("data", "check", tmp_path, "--window", 4800)
+    assert ended.code == 2 and "not usable as it is" in ended.out
 
 
-def test_no_data_set_is_one_line_and_2(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["data", "check", str(tmp_path), "--json"])
-    assert stop.value.code == 2
-    assert capsys.readouterr().err.count("\n") == 1
+def test_no_data_set_is_one_line_and_2(tmp_path, command_line):
+    ended = command_line("data", "check", tmp_path, "--json")
+    assert ended.code == 2 and ended.complaint
 
 
 def test_computed_features_come_from_the_voice_and_the_cache(tmp_path):

@@ -1,23 +1,20 @@
 """`sfms-robot demo` in virtual time."""
 
-import json
 import sys
 
 import pytest
 
 from sfms_robot.app.listen.demo import DemoOptions, compare_seeds, demo, free_folder
-from sfms_robot.cli.main import main
 
 
 @pytest.mark.slow
-def test_the_demo_draws_what_it_saw(tmp_path, monkeypatch, capsys):
+def test_the_demo_draws_what_it_saw(tmp_path, monkeypatch, command_line):
     pytest.importorskip("matplotlib")
     pytest.importorskip("vtkmodules")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(["demo", "--fast", "--head", "op3_head", "--duration", "20", "--json"])
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert ended.value.code == 0 and told["exit"] == "done" and told["nods"] >= 1 and told["neck_travel_deg"] > 10
+    ended = command_line("demo", "--fast", "--head", "op3_head", "--duration", 20, "--json")
+    told = ended.told
+    assert ended.code == 0 and told["exit"] == "done" and told["nods"] >= 1 and told["neck_travel_deg"] > 10
     assert told["pictures"] == ["sfms-demo/run.png", "sfms-demo/head.png"]
     assert all((tmp_path / png).stat().st_size > 10_000 for png in told["pictures"])
     assert (tmp_path / "sfms-demo" / "run.mcap").is_file()

@@ -51,9 +51,11 @@ class Patient:
     def port(self, baud: int = BAUD) -> VirtualTimePort:
         return VirtualTimePort(self.chain.device, self.chain.control, baud, self.clock)
 
-    def examined(self, rate_hz: float = 100.0, fix=None) -> dict:
-        line = Line("face", self.chain.device, "/dev/ttyUSB0", "dynamixel2", BAUD, rate_hz, self.wanted)
-        return examine_line(line, self.clock, lambda device, baud: self.port(baud), fix=fix)
+    def examined(self, rate_hz: float = 100.0, fix=None, port=None, **line) -> dict:
+        """`line`: what else is known of the port than that it is a face's."""
+        usual = Line("face", self.chain.device, "/dev/ttyUSB0", "dynamixel2", BAUD, rate_hz, self.wanted)
+        open_port = port or (lambda device, baud: self.port(baud))
+        return examine_line(replace(usual, **line), self.clock, open_port, fix=fix)
 
     @contextmanager
     def wire(self) -> Iterator[Wire]:
@@ -189,10 +191,7 @@ def test_a_port_that_vanishes_meanwhile_is_a_finding():
             return super().read(n, deadline_s)
 
     with patient() as sick:
-        line = Line("face", sick.chain.device, "/dev/ttyUSB0", "dynamixel2", BAUD, 100.0, sick.wanted)
-        report = examine_line(
-            line, sick.clock, lambda device, baud: Loose(device, sick.chain.control, baud, sick.clock)
-        )
+        report = sick.examined(port=lambda device, baud: Loose(device, sick.chain.control, baud, sick.clock))
     assert report["exit_code"] == 4 and "gone" in report["findings"][0]["problem"]
 
 
@@ -253,8 +252,7 @@ def test_a_watchdog_that_does_not_stop_the_motor_is_told():
 
 def test_without_a_head_everybody_is_listed_at_their_rate():
     with patient(EmulatedServo(1), EmulatedServo(2), EmulatedServo(9, baud=57_600)) as sick:
-        line = Line(None, sick.chain.device, "/dev/ttyUSB0", "dynamixel2", None, 100.0, {})
-        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+        report = sick.examined(bus=None, baud=None, wanted={})
     assert [(row["id"], row["baud"]) for row in report["servos"]] == [(1, BAUD), (2, BAUD), (9, 57_600)]
     assert report["exit_code"] == 0 and report["baud"] == BAUD
 
@@ -265,8 +263,7 @@ def test_the_older_frame_is_examined_too(model):
     center = load_firmware_map(model).center_ticks
     servos = [EmulatedServo(i, model, start_ticks=center) for i in (1, 2)]
     with patient(*servos, count=3, model=model) as sick:
-        line = Line("neck", sick.chain.device, "/dev/ttyUSB0", family, BAUD, 50.0, sick.wanted)
-        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+        report = sick.examined(50.0, family=family)
     assert told(report, "error") == ["id 3 (joint3): no answer, at any rate"]
     assert [row["model"] for row in report["servos"]] == [model, model] and report["budget"]["plain"]["hz"] > 50
     assert report["budget"]["fast"] is None and report["fast_sync_read"] is None
@@ -283,8 +280,7 @@ def test_every_model_that_has_a_map_can_be_examined(family):
     servos = [EmulatedServo(i, model, start_ticks=500) for i, model in enumerate(models, start=1)]
     with patient(*servos) as sick:
         wanted = {i: Wanted(model, model, load_firmware_map(model).model_number) for i, model in enumerate(models, 1)}
-        line = Line("all", sick.chain.device, "/dev/ttyUSB0", family, BAUD, 10.0, wanted)
-        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+        report = sick.examined(10.0, family=family, wanted=wanted)
     assert told(report, "error") == []
     assert [row["model"] for row in report["servos"]] == models
     assert all(row["voltage_V"] and row["faults"] == "" for row in report["servos"])
@@ -294,8 +290,8 @@ def board(model: str, family: str, baud: int, rate_hz: float) -> dict:
     """What is said of 24 channels of a board."""
     with launch([EmulatedServo(i, model, baud) for i in range(24)], virtual=True) as chain:
         sick = Patient(chain, 1, "xl330-m288", ())
-        line = Line("face", chain.device, "/dev/ttyACM0", family, baud, rate_hz, dict(enumerate([sick.wanted[1]] * 24)))
-        return examine_line(line, sick.clock, lambda device, rate: sick.port(rate))
+        wanted = dict(enumerate([sick.wanted[1]] * 24))
+        return sick.examined(rate_hz, shown="/dev/ttyACM0", family=family, baud=baud, wanted=wanted)
 
 
 @pytest.mark.parametrize("model", ["maestro-24", "ssc-32"])
@@ -303,8 +299,7 @@ def test_a_board_that_answers_is_fit_and_one_that_does_not_comes_with_its_serial
     family = load_firmware_map(model).family
     assert told(board(model, family, 115_200, 50.0), "error") == []
     with patient() as sick:  # servos on the port where the board should be
-        line = Line("face", sick.chain.device, "/dev/ttyACM0", family, BAUD, 50.0, sick.wanted)
-        report = examine_line(line, sick.clock, lambda device, baud: sick.port(baud))
+        report = sick.examined(50.0, shown="/dev/ttyACM0", family=family)
     assert told(report, "error") == [f"bus: no {family} board answers"] and report["exit_code"] == 4
     assert ("USB Dual Port" if family == "maestro" else "jumpers") in fix_of(report, "board answers")
 

@@ -8,15 +8,13 @@ import pytest
 from sfms_robot.app.head.head_check import check as check_head
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.servo.doctor import examine
+from sfms_robot.app.session import build_bus
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.data import data_dir
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
-from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.stored_settings import JointNeeds, unique_turn
 
 GEAR = "ratio: 3.0\n    min_deg: -80\n    max_deg: 80"  # 2048 +- 2731 ticks
@@ -44,18 +42,8 @@ def test_its_whole_range_is_reached_on_the_wire(tmp_path):
     checked(head)
     clock = VirtualClock()
     (servos,) = emulated(head).values()
-    table = load_firmware_map("xm430-w350")
     with launch(servos, virtual=True) as chain:
-        bus = Dynamixel2Bus(
-            "main",
-            [
-                BusServo(name, j.id, table, j.min_rad, j.max_rad, head.safety_of(name))
-                for name, j in head.joints.items()
-            ],
-            calibration_of(head.joints),
-            lambda: VirtualTimePort(chain.device, chain.control, 1_000_000, clock),
-            1_000_000,
-        )
+        bus = build_bus(head, {next(iter(head.buses)): chain}, clock)
         try:
             bus.connect()
             goals = bus.enable(bus.joints)

@@ -7,7 +7,6 @@ import pytest
 
 from sfms_robot.app.head.head_check import check
 from sfms_robot.app.session import shipped_heads
-from sfms_robot.cli.main import main
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -28,10 +27,10 @@ def tracks(tmp_path):
     return tmp_path
 
 
-def command(capsys, *words: str) -> tuple[int, str]:
-    with pytest.raises(SystemExit) as ended:
-        main(["head", *words])
-    return ended.value.code, capsys.readouterr().out
+@pytest.fixture
+def command(command_line):
+    """Exit code and stdout of `sfms-robot head WORDS`."""
+    return lambda *words: command_line("head", *words)[:2]
 
 
 def test_use_and_demand_are_those_of_the_faces_shown(tracks):
@@ -65,17 +64,17 @@ def test_a_platforms_reach_and_the_share_of_recorded_poses_in_it_are_told():
     assert 0.9 < neck.reached < 1
 
 
-def test_all_problems_come_at_once_with_those_of_the_neck(tmp_path, capsys):
+def test_all_problems_come_at_once_with_those_of_the_neck(tmp_path, command):
     text = (data_dir("configs") / "heads" / "op3_head" / "head.yaml").read_text()
     broken = (
         text.replace("id: 20", "id: 19").replace("yaw: head_pan", "yaw: head_pam").replace("limits: tilt", "limits: up")
     )
     (tmp_path / "head.yaml").write_text(broken + "\nfolds: [{channel: jawOpen, into: head_tilt, gain: 0.1}]\n")
-    code, out = command(capsys, "check", str(tmp_path))
+    code, out = command("check", str(tmp_path))
     assert code == 2
     for told in ("'head_pam' is not a joint", "id = 19 is used twice", "limits = 'up'", "folds.0.into = 'head_tilt'"):
         assert told in out
-    code, out = command(capsys, "check", str(tmp_path), "--json")
+    code, out = command("check", str(tmp_path), "--json")
     assert code == 2 and len(json.loads(out)["problems"]) == 4
 
 
@@ -90,29 +89,29 @@ def test_a_folder_without_tracks_is_refused(tmp_path):
         check("op3_head", tmp_path)
 
 
-def test_the_table_names_every_joint_and_what_is_lost_and_the_picture_is_small(tracks, tmp_path, capsys):
+def test_the_table_names_every_joint_and_what_is_lost_and_the_picture_is_small(tracks, tmp_path, command):
     png = tmp_path / "op3.png"
-    code, out = command(capsys, "check", "op3_head", "--data", str(tracks), "--plot", str(png))
+    code, out = command("check", "op3_head", "--data", str(tracks), "--plot", str(png))
     assert code == 0 and "head_pan: yaw" in out and "head_tilt" in out and "cannot show: roll, x, y, z" in out
     assert png.read_bytes().startswith(b"\x89PNG") and png.stat().st_size < 60_000
 
 
-def test_the_list_has_every_head_with_its_families(capsys):
-    code, out = command(capsys, "list", "--json")
+def test_the_list_has_every_head_with_its_families(command):
+    code, out = command("list", "--json")
     heads = {head["name"]: head for head in json.loads(out)["heads"]}
     assert code == 0 and set(FACES) < set(heads) and list(heads) == [head["name"] for head in shipped_heads()]
     assert heads["open_duck_mini_v2_head"]["buses"] == {"neck": "feetech", "antennas": "maestro"}
     families = {family for head in heads.values() for family in head["buses"].values()}
     assert families == {"dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"}
-    assert "reachy_mini  9 joints, stewart neck, dynamixel" in command(capsys, "list")[1]
+    assert "reachy_mini  9 joints, stewart neck, dynamixel" in command("list")[1]
 
 
-def test_show_tells_value_and_origin(capsys):
-    code, out = command(capsys, "show", "face28", "--joint", "eye_pan_right", "--json")
+def test_show_tells_value_and_origin(command):
+    code, out = command("show", "face28", "--joint", "eye_pan_right", "--json")
     assert code == 0
     assert json.loads(out)["joints"]["eye_pan_right"]["max_deg"] == {"value": 30.0, "from": "mirror of eye_pan_left"}
-    assert "mirror of eye_pan_left" in command(capsys, "show", "face28", "--joint", "eye_pan_right")[1]
-    assert command(capsys, "show", "face28", "--joint", "ear")[0] == 2
+    assert "mirror of eye_pan_left" in command("show", "face28", "--joint", "eye_pan_right")[1]
+    assert command("show", "face28", "--joint", "ear")[0] == 2
 
 
 @pytest.mark.parametrize("head", [entry["name"] for entry in shipped_heads()])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.head.head_solve import solve_poses
-from sfms_robot.cli.main import main
 from sfms_robot.errors import ConfigError
 
 HEADER = "x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad"
@@ -45,12 +44,11 @@ def test_the_neck_of_the_face_takes_the_pose_as_it_is_but_no_shift(poses):
     assert table.solved.reached.tolist() == [True, False]
 
 
-def test_the_command_prints_a_column_per_joint_in_rad_and_whether_it_got_there(poses, capsys):
+def test_the_command_prints_a_column_per_joint_in_rad_and_whether_it_got_there(poses, command_line):
     file = poses(f"{HEADER}\n0,0,0,0,0.2618,0\n0,0,0.1,0,0,0\n")
-    with pytest.raises(SystemExit) as ended:
-        main(["head", "solve", "reachy_mini", "--poses", str(file), "--residual"])
-    rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
-    assert ended.value.code == 0 and [row["reached"] for row in rows] == ["1", "0"]
+    ended = command_line("head", "solve", "reachy_mini", "--poses", file, "--residual")
+    rows = list(csv.DictReader(ended.out.splitlines()))
+    assert ended.code == 0 and [row["reached"] for row in rows] == ["1", "0"]
     assert list(rows[0]) == [
         "body_rotation",
         *(f"stewart_{i}" for i in range(1, 7)),

@@ -12,6 +12,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import MOTION_DIM
+from sfms_robot.ports import Observer
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
@@ -59,20 +60,14 @@ def test_a_run_with_the_neck_turned_off_keeps_it_at_rest():
     assert loud["limits"]["violations"] == 0
 
 
-class Goals:
-    """ports.Observer that keeps what was sent."""
+class Goals(Observer):
+    """Keeps what was sent."""
 
     def __init__(self) -> None:
         self.sent_rad: list[np.ndarray] = []
 
     def tick(self, seen) -> None:
         self.sent_rad.append(seen.goals_rad)
-
-    def heard(self, frame) -> None: ...
-
-    def planned(self, plan) -> None: ...
-
-    def close(self) -> None: ...
 
 
 def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():

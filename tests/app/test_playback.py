@@ -8,7 +8,6 @@ import pytest
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.replay.run_playback import PlaybackOptions, RecordedFace, play_back
 from sfms_robot.app.session import RunOptions, run
-from sfms_robot.cli.main import main
 from sfms_robot.runtime.recorder import RUN_FILE
 
 HEAD, SECONDS = "interbotix_wxxms", 4.0
@@ -71,20 +70,16 @@ def test_the_head_that_is_in_a_recording_is_a_head_file(recorded, tmp_path):
     assert played["head"] == HEAD and played["joints"] == play_back(recorded[0], PlaybackOptions(fast=True))["joints"]
 
 
-def test_what_is_wrong_is_said_in_one_line(recorded, capsys):
+def test_what_is_wrong_is_said_in_one_line(recorded, command_line):
     for words, told in (
         (["--head", "poppy_head"], "add --port"),
         (["--port", "sim", "--head", "nobody"], "nobody"),
         (["--port", "/dev/nowhere"], "/dev/nowhere"),
     ):
-        with pytest.raises(SystemExit) as ended:
-            main(["replay", str(recorded[0]), *words])
-        said = capsys.readouterr().err.strip()
-        assert ended.value.code in (2, 3) and told in said and len(said.splitlines()) == 1
+        ended = command_line("replay", recorded[0], *words)
+        assert ended.code in (2, 3) and told in ended.complaint
 
 
-def test_the_command_says_what_was_played(recorded, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["replay", str(recorded[0]), "--port", "sim", "--fast", "--json"])
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert ended.value.code == 0 and told["exit"] == "done" and told["recording"]["head"] == HEAD
+def test_the_command_says_what_was_played(recorded, command_line):
+    ended = command_line("replay", recorded[0], "--port", "sim", "--fast", "--json")
+    assert ended.code == 0 and ended.told["exit"] == "done" and ended.told["recording"]["head"] == HEAD

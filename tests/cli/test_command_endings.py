@@ -115,10 +115,9 @@ def test_a_reader_that_has_gone_is_no_error_worth_a_word():
 
 
 @pytest.mark.parametrize("words", [["-v", "listener", "list"], ["listener", "list", "--verbose"]])
-def test_verbose_stands_before_and_after_the_command(words, capsys):
-    with pytest.raises(SystemExit) as ended:
-        command_line.main([*words, "--json"])
-    assert ended.value.code == 0 and json.loads(capsys.readouterr().out)["listeners"]
+def test_verbose_stands_before_and_after_the_command(words, command_line):
+    ended = command_line(*words, "--json")
+    assert ended.code == 0 and ended.told["listeners"]
 
 
 @pytest.mark.parametrize(
@@ -144,25 +143,21 @@ def test_a_slip_of_the_keyboard_is_found_before_anything_is_loaded(words, code):
     assert words[1] in done.stderr
 
 
-def test_a_head_that_is_not_there_is_named_as_it_was_given(capsys):
+def test_a_head_that_is_not_there_is_named_as_it_was_given(command_line):
     for words in (["head", "check", "nope"], ["run", "--head", "nope"]):
-        with pytest.raises(SystemExit):
-            command_line.main(words)
-        assert capsys.readouterr().err.startswith("sfms-robot: head 'nope' is neither a shipped name nor a folder")
+        told = command_line(*words).err
+        assert told.startswith("sfms-robot: head 'nope' is neither a shipped name nor a folder")
 
 
 @pytest.mark.parametrize(
     ("group", "name", "key"),
     [("head", "face28", "heads"), ("listener", "sfms-small", "listeners"), ("speaker", "katie", "speakers")],
 )
-def test_what_there_is_has_a_line_each(capsys, group, name, key):
+def test_what_there_is_has_a_line_each(command_line, group, name, key):
     for words in ([group, "list"], [group, "list", "--json"]):
-        with pytest.raises(SystemExit) as ended:
-            command_line.main(words)
-        assert ended.value.code == 0
-        out = capsys.readouterr().out
-        assert name in out
-    assert all(row["description"] for row in json.loads(out)[key])
+        ended = command_line(*words)
+        assert ended.code == 0 and name in ended.out
+    assert all(row["description"] for row in ended.told[key])
 
 
 def test_a_shell_completes_names_of_heads():

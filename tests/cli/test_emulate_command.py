@@ -7,7 +7,6 @@ import sys
 import pytest
 import serial
 
-from sfms_robot.cli.main import main
 from sfms_robot.servo.codecs import dxl2
 
 
@@ -27,13 +26,12 @@ def test_emulator_serves_until_it_is_told_to_stop_and_leaves_nothing_behind(tmp_
     assert not os.path.lexists(link)
 
 
-def test_bad_fault_is_one_line_and_code_2(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["emulate", "--servo", "xl330-m288:1", "--fault", "dorp:1"])
-    told = capsys.readouterr().err.strip()
-    assert ended.value.code == 2
-    assert told.startswith("sfms-robot: emulate: fault = 'dorp:1' has no such kind as 'dorp' (drop, delay, corrupt")
-    assert len(told.splitlines()) == 1
+def test_bad_fault_is_one_line_and_code_2(command_line):
+    ended = command_line("emulate", "--servo", "xl330-m288:1", "--fault", "dorp:1")
+    assert ended.code == 2
+    assert ended.complaint.startswith(
+        "sfms-robot: emulate: fault = 'dorp:1' has no such kind as 'dorp' (drop, delay, corrupt"
+    )
 
 
 def test_json_is_one_object_with_devices_and_servos_and_it_serves_on():

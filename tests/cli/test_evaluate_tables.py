@@ -1,27 +1,16 @@
 """`sfms-robot evaluate tokenizer --table`: trained from nothing, kept, scored on any folder; what it refuses."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, train_missing
-from sfms_robot.cli.main import main
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_S
 from sfms_robot.signals.tracks import Track, write_track
 
 TABLE = ("evaluate", "tokenizer", "--table")
-
-
-def command(*arguments: object) -> int:
-    """Exit code."""
-    try:
-        main([str(argument) for argument in arguments])
-    except SystemExit as stopped:
-        return int(stopped.code or 0)
-    return 0
 
 
 @pytest.fixture
@@ -41,11 +30,12 @@ def tracks(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_a_table_trains_what_is_missing_keeps_it_and_scores_any_folder(
-    tmp_path: Path, tracks: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    tmp_path: Path, tracks: Path, command_line, caplog: pytest.LogCaptureFixture
 ) -> None:
     options = (*TABLE, "4", "--models", tmp_path / "m", "--data", tracks, "--json")
-    assert command(*options, "--train", "--steps", 2, "--plots", tmp_path / "p") == 0
-    first = json.loads(capsys.readouterr().out.splitlines()[-1])
+    trained = command_line(*options, "--train", "--steps", 2, "--plots", tmp_path / "p")
+    first = trained.told
+    assert trained.code == 0
     assert "1 of 5 stretches with a face are shorter than a window of 48 frames and left out: short.csv" in caplog.text
     assert first["table"] == 4 and first["windows"] == 4
     assert [row["name"] for row in first["rows"]][-1] == "Sparse-FSQ-256"
@@ -53,13 +43,21 @@ def test_a_table_trains_what_is_missing_keeps_it_and_scores_any_folder(
         assert row["mse"] > 0 and row["bits_per_window"] > 0 and row["params"] > 0
         assert set(row["per_take"]) == {"a.csv", "deeper/b.csv.gz"}
     assert {file.name for file in (tmp_path / "p").iterdir()} == {"keyframes.png", "quantiles.png"}
-    assert command(*options) == 0
-    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == first, "nothing is trained a second time"
+    again = command_line(*options)
+    assert again.code == 0 and again.told == first, "nothing is trained a second time"
 
 
-def test_an_unknown_table_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert command(*TABLE, "5") == 2
-    assert "--table '5' is not one of 3, 4, all" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((*TABLE, "5"), "--table '5' is not one of 3, 4, all"),
+        ((*TABLE, "3", "--train"), "--train needs --models DIR"),
+        (("evaluate", "tokenizer"), "--data is needed without --table"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(command_line, words, said):
+    ended = command_line(*words)
+    assert ended.code == 2 and said in ended.err
 
 
 def test_an_installed_package_says_how_to_get_the_tokenizers_it_does_not_carry(tmp_path: Path) -> None:
@@ -68,19 +66,7 @@ def test_an_installed_package_says_how_to_get_the_tokenizers_it_does_not_carry(t
         train_missing(TableOptions("4"), ["a", "b"], tmp_path / "tokenizers", {})
 
 
-def test_training_needs_a_folder_of_ones_own(capsys: pytest.CaptureFixture[str]) -> None:
-    assert command(*TABLE, "3", "--train") == 2
-    assert "--train needs --models DIR" in capsys.readouterr().err
-
-
-def test_a_folder_without_tracks_is_refused_before_anything_is_trained(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(*TABLE, "4", "--data", tmp_path, "--models", tmp_path / "m") == 2
-    assert "no face tracks (*.csv, *.csv.gz) below it" in capsys.readouterr().err
+def test_a_folder_without_tracks_is_refused_before_anything_is_trained(tmp_path: Path, command_line) -> None:
+    ended = command_line(*TABLE, "4", "--data", tmp_path, "--models", tmp_path / "m")
+    assert ended.code == 2 and "no face tracks (*.csv, *.csv.gz) below it" in ended.err
     assert not (tmp_path / "m").exists()
-
-
-def test_without_a_table_dyads_are_needed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert command("evaluate", "tokenizer") == 2
-    assert "--data is needed without --table" in capsys.readouterr().err

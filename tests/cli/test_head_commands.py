@@ -5,21 +5,17 @@ import json
 
 import pytest
 
-from sfms_robot.cli.main import main
 from sfms_robot.config.overlay import overlay_file
 
 
 @pytest.fixture
-def run(capsys, monkeypatch, tmp_path):
+def run(command_line, monkeypatch, tmp_path):
     """Run `sfms-robot ARGUMENTS` with lines to type; (exit code, stdout, stderr)."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
-    def command(*words: str, typed: str = "") -> tuple[int, str, str]:
+    def command(*words: str, typed: str = ""):
         monkeypatch.setattr("sys.stdin", io.StringIO(typed))
-        with pytest.raises(SystemExit) as ended:
-            main(list(words))
-        out, err = capsys.readouterr()
-        return int(ended.value.code or 0), out, err
+        return command_line(*words)
 
     return command
 

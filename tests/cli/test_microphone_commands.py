@@ -1,36 +1,23 @@
 """`port list` and `run --check` beside a sound server, and where there is none."""
 
-import json
-
 import pytest
 
-from sfms_robot.cli.main import main
 from sfms_robot.cli.meter import LevelMeter, meter_line
 
 
-@pytest.fixture
-def told(capsys):
-    """How to run the command line: exit code, and the last line of stdout as JSON."""
-
-    def run(*words):
-        with pytest.raises(SystemExit) as ended:
-            main([*words, "--json"])
-        return ended.value.code or 0, json.loads(capsys.readouterr().out.splitlines()[-1])
-
-    return run
-
-
-def test_port_list_shows_serial_ports_and_what_records(sound_server, told):
-    code, listed = told("port", "list")
-    assert code == 0 and isinstance(listed["ports"], list) and listed["microphone_problem"] is None
+def test_port_list_shows_serial_ports_and_what_records(sound_server, command_line):
+    ended = command_line("port", "list", "--json")
+    listed = ended.told
+    assert ended.code == 0 and isinstance(listed["ports"], list) and listed["microphone_problem"] is None
     devices = {row["name"]: row for row in listed["microphones"]}
     assert devices["default"]["default"] and devices["default"]["description"] == "--audio mic:default"
     assert devices["person.monitor"]["description"] == "--agent-audio device:person.monitor"
 
 
-def test_a_check_says_what_it_heard_of_nobody(sound_server, told):
-    code, heard = told("run", "--audio", "mic:person", "--check", "--duration", "0.4")
-    assert code == 0 and heard["seconds"] == 0.4
+def test_a_check_says_what_it_heard_of_nobody(sound_server, command_line):
+    ended = command_line("run", "--audio", "mic:person", "--check", "--duration", "0.4", "--json")
+    heard = ended.told
+    assert ended.code == 0 and heard["seconds"] == 0.4
     assert heard["source"]["voice"]["device"] == "person.monitor"
     assert "digital silence" in heard["findings"][0]
 

@@ -1,6 +1,5 @@
 """`servo` and `doctor` as they are typed, on an emulated chain in real time."""
 
-import json
 import re
 import shlex
 from collections.abc import Iterator
@@ -10,7 +9,7 @@ import pytest
 import typer
 
 import sfms_robot
-from sfms_robot.cli.main import app, main
+from sfms_robot.cli.main import app
 from sfms_robot.emulator.launch import EmulatedServo, launch
 
 
@@ -22,18 +21,14 @@ def device() -> Iterator[str]:
 
 
 @pytest.fixture
-def run(capsys, device):
+def run(command_line, device):
     """Run `sfms-robot ARGUMENTS --port DEVICE`; (exit code, what --json printed or None, stderr)."""
 
     def command(*arguments: object, port: object = None) -> tuple[int, dict | None, str]:
         words = [str(word) for word in arguments]
         rate = ["--baud", "1000000"] if words[0] == "servo" else []
-        with pytest.raises(SystemExit) as ended:
-            main([*words, "--port", str(port or device), *rate])
-        out, err = capsys.readouterr()
-        told = json.loads(out.splitlines()[-1]) if "--json" in words and out else None
-        code = ended.value.code
-        return (0 if code is None else int(code)), told, err.strip()
+        ended = command_line(*words, "--port", port or device, *rate)
+        return ended.code, ended.told if "--json" in words and ended.out else None, ended.err.strip()
 
     return command
 
@@ -103,18 +98,15 @@ def test_a_directory_is_no_port(run, tmp_path):
     assert code == 3 and "directory" in told["findings"][0]["problem"]
 
 
-def test_the_tables_for_people_hold_what_json_holds(capsys, device):
+def test_the_tables_for_people_hold_what_json_holds(command_line, device):
     for words in (("servo", "ping", "1"), ("servo", "read", "1", "all"), ("servo", "monitor", "1", "--samples", "1")):
-        with pytest.raises(SystemExit):
-            main([*words, "--port", device, "--baud", "1000000"])
-        assert "xl330-m288" in (out := capsys.readouterr().out) or "goal_position" in out
+        out = command_line(*words, "--port", device, "--baud", 1_000_000).out
+        assert "xl330-m288" in out or "goal_position" in out
 
 
-def test_the_doctor_finds_the_emulated_head_fit_to_run(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["doctor", "--port", "sim", "--head", "face28"])
-    out = capsys.readouterr().out
-    assert not ended.value.code and "fit to run: 0 errors" in out and "One tick of 28 servos" in out
+def test_the_doctor_finds_the_emulated_head_fit_to_run(command_line):
+    ended = command_line("doctor", "--port", "sim", "--head", "face28")
+    assert not ended.code and "fit to run: 0 errors" in ended.out and "One tick of 28 servos" in ended.out
 
 
 def test_every_command_on_the_page_for_makers_is_one_that_the_program_has():

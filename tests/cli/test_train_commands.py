@@ -1,6 +1,5 @@
 """`train` on a few seconds of made-up conversation: figures out, one line for whatever is wrong, Ctrl-C and back."""
 
-import json
 import signal
 import subprocess
 import sys
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 
-from sfms_robot.cli.main import main
 from sfms_robot.corpora import clips
 from sfms_robot.data import data_dir
 from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
@@ -67,32 +65,34 @@ def arguments(tmp_path, data):
 
 
 @pytest.fixture
-def fails(capsys):
+def fails(command_line):
     """Run a command line that must fail; gives exit code and the one line on stderr."""
 
     def run(*words: str) -> tuple[object, str]:
-        with pytest.raises(SystemExit) as ended:
-            main(["train", *words])
-        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("sfms-robot:")]
+        ended = command_line("train", *words)
+        told = [line for line in ended.err.splitlines() if line.startswith("sfms-robot:")]
         assert len(told) == 1, told
-        return ended.value.code, told[0]
+        return ended.code, told[0]
 
     return run
 
 
-def done(capsys, *words: str) -> tuple[dict, str]:
-    """Figures and stderr of a `train` command that ends well."""
-    with pytest.raises(SystemExit) as ended:
-        main(["train", *words, "--json"])
-    assert ended.value.code == 0
-    told = capsys.readouterr()
-    return json.loads(told.out.splitlines()[-1]), told.err
+@pytest.fixture
+def done(command_line):
+    """Run a `train` command that ends well; figures and stderr."""
+
+    def run(*words: str) -> tuple[dict, str]:
+        ended = command_line("train", *words, "--json")
+        assert ended.code == 0
+        return ended.told, ended.err
+
+    return run
 
 
-def test_both_phases_give_figures_and_a_folder_that_runs(capsys, arguments, tmp_path):
-    first, bar = done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+def test_both_phases_give_figures_and_a_folder_that_runs(done, arguments, tmp_path):
+    first, bar = done("tokenizer", *arguments(), "--no-tensorboard")
     assert first["steps"] == 6 and first["mse"] > 0 and first["stopped"] == "steps" and "loss" in bar
-    second, _ = done(capsys, "listener", *arguments(), "--no-tensorboard", "--steps", "4")
+    second, _ = done("listener", *arguments(), "--no-tensorboard", "--steps", "4")
     assert second["steps"] == 4 and second["held_out_loss"] > 0
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"config.yaml", "tokenizer.safetensors", "model.safetensors"} <= names
@@ -100,19 +100,19 @@ def test_both_phases_give_figures_and_a_folder_that_runs(capsys, arguments, tmp_
     assert "tensorboard" not in names
 
 
-def test_both_phases_train_in_16_bits(capsys, arguments, monkeypatch):
+def test_both_phases_train_in_16_bits(done, arguments, monkeypatch):
     monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: True)
     raw = tiny()
     for phase in ("tokenizer", "predictor"):
         raw[phase] |= {"precision": "bf16", "steps": 2}
         command = "listener" if phase == "predictor" else phase
-        figures, _ = done(capsys, command, *arguments(raw), "--no-tensorboard")
+        figures, _ = done(command, *arguments(raw), "--no-tensorboard")
         assert figures["steps"] == 2
 
 
-def test_curves_go_to_tensorboard(capsys, arguments, tmp_path):
+def test_curves_go_to_tensorboard(done, arguments, tmp_path):
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    done(capsys, "tokenizer", *arguments(), "--tensorboard")
+    done("tokenizer", *arguments(), "--tensorboard")
     curves = events.EventAccumulator(str(tmp_path / "out" / "tensorboard" / "tokenizer"))
     curves.Reload()
     assert {"loss", "held_out_loss", "learning_rate", "frames_per_s"} <= set(curves.Tags()["scalars"])
@@ -127,9 +127,9 @@ def test_curves_that_were_asked_for_name_the_missing_extra(arguments):
     assert ended.stderr == "sfms-robot: --tensorboard needs an optional part: pip install 'sfms-robot[train]'\n"
 
 
-def test_a_finished_run_says_so(capsys, arguments):
-    before, _ = done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
-    after, told = done(capsys, "tokenizer", *arguments(), "--no-tensorboard", "--resume")
+def test_a_finished_run_says_so(done, arguments):
+    before, _ = done("tokenizer", *arguments(), "--no-tensorboard")
+    after, told = done("tokenizer", *arguments(), "--no-tensorboard", "--resume")
     assert "had already finished at step 6" in told
     assert after["mse"] == before["mse"] and after["resumed_at"] == 6
 
@@ -139,8 +139,8 @@ def test_nothing_to_resume(fails, arguments):
     assert code == 2 and "checkpoint-tokenizer.safetensors: no checkpoint to resume from" in told
 
 
-def test_an_earlier_training_is_not_lost_unasked(capsys, fails, arguments, tmp_path):
-    done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+def test_an_earlier_training_is_not_lost_unasked(done, fails, arguments, tmp_path):
+    done("tokenizer", *arguments(), "--no-tensorboard")
     weights = tmp_path / "out" / "tokenizer.safetensors"
     before = weights.read_bytes()
     code, told = fails("tokenizer", *arguments(), "--steps", "3")
@@ -149,12 +149,12 @@ def test_an_earlier_training_is_not_lost_unasked(capsys, fails, arguments, tmp_p
     weights.unlink()
     code, told = fails("tokenizer", *arguments(), "--steps", "3")
     assert code == 2 and "checkpoint-tokenizer.safetensors is of an earlier training" in told
-    anew, _ = done(capsys, "tokenizer", *arguments(), "--no-tensorboard", "--steps", "3", "--overwrite")
+    anew, _ = done("tokenizer", *arguments(), "--no-tensorboard", "--steps", "3", "--overwrite")
     assert anew["steps"] == 3 and weights.exists()
 
 
-def test_a_checkpoint_of_another_configuration(capsys, fails, arguments):
-    done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+def test_a_checkpoint_of_another_configuration(done, fails, arguments):
+    done("tokenizer", *arguments(), "--no-tensorboard")
     raw = tiny()
     raw["listener"]["tokenizer_width"] = 16
     code, told = fails("tokenizer", *arguments(raw), "--resume")
@@ -259,7 +259,7 @@ def test_a_gpu_that_is_not_there(fails, arguments):
     assert code == 2 and "--device cuda: torch sees no CUDA device here (auto, cpu)" in line
 
 
-def test_the_interrupt_handler_survives_a_training(capsys, arguments):
+def test_the_interrupt_handler_survives_a_training(done, arguments):
     before = signal.getsignal(signal.SIGINT)
-    done(capsys, "tokenizer", *arguments(), "--no-tensorboard")
+    done("tokenizer", *arguments(), "--no-tensorboard")
     assert signal.getsignal(signal.SIGINT) is before

@@ -11,7 +11,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+
+from ended import Ended
 
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
@@ -26,12 +27,6 @@ AWAY_TICKS = 2448  # inside the limits, and a second of easing from rest
 LOOKS = 12_000  # of `LOOK_S` each before something counts as not coming
 LOOK_S = 0.01
 TICKS_20 = 1000  # bytes on the wire of this head
-
-
-class Ended(NamedTuple):
-    code: int
-    out: str
-    err: str
 
 
 class Terminal:

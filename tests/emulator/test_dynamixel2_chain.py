@@ -1,17 +1,15 @@
 """The emulated chain without a terminal: packets in, packets out."""
 
 import pytest
+from emulated_devices import device_of, table_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
-from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_instruction, maybe_packet
-from sfms_robot.servo.registers import Table
 
-TABLE = Table.of(load_firmware_map("xl330-m288"))
+TABLE = table_of("xl330-m288")
 BAUD = 1_000_000
 
 
@@ -19,8 +17,8 @@ class Host:
     """A host that talks at one baud, at a time it sets."""
 
     def __init__(self, *servos: int, baud: int = BAUD, firmware: int = 53, chain_break: bool = True):
-        each = [Dynamixel2Servo(i, TABLE, baud, start_ticks=2000 + i, firmware=firmware) for i in servos]
-        self.chain = Dynamixel2Chain(each, chain_break)
+        each = [EmulatedServo(i, baud=baud, start_ticks=2000 + i, firmware=firmware) for i in servos]
+        self.chain = device_of(*each, chain_break=chain_break)
         self.t = 0.0
 
     def replies(self, servo: int, instruction: int, params: bytes = b""):
@@ -56,24 +54,10 @@ def host():
     return Host(1, 2, 3)
 
 
-def test_ping_tells_model_and_firmware(host):
-    assert host.ask(2, dxl2.PING) == [Packet(2, dxl2.STATUS, b"\xb0\x04\x35")]
-
-
-def test_broadcast_ping_is_answered_by_all(host):
-    assert [packet.servo for packet in host.ask(dxl2.BROADCAST, dxl2.PING)] == [1, 2, 3]
-
-
 def test_unknown_id_and_other_baud_are_silence(host):
     assert host.ask(9, dxl2.PING) == []
     assert host.ask(1, dxl2.PING, baud=57600) == []
     assert host.ask(1, dxl2.PING, baud=None) == []
-
-
-def test_baud_register_moves_the_servo_to_another_baud(host):
-    assert host.write(1, "baud_rate", 1) == 0
-    assert host.ask(1, dxl2.PING) == []
-    assert len(host.ask(1, dxl2.PING, baud=57600)) == 1
 
 
 @pytest.mark.parametrize(
@@ -129,24 +113,9 @@ def test_torque_before_a_goal_jumps_to_the_middle(host):
     assert host.read(1, "present_position") == 2048
 
 
-def test_sync_write_moves_all(host):
-    for servo in (1, 2, 3):
-        host.write(servo, "torque_enable", 1)
-    body = b"".join(bytes([i]) + (1000 * i).to_bytes(4, "little") for i in (1, 2, 3))
-    assert host.ask(dxl2.BROADCAST, dxl2.SYNC_WRITE, words(116, 4) + body) == []
-    host.t = 3.0
-    assert [host.read(i, "present_position") for i in (1, 2, 3)] == [1000, 2000, 3000]
-
-
 def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x01\x02")] == [3, 1, 2]
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x09\x02")] == [3]
-
-
-def test_bulk_read_and_write(host):
-    host.ask(dxl2.BROADCAST, dxl2.BULK_WRITE, b"\x01" + words(65, 1) + b"\x01" + b"\x02" + words(84, 2) + words(700))
-    answers = host.ask(dxl2.BROADCAST, dxl2.BULK_READ, b"\x01" + words(65, 1) + b"\x02" + words(84, 2))
-    assert [p.params for p in answers] == [b"\x01", words(700)]
 
 
 def test_registered_write_waits_for_action(host):
@@ -164,16 +133,6 @@ def test_reboot_restores_ram_and_keeps_eeprom(host):
     assert host.ask(1, dxl2.PING) == []  # it is busy starting
     host.t = 0.5
     assert [host.read(1, n) for n in ("led", "torque_enable", "return_delay_time")] == [0, 0, 7]
-
-
-def test_factory_reset_keeps_what_it_is_told_to(host):
-    host.write(3, "return_delay_time", 7)
-    host.ask(3, dxl2.FACTORY_RESET, b"\x02")
-    host.t = 0.5
-    assert host.read(3, "return_delay_time") == 250
-    host.ask(3, dxl2.FACTORY_RESET, b"\x01")
-    host.t = 1.0
-    assert host.ask(3, dxl2.PING) == [] and len(host.ask(3, dxl2.PING, baud=57600)) == 1
 
 
 def test_hardware_error_is_latched_until_reboot(host):

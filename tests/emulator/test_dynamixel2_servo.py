@@ -6,6 +6,7 @@ import pytest
 
 from sfms_robot.config import load_firmware_map, map_files, variant
 from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Table
 
@@ -15,7 +16,9 @@ class Bench:
 
     def __init__(self, model="xl330-m288", firmware=53, start=2048, supply_v=None, **registers):
         self.table = Table.of(variant(model, firmware))
-        self.servo = Dynamixel2Servo(1, self.table, 1_000_000, start, firmware, registers, supply_v)
+        self.servo = Dynamixel2Servo(
+            EmulatedServo(1, model, 1_000_000, start, firmware, registers, supply_v), self.table
+        )
         self.t = 0.0
 
     def put(self, **values):
@@ -44,7 +47,7 @@ PROTOCOL_2 = sorted(file.stem for file in map_files() if load_firmware_map(file.
 def test_every_shipped_model_stands_still_and_moves_when_told(model):
     table = Table.of(load_firmware_map(model))
     baud = max(table.baud_codes.values())
-    servo = Dynamixel2Servo(1, table, baud, table.center_ticks, table.firmware[1])
+    servo = Dynamixel2Servo(EmulatedServo(1, model, baud, table.center_ticks, table.firmware[1]), table)
     present, goal, torque = (table.role(r) for r in ("present_position", "goal_position", "torque_enable"))
     assert servo.read(0, table.size, 0.5) == (0, servo.read(0, table.size, 0.5)[1])
     assert present.from_bytes(servo.read(present.address, present.size, 1.0)[1]) == table.center_ticks
@@ -235,7 +238,7 @@ def test_xl320_torque_limit_starts_at_max_torque_and_holds_the_motor_back():
     table = Table.of(load_firmware_map("xl-320"))
     way = {}
     for stored in ({}, {"max_torque": 60}):
-        servo = Dynamixel2Servo(1, table, 1_000_000, 512, 30, stored)
+        servo = Dynamixel2Servo(EmulatedServo(1, "xl-320", start_ticks=512, firmware=30, registers=stored), table)
         most = stored.get("max_torque", 1023)
         assert servo.read(35, 2, 0.0) == (0, most.to_bytes(2, "little"))  # Torque Limit
         servo.write(30, (900).to_bytes(2, "little"), 0.0)

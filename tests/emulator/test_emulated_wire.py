@@ -1,27 +1,27 @@
 """Devices, faults and the line between, without a terminal."""
 
 import pytest
+from emulated_devices import chain_of, device_of, servos_of
 
-from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
-from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
-from sfms_robot.emulator.protocol1_chain import Protocol1Chain
-from sfms_robot.emulator.pulse_boards import Ssc32Board
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
-from sfms_robot.servo.registers import Table
 
 BAUD = 1_000_000
-TABLE = Table.of(load_firmware_map("xl330-m288"))
 POSITIONS = (132).to_bytes(2, "little") + (4).to_bytes(2, "little")
 
 
+def xl330(*ids, chain_break=True, **more):
+    """Servos that stand at 2000 and their id."""
+    return device_of(*(EmulatedServo(i, start_ticks=2000 + i, **more) for i in ids), chain_break=chain_break)
+
+
 def wire_of(*ids: int, timing="instant", faults=(), seed=0) -> EmulatedWire:
-    servos = [Dynamixel2Servo(i, TABLE, BAUD, 2000 + i, 53, {"return_delay_time": 50}) for i in ids]
-    return EmulatedWire([Dynamixel2Chain(servos)], timing, [parse_fault(text) for text in faults], seed)
+    chain = xl330(*ids, registers={"return_delay_time": 50})
+    return EmulatedWire([chain], timing, [parse_fault(text) for text in faults], seed)
 
 
 def sync_read(*ids: int) -> bytes:
@@ -134,10 +134,7 @@ def test_unplugged_wire_hears_nothing_but_counts():
 
 
 def test_two_protocols_share_one_wire():
-    table = Table.of(load_firmware_map("ax-12a"))
-    row = {"id": 20, "model": "ax-12a", "baud": BAUD, "start_ticks": 512, "firmware": 24}
-    old = Protocol1Chain.from_rows([row], {"ax-12a": table})
-    wire = EmulatedWire([Dynamixel2Chain([Dynamixel2Servo(1, TABLE, BAUD, 2001, 53)]), old])
+    wire = EmulatedWire([xl330(1), device_of(*servos_of("ax-12a", 20))])
     for _ in range(3):
         wire.receive(encode_instruction(1, dxl2.PING), BAUD, 0.0)
         assert ids_in(wire.take(0.0)) == [1]
@@ -159,7 +156,7 @@ def test_same_faults_and_requests_give_the_same_bytes():
 
 @pytest.mark.parametrize("chain_break", [True, False])
 def test_mute_servo_obeys_and_never_answers(chain_break):
-    chain = Dynamixel2Chain([Dynamixel2Servo(i, TABLE, BAUD, 2000 + i, 53) for i in (1, 2, 3)], chain_break)
+    chain = xl330(1, 2, 3, chain_break=chain_break)
     wire = EmulatedWire([chain], "instant", [parse_fault("mute:2@1-3")], 0)
     torque_on = encode_instruction(2, dxl2.WRITE, bytes([64, 0, 1]))
     behind = [1] if chain_break else [1, 3]
@@ -175,9 +172,7 @@ def test_mute_servo_obeys_and_never_answers(chain_break):
 
 
 def test_mute_servo_of_protocol_1_obeys_and_never_answers():
-    table = Table.of(load_firmware_map("ax-12a"))
-    row = {"id": 1, "model": "ax-12a", "baud": BAUD, "start_ticks": 512, "firmware": 24}
-    chain = Protocol1Chain.from_rows([row], {"ax-12a": table})
+    chain = chain_of("ax-12a")
     wire = EmulatedWire([chain], "instant", [parse_fault("mute")], 0)
     for request in ("ff ff 01 02 01 fb", "ff ff 01 04 02 24 02 d2", "ff ff 01 04 03 18 01 de"):  # ping, read, torque on
         wire.receive(bytes.fromhex(request), BAUD, 0.0)
@@ -185,8 +180,7 @@ def test_mute_servo_of_protocol_1_obeys_and_never_answers():
 
 
 def test_board_is_mute_when_all_its_channels_are():
-    table = Table.of(load_firmware_map("ssc-32"))
-    board = Ssc32Board(table, [{"id": i, "baud": 9600, "start_ticks": 1500} for i in (0, 1)])
+    board = device_of(*servos_of("ssc-32", 0, 1, baud=9600))
     wire = EmulatedWire([board], "instant", [parse_fault("mute@1-2")], 0)
     for now_s, answers in ((0.5, 1), (1.5, 0), (2.5, 1)):
         wire.receive(f"#0P{1500 + round(now_s)}\rQ\r".encode(), 9600, now_s)

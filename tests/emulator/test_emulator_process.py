@@ -1,10 +1,10 @@
 """The emulator's process as a whole: control socket, terminal, virtual time."""
 
 import os
-from dataclasses import dataclass
 
 import pytest
 import serial
+from virtual_time import Time
 
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError
@@ -14,14 +14,6 @@ from sfms_robot.servo.port import VirtualTimePort
 
 POSITIONS = (132).to_bytes(2, "little") + (4).to_bytes(2, "little")
 BAUD = 1_000_000
-
-
-@dataclass
-class Time:
-    t: float = 0.0
-
-    def now_s(self) -> float:
-        return self.t
 
 
 class Host:
@@ -199,24 +191,32 @@ def test_stale_link_of_a_killed_emulator_is_replaced(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("servo", "how", "message"),
+    ("servos", "how", "message"),
     [
-        (EmulatedServo(1, registers={"homing": 3}), {}, "register = 'homing' is none of xl330-m288"),
-        (EmulatedServo(1, registers={"shutdown": 300}), {}, r"shutdown = 300 is out of range of xl330-m288 \(0..255\)"),
+        ([EmulatedServo(1), EmulatedServo(1)], {}, "id = 1 is used twice"),
+        ([EmulatedServo(253)], {}, "id = 253 is not a servo id"),
+        ([EmulatedServo(1, baud=12345)], {}, r"baud = 12345 is no rate of xl330-m288 \(9600, 57600"),
+        ([EmulatedServo(1, model="xl999")], {}, "'xl999' has no firmware map"),
+        ([EmulatedServo(1, registers={"homing": 3})], {}, "register = 'homing' is none of xl330-m288"),
         (
-            EmulatedServo(1, "maestro-24", supply_v=11.0),
+            [EmulatedServo(1, registers={"shutdown": 300})],
+            {},
+            r"shutdown = 300 is out of range of xl330-m288 \(0..255\)",
+        ),
+        (
+            [EmulatedServo(1, "maestro-24", supply_v=11.0)],
             {},
             "model = 'maestro-24' is a board of hobby servos: it has no registers",
         ),
-        (EmulatedServo(24, "maestro-24"), {}, r"id = 24 is not a servo id \(0..23\)"),
-        (EmulatedServo(1), {"faults": ["bang"]}, "has no such kind as 'bang'"),
-        (EmulatedServo(1), {"faults": ["drop:7"]}, "'drop:7' concerns no servo of this wire"),
-        (EmulatedServo(1), {"link": "/no/such/folder/x"}, "lies in a folder that does not exist"),
+        ([EmulatedServo(24, "maestro-24")], {}, r"id = 24 is not a servo id \(0..23\)"),
+        ([EmulatedServo(1)], {"faults": ["bang"]}, "has no such kind as 'bang'"),
+        ([EmulatedServo(1)], {"faults": ["drop:7"]}, "'drop:7' concerns no servo of this wire"),
+        ([EmulatedServo(1)], {"link": "/no/such/folder/x"}, "lies in a folder that does not exist"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(servo, how, message):
+def test_what_cannot_be_is_refused_in_one_line(servos, how, message):
     with pytest.raises(ConfigError, match=message) as caught:
-        launch([servo], **how)
+        launch(servos, **how)
     assert "\n" not in str(caught.value)
 
 

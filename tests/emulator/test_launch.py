@@ -5,37 +5,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PortHandler, Protocol2PacketHandler
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch, wait
-from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.errors import BusError
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
-
-
-def test_vendor_sdk_works_unchanged():
-    """In real time, with the SDK's own port: its set-up, its packets, its waiting."""
-    with launch([EmulatedServo(i, start_ticks=2000 + i) for i in (1, 2, 3)]) as chain:
-        port, sdk = PortHandler(chain.device), Protocol2PacketHandler()
-        assert port.openPort() and port.setBaudRate(1_000_000)
-        assert sdk.ping(port, 2) == (1200, 0, 0)
-        read = GroupSyncRead(port, sdk, 132, 4)
-        goals = GroupSyncWrite(port, sdk, 116, 4)
-        for servo in (1, 2, 3):
-            assert sdk.write4ByteTxRx(port, servo, 116, 2000 + servo) == (0, 0)
-            assert sdk.write1ByteTxRx(port, servo, 64, 1) == (0, 0)
-            read.addParam(servo)
-            goals.addParam(servo, [0xD0 + servo, 0x07, 0, 0])  # 2000 + servo: where it stands
-        assert goals.txPacket() == 0
-        assert read.txRxPacket() == 0
-        assert [read.getData(servo, 132, 4) for servo in (1, 2, 3)] == [2001, 2002, 2003]
-        assert read.fastSyncRead() == 0
-        assert [read.getData(servo, 132, 4) for servo in (1, 2, 3)] == [2001, 2002, 2003]
-        assert sdk.write1ByteTxRx(port, 1, 9, 0) == (0, 7)  # EEPROM under torque
-        port.closePort()
 
 
 def test_process_ends_and_leaves_nothing_behind():
@@ -65,25 +42,6 @@ def test_emulator_needs_no_heavy_library():
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
     assert "sfms_robot.emulator.dynamixel2_chain" in loaded
     assert not {"torch", "scipy", "numpy", "pydantic", "yaml"} & {*loaded}
-
-
-@pytest.mark.parametrize(
-    ("servos", "message"),
-    [
-        ([EmulatedServo(1), EmulatedServo(1)], "id = 1 is used twice"),
-        ([EmulatedServo(253)], "id = 253 is not a servo id"),
-        ([EmulatedServo(1, baud=12345)], r"baud = 12345 is no rate of xl330-m288 \(9600, 57600"),
-        ([EmulatedServo(1, model="xl999")], "'xl999' has no firmware map"),
-    ],
-)
-def test_impossible_chain_is_refused(servos, message):
-    with pytest.raises(ConfigError, match=message):
-        launch(servos)
-
-
-def test_request_that_the_emulator_does_not_know_is_refused():
-    with launch([EmulatedServo(1)]) as chain, pytest.raises(BusError, match="no such servo"):
-        chain.kill(9)
 
 
 @pytest.mark.parametrize(

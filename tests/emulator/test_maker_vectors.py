@@ -5,24 +5,15 @@ same files, or written out here and closed with a checksum of the maker's page, 
 are tested against the same files, so neither side is only tested against the other.
 """
 
-import csv
-from pathlib import Path
-
 import pytest
-
-from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.dynamixel2_chain import Dynamixel2Chain
-from sfms_robot.emulator.protocol1_chain import Protocol1Chain
-from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
-from sfms_robot.servo.registers import Table
+from emulated_devices import device_of, servos_of
+from published import rows
 
 BAUD = 1_000_000
 
 
 def vectors(file, column):
-    lines = (Path(__file__).parents[1] / "assets" / file).read_text().splitlines()
-    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
-    return {row["name"]: row[column] for row in rows}
+    return {row["name"]: row[column] for row in rows(file)}
 
 
 NEW = {name: bytes.fromhex(text) for name, text in vectors("dxl2_packets.csv", "packet").items()}
@@ -50,15 +41,9 @@ def status1(servo, error, *data):
     return bytes([255, 255, *body, ~sum(body) & 255])
 
 
-def servos(model, *ids, chain=Dynamixel2Chain, firmware=53, start=None, **registers):
-    table = Table.of(load_firmware_map(model))
-    row = {"model": model, "baud": BAUD, "firmware": firmware, "registers": registers, "supply_v": None}
-    start = table.center_ticks if start is None else start
-    return chain.from_rows([{**row, "id": i, "start_ticks": start} for i in ids], {model: table})
-
-
-def old(model, *ids, **more):
-    return servos(model, *ids, chain=Protocol1Chain, **more)
+def servos(model, *ids, firmware=53, start_ticks=None, **registers):
+    stored = {"firmware": firmware, "start_ticks": start_ticks, "registers": registers}
+    return device_of(*servos_of(model, *ids, **stored))
 
 
 def test_the_checksum_of_this_file_is_the_makers():
@@ -74,7 +59,7 @@ def test_protocol_2_ping_of_an_xm430_w210():
 
 
 def test_protocol_2_reads():
-    chain = servos("xl330-m288", 1, 2, start=0x0823)
+    chain = servos("xl330-m288", 1, 2, start_ticks=0x0823)
     one, two = status2(1, 0, 0x23, 8, 0, 0), status2(2, 0, 0x23, 8, 0, 0)
     assert chain.receive(NEW["read 4 bytes at 132 id1"], BAUD, 0.0) == one
     assert chain.receive(NEW["sync read 4 bytes at 132 ids 1 2"], BAUD, 0.0) == one + two
@@ -123,7 +108,7 @@ def test_protocol_2_alert_and_access_error():
 
 
 def test_dynamixel_1_frames():
-    chain = old("ax-12a", 0, 1, 2, 3)
+    chain = servos("ax-12a", 0, 1, 2, 3)
     assert chain.receive(OLD["ping id1"], BAUD, 0.0) == status1(1, 0)
     assert chain.receive(OLD["read temperature id1 (43,1)"], BAUD, 0.0) == status1(1, 0, 31)
     assert chain.receive(OLD["AX goal position 512 id1"], BAUD, 0.0) == status1(1, 0)
@@ -134,7 +119,7 @@ def test_dynamixel_1_frames():
 
 
 def test_feetech_frames():
-    chain = old("sts3215", 1, 2, start=0x0456)
+    chain = servos("sts3215", 1, 2, start_ticks=0x0456)
     one, two = (status1(i, 0, 0x56, 4, 0, 0) for i in (1, 2))
     assert chain.receive(OLD["read position id1"], BAUD, 0.0) == status1(1, 0, 0x56, 4)
     assert chain.receive(OLD["sync read pos+speed (56,4) ids 1 2"], BAUD, 0.0) == one + two
@@ -147,7 +132,7 @@ def test_feetech_frames():
 
 
 def test_feetech_turns_and_id():
-    chain = old("sts3215", 1, lock=1, phase=28)
+    chain = servos("sts3215", 1, lock=1, phase=28)
     chain.servo(1).turn(3 * 4096 + 9, 0.0)
     assert chain.receive(OLD["clear turns id1"], BAUD, 0.0) == status1(1, 0)
     assert chain.receive(OLD["read position id1"], BAUD, 0.0) == status1(1, 0, 9, 0)
@@ -157,7 +142,7 @@ def test_feetech_turns_and_id():
 
 
 def test_feetech_with_the_high_byte_first():
-    chain = old("scs0009", 1)
+    chain = servos("scs0009", 1)
     request = "write pos 512 time 0 speed 0 id1 (high byte first)"
     assert chain.receive(OLD[request], BAUD, 0.0) == status1(1, 0)
     assert chain.servo(1).state(0.0)["goal"] == 512
@@ -165,8 +150,7 @@ def test_feetech_with_the_high_byte_first():
 
 @pytest.fixture
 def maestro():
-    table = Table.of(load_firmware_map("maestro-24"))
-    board = MaestroBoard(table, [{"id": i, "baud": 9600, "start_ticks": 6000} for i in range(6)])
+    board = device_of(*servos_of("maestro-24", *range(6), baud=9600))
     board.receive(b"\xaa", 9600, 0.0)
     return board
 
@@ -195,8 +179,7 @@ def test_maestro_commands(maestro):
 
 
 def test_ssc32_commands():
-    table = Table.of(load_firmware_map("ssc-32"))
-    board = Ssc32Board(table, [{"id": i, "baud": 9600, "start_ticks": 1500} for i in (3, 4, 5, 10)])
+    board = device_of(*servos_of("ssc-32", 3, 4, 5, 10, baud=9600))
 
     def send(name, now_s):
         return board.receive(BOARD[name].replace("<CR>", "\r").encode(), 9600, now_s)

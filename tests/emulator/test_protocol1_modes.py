@@ -4,10 +4,7 @@ Frames are written out byte by byte, as the makers' manuals have them, so that n
 """
 
 import pytest
-
-from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.protocol1_chain import Protocol1Chain
-from sfms_robot.servo.registers import Table
+from emulated_devices import chain_of
 
 BAUD = 1_000_000
 AX, MX, STS, SCS = "ax-12a", "mx-28-1.0", "sts3215", "scs0009"
@@ -18,10 +15,7 @@ class Bench:
     """One servo with id 1."""
 
     def __init__(self, model, start_ticks=None, **registers):
-        table = Table.of(load_firmware_map(model))
-        start = table.center_ticks if start_ticks is None else start_ticks
-        row = {"id": 1, "model": model, "baud": BAUD, "start_ticks": start, "firmware": 40, "registers": registers}
-        self.device = Protocol1Chain.from_rows([row], {model: table})
+        self.device = chain_of(model, start_ticks=start_ticks, registers=registers)
         self.high_first = model == SCS
         self.now_s = 0.0
 
@@ -177,7 +171,7 @@ def test_registered_write_is_pending_until_action(model, goal, pending):
     bench = Bench(model)
     assert bench.read(pending, 1) == 0
     bench.send(4, goal, *bench.word(600))  # REG WRITE
-    assert bench.read(pending, 1) == 1
+    assert bench.read(pending, 1) == 1 and bench.read(goal) != 600
     bench.send(5)  # ACTION
     assert bench.read(pending, 1) == 0
     assert bench.read(goal) == 600

@@ -1,34 +1,16 @@
 import pytest
+from emulated_devices import chain_of, table_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.protocol1_chain import Protocol1Chain
 from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
-from sfms_robot.servo.registers import Table
 
 MODELS = [
     "ax-12a", "ax-18a", "mx-28-1.0", "mx-64-1.0", "mx-106-1.0",
     "sts3215", "sts3215_12v", "sts3250", "sts3032", "scs0009", "scs15",
 ]  # fmt: skip
 BAUD = 1_000_000
-
-
-def device_of(*models: str, start_ticks: int | None = None, **more) -> Protocol1Chain:
-    tables = {model: Table.of(load_firmware_map(model)) for model in models}
-    rows = [
-        {
-            "id": i + 1,
-            "model": model,
-            "baud": BAUD,
-            "start_ticks": tables[model].center_ticks if start_ticks is None else start_ticks,
-            "firmware": 3,
-            **more,
-        }
-        for i, model in enumerate(models)
-    ]
-    return Protocol1Chain.from_rows(rows, tables)
 
 
 def ask(device, servo, code, params=b"", now_s=0.0, baud=BAUD) -> list[Frame]:
@@ -55,7 +37,7 @@ def put(device, servo, name, value, now_s=0.0) -> int:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_answers_a_ping_and_goes_where_it_is_told(model):
-    device = device_of(model)
+    device = chain_of(model)
     table = device.servo(1).table
     assert ask(device, 1, protocol1.PING) == [Frame(1, 0, b"")]
     assert get(device, 1, "model_number") == (table.model_number or 0)
@@ -68,34 +50,28 @@ def test_every_model_answers_a_ping_and_goes_where_it_is_told(model):
 
 @pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
 def test_goal_before_torque_switches_the_torque_on(model):
-    device = device_of(model)
+    device = chain_of(model)
     put(device, 1, "goal_position", 600)
     assert get(device, 1, "torque_enable") == 1
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_torque_without_a_goal_is_a_jump_to_the_middle(model):
-    table = Table.of(load_firmware_map(model))
-    device = device_of(model, start_ticks=table.center_ticks - 200)
+    table = table_of(model)
+    device = chain_of(model, start_ticks=table.center_ticks - 200)
     put(device, 1, "torque_enable", 1)
     assert get(device, 1, "present_position", 3.0) == table.center_ticks
 
 
-def test_byte_order_is_that_of_the_series():
-    device = device_of("sts3215", "scs0009", start_ticks=0x0123)
-    little, big = (ask(device, servo, protocol1.READ, bytes([56, 2]))[0].params for servo in (1, 2))
-    assert (little, big) == (b"\x23\x01", b"\x01\x23")
-
-
 def test_speed_backwards_carries_its_sign_bit():
-    device = device_of("sts3215", "ax-12a", start_ticks=700)
+    device = chain_of("sts3215", "ax-12a", start_ticks=700)
     for servo, name in ((1, "present_velocity"), (2, "present_speed")):
         put(device, servo, "goal_position", 300)
         assert get(device, servo, name, 0.05) < 0
 
 
 def test_only_servos_at_the_hosts_baud_hear_it_give_or_take_three_percent():
-    device = device_of("ax-12a")
+    device = chain_of("ax-12a")
     put(device, 1, "baud_rate", 34)  # 57,142 in truth
     assert ask(device, 1, protocol1.PING) == []
     assert len(ask(device, 1, protocol1.PING, baud=57_600)) == 1
@@ -103,7 +79,7 @@ def test_only_servos_at_the_hosts_baud_hear_it_give_or_take_three_percent():
 
 
 def test_dynamixel_says_what_it_refuses_and_changes_nothing():
-    device = device_of("ax-12a")
+    device = chain_of("ax-12a")
     put(device, 1, "cw_angle_limit", 200)
     assert put(device, 1, "goal_position", 100) == dxl1.ANGLE_LIMIT
     assert ask(device, 1, protocol1.WRITE, bytes([36, 0, 0]))[0].code == dxl1.RANGE  # read-only
@@ -115,25 +91,15 @@ def test_dynamixel_says_what_it_refuses_and_changes_nothing():
 
 
 def test_feetech_takes_what_it_can_and_says_nothing():
-    device = device_of("scs0009")
+    device = chain_of("scs0009")
     assert put(device, 1, "goal_position", 5) == 0
     assert get(device, 1, "goal_position") == 20  # its own limit
     assert ask(device, 1, protocol1.WRITE, bytes([56, 0, 0]))[0].code == 0
     assert ask(device, 1, 0x77) == []
 
 
-@pytest.mark.parametrize(("model", "kept"), [("sts3215", 2048), ("ax-12a", 512)])
-def test_registered_write_waits_for_action(model, kept):
-    device = device_of(model)
-    goal = device.servo(1).table["goal_position"]
-    ask(device, 1, protocol1.REG_WRITE, bytes([goal.address]) + goal.to_bytes(300))
-    assert get(device, 1, "goal_position") == kept
-    assert ask(device, BROADCAST, protocol1.ACTION) == []
-    assert get(device, 1, "goal_position") == 300
-
-
 def test_locked_eeprom_forgets_on_feetech():
-    device = device_of("sts3215")
+    device = chain_of("sts3215")
     for lock, kept in ((1, 0), (0, 5)):
         put(device, 1, "lock", lock)
         put(device, 1, "return_delay_time", 5)
@@ -143,7 +109,7 @@ def test_locked_eeprom_forgets_on_feetech():
 
 
 def test_locked_eeprom_takes_nothing_on_dynamixel_and_the_lock_holds():
-    device = device_of("ax-12a")
+    device = chain_of("ax-12a")
     assert put(device, 1, "lock", 1) == 0 and put(device, 1, "alarm_led", 4) == 0 and put(device, 1, "lock", 0) == 0
     assert (get(device, 1, "alarm_led"), get(device, 1, "lock")) == (36, 1)
     device.servo(1).power_cycle(0.0)
@@ -151,7 +117,7 @@ def test_locked_eeprom_takes_nothing_on_dynamixel_and_the_lock_holds():
 
 
 def test_status_level_decides_who_is_answered():
-    device = device_of("ax-12a", "sts3215")
+    device = chain_of("ax-12a", "sts3215")
     put(device, 1, "status_return_level", 0)
     put(device, 2, "response_level", 0)
     assert ask(device, 1, protocol1.READ, bytes([3, 1])) == [] and len(ask(device, 1, protocol1.PING)) == 1
@@ -159,28 +125,18 @@ def test_status_level_decides_who_is_answered():
     assert ask(device, 2, protocol1.WRITE, bytes([40, 0])) == []
 
 
-def test_sync_write_reaches_all_and_nobody_answers():
-    device = device_of("sts3215", "sts3215")
-    params = dxl1.sync_write_params(42, {1: b"\x00\x04", 2: b"\x00\x05"})
-    assert ask(device, BROADCAST, protocol1.SYNC_WRITE, params) == []
-    assert [get(device, i, "goal_position") for i in (1, 2)] == [0x400, 0x500]
-
-
 def test_sync_read_is_answered_in_order_up_to_the_first_that_is_silent():
-    device = device_of("sts3215", "sts3215", "sts3215")
+    device = chain_of("sts3215", "sts3215", "sts3215")
     params = feetech.sync_read_params(56, 2, [3, 1, 2])
     assert [frame.servo for frame in ask(device, BROADCAST, feetech.SYNC_READ, params)] == [3, 1, 2]
-    device.kill(1)
+    device.servo(1).dead = True
     assert [frame.servo for frame in ask(device, BROADCAST, feetech.SYNC_READ, params)] == [3]
     device.chain_break = False
     assert [frame.servo for frame in ask(device, BROADCAST, feetech.SYNC_READ, params)] == [3, 2]
-    device.revive(1)
-    with pytest.raises(KeyError, match="no servo with id 9"):
-        device.kill(9)
 
 
 def test_scs_knows_no_sync_read_and_ax_no_bulk_read():
-    device = device_of("scs0009", "ax-12a", "mx-28-1.0")
+    device = chain_of("scs0009", "ax-12a", "mx-28-1.0")
     assert ask(device, BROADCAST, feetech.SYNC_READ, feetech.sync_read_params(56, 2, [1])) == []
     assert ask(device, BROADCAST, dxl1.BULK_READ, dxl1.bulk_read_params([(2, 36, 2)])) == []
     (answer,) = ask(device, BROADCAST, dxl1.BULK_READ, dxl1.bulk_read_params([(3, 36, 2)]))
@@ -188,12 +144,12 @@ def test_scs_knows_no_sync_read_and_ax_no_bulk_read():
 
 
 def test_broadcast_ping_is_a_feetech_matter():
-    device = device_of("sts3215", "ax-12a", "scs0009")
+    device = chain_of("sts3215", "ax-12a", "scs0009")
     assert [frame.servo for frame in ask(device, BROADCAST, protocol1.PING)] == [1, 3]
 
 
 def test_factory_reset_gives_back_id_and_baud():
-    device = device_of("sts3215")
+    device = chain_of("sts3215")
     put(device, 1, "lock", 0)
     assert ask(device, 1, protocol1.WRITE, bytes([5, 9])) == [Frame(1, 0, b"")]  # the old id says yes
     assert ask(device, 1, protocol1.PING) == []
@@ -202,7 +158,7 @@ def test_factory_reset_gives_back_id_and_baud():
 
 
 def test_overload_comes_from_the_motor_and_takes_the_torque():
-    device = device_of("ax-12a")
+    device = chain_of("ax-12a")
     device.servo(1).plant.stuck = True
     put(device, 1, "goal_position", 900)
     (answer,) = ask(device, 1, protocol1.PING, now_s=3.0)
@@ -215,7 +171,7 @@ def test_overload_comes_from_the_motor_and_takes_the_torque():
 
 
 def test_voltage_bit_is_there_as_long_as_the_voltage_is_wrong():
-    device = device_of("sts3215")
+    device = chain_of("sts3215")
     device.servo(1).set_supply(9.5, 0.0)
     assert ask(device, 1, protocol1.PING)[0].code == feetech.VOLTAGE
     assert get(device, 1, "present_voltage") == 95
@@ -224,7 +180,7 @@ def test_voltage_bit_is_there_as_long_as_the_voltage_is_wrong():
 
 
 def test_brown_out_is_silence_and_then_a_start_without_torque():
-    device = device_of("scs0009")
+    device = chain_of("scs0009")
     put(device, 1, "goal_position", 600)
     device.servo(1).set_supply(1.0, 0.5)
     assert ask(device, 1, protocol1.PING, now_s=0.5) == []
@@ -234,7 +190,7 @@ def test_brown_out_is_silence_and_then_a_start_without_torque():
 
 @pytest.mark.parametrize("how", ["torque_enable := 128", "instruction 0x0B"])
 def test_sts_is_calibrated_where_it_stands(how):
-    device = device_of("sts3215", start_ticks=3000)
+    device = chain_of("sts3215", start_ticks=3000)
     if how.startswith("torque"):
         put(device, 1, "torque_enable", feetech.CALIBRATE_HERE)
     else:
@@ -246,24 +202,24 @@ def test_sts_is_calibrated_where_it_stands(how):
 
 
 def test_stored_registers_are_there_at_the_start():
-    device = device_of("sts3215", registers={"homing_offset": 100, "lock": 1}, supply_v=6.0)
+    device = chain_of("sts3215", registers={"homing_offset": 100, "lock": 1}, supply_v=6.0)
     assert (get(device, 1, "homing_offset"), get(device, 1, "present_voltage")) == (100, 60)
     assert get(device, 1, "present_position") == 2048  # where its position stands, offset and all
 
 
 def test_profile_speed_and_acceleration_are_kept():
-    device = device_of("sts3215")
+    device = chain_of("sts3215")
     put(device, 1, "goal_velocity", 100)
     put(device, 1, "goal_position", 3000)
     assert get(device, 1, "present_position", 1.0) == pytest.approx(2048 + 100, abs=10)
-    slow = device_of("mx-28-1.0")
+    slow = chain_of("mx-28-1.0")
     put(slow, 1, "moving_speed", 10)  # 1.14 rpm
     put(slow, 1, "goal_position", 3000)
     assert get(slow, 1, "present_position", 1.0) == pytest.approx(2048 + 1.14 * 4096 / 60, abs=10)
 
 
 def test_where_it_is_does_not_depend_on_who_looked():
-    looked, left = device_of("ax-12a"), device_of("ax-12a")
+    looked, left = chain_of("ax-12a"), chain_of("ax-12a")
     for device in (looked, left):
         device.servo(1).plant.load = 0.2
         put(device, 1, "goal_position", 800)
@@ -273,27 +229,27 @@ def test_where_it_is_does_not_depend_on_who_looked():
 
 
 def test_two_servos_with_one_id_both_answer():
-    device = device_of("ax-12a", "ax-12a")
+    device = chain_of("ax-12a", "ax-12a")
     ask(device, 2, protocol1.WRITE, bytes([3, 1]))
     assert len(ask(device, 1, protocol1.PING)) == 2
 
 
 def test_frame_of_the_other_protocol_is_rubbish():
-    device = device_of("ax-12a")
+    device = chain_of("ax-12a")
     other = bytes.fromhex("FF FF FD 00 01 03 00 01 19 4E")
     assert device.receive(other, BAUD, 0.0) == b""
     assert len(ask(device, 1, protocol1.PING)) == 1
 
 
 def test_unfinished_frame_is_forgotten_after_a_pause():
-    device = device_of("ax-12a")
+    device = chain_of("ax-12a")
     assert device.receive(encode(1, protocol1.READ, b"\x24\x02")[:-1], BAUD, 0.0) == b""
     assert len(ask(device, 1, protocol1.PING, now_s=1.0)) == 1
 
 
 @given(st.lists(st.binary(max_size=80), max_size=10))
 def test_any_bytes_are_survived(chunks):
-    device = device_of("ax-12a", "sts3215", "scs0009")
+    device = chain_of("ax-12a", "sts3215", "scs0009")
     for k, chunk in enumerate(chunks):
         device.receive(b"\xff\xff" + chunk, BAUD, 0.01 * k)
     device.advance(1.0)
@@ -302,7 +258,7 @@ def test_any_bytes_are_survived(chunks):
 
 @given(st.sampled_from(MODELS), st.integers(0, 255), st.binary(min_size=1, max_size=12))
 def test_any_write_is_survived(model, address, data):
-    device = device_of(model)
+    device = chain_of(model)
     device.servos[0].write(address, data, 0.0)
     device.advance(0.2)
     device.servos[0].read(0, 60, 0.3)

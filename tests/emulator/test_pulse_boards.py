@@ -1,25 +1,17 @@
 import pytest
+from emulated_devices import device_of, servos_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.codecs.ssc32 import Move
-from sfms_robot.servo.registers import Table
 
 AA = bytes([maestro.BAUD_INDICATION])
 
 
-def rows(model, channels, baud=9600, start_ticks=None):
-    table = Table.of(load_firmware_map(model))
-    start = table.center_ticks if start_ticks is None else start_ticks
-    return table, [{"id": i, "model": model, "baud": baud, "start_ticks": start} for i in channels]
-
-
 def maestro_board(model="maestro-24", channels=range(6), **more):
     """One that has detected its baud rate."""
-    board = MaestroBoard(*rows(model, channels, **more))
+    board = device_of(*servos_of(model, *channels, **more))
     board.receive(AA, 115200, 0.0)
     return board
 
@@ -33,14 +25,14 @@ def errors(board):
 
 
 def test_maestro_is_deaf_until_it_has_seen_the_baud_byte():
-    board = MaestroBoard(*rows("maestro-24", [0]))
+    board = device_of(*servos_of("maestro-24", 0))
     assert board.receive(maestro.get_errors(), 115200, 0.0) == b""
     assert board.receive(AA + maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
     assert board.receive(maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
 
 
 def test_maestro_takes_the_baud_byte_as_the_start_of_a_pololu_command():
-    board = MaestroBoard(*rows("maestro-24", [0]))
+    board = device_of(*servos_of("maestro-24", 0))
     assert board.receive(maestro.addressed(maestro.get_errors()), 57600, 0.0) == b"\x00\x00"
     assert board.baud == 57600
 
@@ -64,18 +56,18 @@ def test_target_without_a_speed_limit_is_there_at_once_and_the_shaft_follows():
 
 def test_speed_limit_holds_once_pulses_are_on():
     board = maestro_board()
-    board.receive(maestro.set_speed(0, 20) + maestro.set_target(0, 5000), 115200, 0.0)
+    board.receive(bytes([maestro.SET_SPEED, 0]) + maestro.word(20) + maestro.set_target(0, 5000), 115200, 0.0)
     assert position(board, 0, 0.0) == 5000
     board.receive(maestro.set_target(0, 7000), 115200, 0.0)
-    assert board.receive(maestro.get_moving(), 115200, 0.1) == b"\x01"
+    assert board.receive(bytes([maestro.GET_MOVING]), 115200, 0.1) == b"\x01"
     assert position(board, 0, 0.5) == pytest.approx(6000, abs=10)  # 20 x 0.25 us per 10 ms = 2000 ticks/s
     assert position(board, 0, 1.5) == 7000
-    assert board.receive(maestro.get_moving(), 115200, 1.5) == b"\x00"
+    assert board.receive(bytes([maestro.GET_MOVING]), 115200, 1.5) == b"\x00"
 
 
 def test_smallest_acceleration_takes_about_three_seconds_for_a_millisecond_of_pulse():
     board = maestro_board()
-    board.receive(maestro.set_acceleration(0, 1) + maestro.set_target(0, 4000), 115200, 0.0)
+    board.receive(bytes([maestro.SET_ACCELERATION, 0]) + maestro.word(1) + maestro.set_target(0, 4000), 115200, 0.0)
     board.receive(maestro.set_target(0, 8000), 115200, 0.0)
     assert 7900 > position(board, 0, 2.5) > 6000
     assert position(board, 0, 4.0) == 8000
@@ -91,7 +83,7 @@ def test_target_zero_and_going_home_end_the_pulses():
     board = maestro_board()
     board.receive(maestro.set_targets(0, [6000, 6000]) + maestro.set_target(0, maestro.OFF), 115200, 0.0)
     assert (position(board, 0, 0.0), position(board, 1, 0.0)) == (0, 6000)
-    board.receive(maestro.go_home(), 115200, 0.0)
+    board.receive(bytes([maestro.GO_HOME]), 115200, 0.0)
     assert position(board, 1, 0.0) == 0
 
 
@@ -111,7 +103,7 @@ def test_nonsense_is_a_protocol_error_and_reading_it_clears_it(command):
 
 def test_mini_ssc_neutral_is_the_middle():
     board = maestro_board()
-    board.receive(maestro.mini_ssc(3, 127) + maestro.mini_ssc(4, 0), 115200, 0.0)
+    board.receive(bytes([maestro.MINI_SSC, 3, 127, maestro.MINI_SSC, 4, 0]), 115200, 0.0)
     assert position(board, 3, 0.0) == 6000
     assert position(board, 4, 0.0) == pytest.approx((1500 - 476.25) * 4)
 
@@ -124,11 +116,11 @@ def test_shaft_without_pulses_stays_where_it_is():
 
 def test_board_is_unplugged_when_every_channel_is_dead():
     board = maestro_board(channels=[0, 1])
-    board.kill(0)
+    board.servo(0).dead = True
     assert errors(board) == 0
-    board.kill(1)
+    board.servo(1).dead = True
     assert board.receive(maestro.get_errors(), 115200, 0.0) == b""
-    board.revive(0)
+    board.servo(0).dead = False
     assert errors(board) == 0
 
 
@@ -138,7 +130,7 @@ def test_channel_without_a_servo_is_nobody():
 
 
 def ssc_board(baud=115200):
-    return Ssc32Board(*rows("ssc-32", range(8), baud))
+    return device_of(*servos_of("ssc-32", *range(8), baud=baud))
 
 
 def pulses(board, channels, now_s):
@@ -181,8 +173,7 @@ def test_ssc32_hears_no_other_baud_rate():
 @given(st.lists(st.binary(max_size=64), max_size=20), st.sampled_from(["maestro-24", "maestro-6", "ssc-32"]))
 @settings(deadline=None)
 def test_rubbish_moves_no_channel_out_of_its_limits(chunks, model):
-    kind = Ssc32Board if model == "ssc-32" else MaestroBoard
-    board = kind(*rows(model, range(6)))
+    board = device_of(*servos_of(model, *range(6), baud=9600))
     now_s = 0.0
     for chunk in [AA, *chunks]:
         now_s += 0.01

@@ -1,10 +1,13 @@
 """Tables of tokenizers: takes, folders, scores, rows, what they need and what they say."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sfms_robot import config
 from sfms_robot.config import parse
@@ -177,3 +180,13 @@ def test_amplified_windows_keep_their_shape_and_their_best_masks() -> None:
     assert float(gain.min()) > 0 and float(gain.std()) > 0.05
     member = torch.eye(3)
     assert torch.equal(place_exact(batch, [5] * 3, member), place_exact(louder, [5] * 3, member))
+
+
+@given(st.integers(1, 60), st.data())
+def test_bits_are_the_logarithm_of_how_many_codes_there_are(frames, data):
+    k = data.draw(st.integers(0, frames))
+    codes = data.draw(st.integers(1, 1024))
+    bits = compared_tokenizer.keyframe_bits(frames, k, codes)
+    assert 2**bits == pytest.approx(math.comb(frames, k) * codes**k, rel=1e-6)
+    with pytest.raises(ValueError, match="9 keyframes in 8"):
+        compared_tokenizer.keyframe_bits(8, 9, 2)

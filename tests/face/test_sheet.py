@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from motion_rows import motion
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.contact_sheet import pick_instants, render_sheet
@@ -12,13 +13,6 @@ from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX
 @pytest.fixture(scope="module")
 def human():
     return load_human()
-
-
-def motion(**channels):
-    row = np.zeros(58, dtype=np.float32)
-    for name, value in channels.items():
-        row[CHANNEL_INDEX[name]] = value
-    return row
 
 
 def moved(human, **channels):

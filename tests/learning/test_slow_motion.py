@@ -28,7 +28,7 @@ def test_sway_is_found_under_a_nod_and_the_nod_is_left_whole():
 
 
 def test_without_events_it_is_a_low_pass():
-    quick = np.sin(2 * np.pi * 2.0 * TIMES_S)[:, None].astype(np.float32)
+    quick = np.sin(2 * np.pi * 3.0 * TIMES_S)[:, None].astype(np.float32)
     assert np.abs(slow_part(quick, [])[50:-50]).max() < 0.02
     slow = SWAY[:, None].astype(np.float32)
     np.testing.assert_allclose(slow_part(slow, [])[50:-50], slow[50:-50], atol=2e-4)

@@ -17,6 +17,7 @@ from sfms_robot.learning.corpus import GAZE, without_gaze
 from sfms_robot.learning.sfms import predictor_trainer, tokenizer_trainer
 from sfms_robot.learning.sfms.features import context, fit_scales, frames_of, gather
 from sfms_robot.learning.sfms.masks import batches
+from sfms_robot.learning.sfms.missed_keyframes import without_last_keyframes
 from sfms_robot.learning.sfms.predictor_trainer import augment, starts_with_events
 from sfms_robot.learning.sfms.tokens import held_tokens, place_all, tokenise
 from sfms_robot.listeners import sfms
@@ -40,7 +41,8 @@ def settings(**predictor) -> config.Training:
             "tokenizer_width": 16, "predictor_width": 16, "predictor_layers": 1, "heads": 2, "hop": 2,
         },
         "tokenizer": {"steps": 150, "batch": 8, "learning_rate": 5e-3},
-        "predictor": {"steps": 200, "batch": 16, "learning_rate": 5e-3, "event_windows": 0.5} | predictor,
+        "predictor": {"steps": 200, "batch": 16, "learning_rate": 5e-3, "event_windows": 0.5,
+                      "missed_keyframes": 0.2} | predictor,
     }  # fmt: skip
     return config.parse(config.Training, raw, "tiny")
 
@@ -180,6 +182,21 @@ def test_a_stream_that_has_just_begun_was_told_of_nothing_before():
     for row in range(6):
         begun = (after.tokens[row, :40] != 5).any(-1)
         assert not after.control[row, :40][~begun].any() and after.control[row, 40:].all()
+
+
+def test_keyframes_are_missed_only_where_that_is_worth_one_and_are_made_up_for_at_once():
+    tokens = torch.zeros(2, 48, 2).long()
+    tokens[:, 5], tokens[:, 38, 0], tokens[:, 39, 1] = 1, 7, 3
+    dense = torch.full_like(tokens, 9)
+    motion = torch.zeros(2, 48, 4)
+    motion[0, 38:, :2] = 2.0  # of the first group, in the first window: it has moved since frame 5
+    member = torch.tensor([[1.0, 1, 0, 0], [0, 0, 1, 1]])
+    arguments = dense, motion, torch.tensor([42, 42]), member, torch.tensor([1.0, 1.0])
+    after = without_last_keyframes(tokens, *arguments, 1.0, torch.Generator())
+    wanted = tokens.clone()
+    wanted[0, 38, 0], wanted[0, 42, 0] = 0, 9
+    assert torch.equal(after, wanted)
+    assert torch.equal(without_last_keyframes(tokens, *arguments, 0.0, torch.Generator()), tokens)
 
 
 @pytest.mark.slow

@@ -2,36 +2,39 @@
 
 import numpy as np
 import pytest
+from motion_rows import motions
 
+from sfms_robot.app.session import build_motion
 from sfms_robot.config import load_head
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan
+from sfms_robot.corpora.compose.motions import load
+from sfms_robot.data import data_dir
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Plan
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
-from sfms_robot.motion.timeline import PlanTimeline
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.loop import difference
 
 TICK_S, HORIZON, HOP, LATENCY_TICKS = 0.01, 8, 4, 2
 HEAD = load_head("face28")
-MAPPING, LIMITER, TIMELINE = HeadRetargeter(HEAD), JerkLimiter(JointLimits.of(HEAD), TICK_S), PlanTimeline(TICK_S)
-LEADS_S = np.array([joint.lag_ms / 1000 for joint in HEAD.joints.values()])
+PARTS = build_motion(HEAD, 1 / TICK_S)
 JOINTS = list(HEAD.joints)
+PITCH, LID = JOINTS.index("neck_pitch"), JOINTS.index("lid_left")
 
 
 def played(frames) -> tuple[np.ndarray, np.ndarray]:
     """Joint angles asked for and sent, (T, J) each, for a recording at 25 fps cut into plans."""
-    rest = MAPPING.angles(np.zeros(MOTION_DIM, np.float32))
-    timeline, limiter = TIMELINE.start(), LIMITER.start(rest)
-    before, here, asked, sent = rest, rest, [], []
+    timeline, memory = PARTS.timeline.start(), PARTS.retargeter.start()
+    limiter = PARTS.limiter.start(PARTS.rest_rad)
+    before = here = PARTS.rest_rad
+    asked, sent = [], []
     for tick in range(4 * (len(frames) - HORIZON - 1)):
         step, rest_ticks = divmod(tick - LATENCY_TICKS, 4)
         if rest_ticks == 0 and step >= 0 and step % HOP == 0:
             times_s = FRAME_S * np.arange(step + 1, step + 1 + HORIZON)
-            rows = frames[step + 1 : step + 1 + HORIZON].astype(np.float32)
-            timeline = TIMELINE.accept(Plan(step * FRAME_S, times_s, rows), timeline)
+            rows = frames[step + 1 : step + 1 + HORIZON]
+            timeline = PARTS.timeline.accept(Plan(step * FRAME_S, times_s, rows), timeline)
         now_s = tick * TICK_S
-        motion, timeline = TIMELINE.sample(now_s + LEADS_S + TICK_S, now_s, timeline)
-        ahead = MAPPING.angles(motion)
-        goals, limiter = LIMITER.step(difference(before, here, ahead, TICK_S), limiter)
+        faces, timeline = PARTS.timeline.sample(now_s + PARTS.leads_s + TICK_S, now_s, timeline)
+        ahead, memory = PARTS.retargeter.step(faces, memory)
+        goals, limiter = PARTS.limiter.step(difference(before, here, ahead, TICK_S), limiter)
         asked.append(here)
         sent.append(goals)
         before, here = here, ahead
@@ -47,23 +50,56 @@ def test_a_nod_arrives_on_time_with_hardly_more_jerk_than_the_nod_itself(nods_hz
     def nod(t):
         return np.radians(size_deg / 2) * np.sin(2 * np.pi * nods_hz * t)
 
-    frames = np.zeros((110, MOTION_DIM))
-    frames[:, CHANNEL_INDEX["pitch"]] = nod(FRAME_S * np.arange(110))
-    _, sent = played(frames)
-    pitch = sent[100:, JOINTS.index("neck_pitch")]
-    true = nod(TICK_S * np.arange(100, len(sent)) + LEADS_S[JOINTS.index("neck_pitch")])
+    _, sent = played(motions(110, pitch=nod(FRAME_S * np.arange(110))))
+    pitch = sent[100:, PITCH]
+    true = nod(TICK_S * np.arange(100, len(sent)) + PARTS.leads_s[PITCH])
     assert np.abs(pitch - true).max() < np.radians(0.05)
     assert rms_jerk(pitch) < 1.5 * rms_jerk(true)
 
 
 @pytest.mark.parametrize("closed_frames", [1, 2, 3])
 def test_a_blink_closes_the_lid_although_it_is_faster_than_the_servo(closed_frames):
-    frames = np.zeros((40, MOTION_DIM))
-    frames[18 : 18 + closed_frames, CHANNEL_INDEX["eyeBlinkLeft"]] = 1.0
-    asked, sent = played(frames)
-    lid = JOINTS.index("lid_left")
+    blink = np.zeros(40)
+    blink[18 : 18 + closed_frames] = 1.0
+    asked, sent = played(motions(40, eyeBlinkLeft=blink))
     closed = HEAD.joints["lid_left"].max_rad
-    assert asked[:, lid].max() == pytest.approx(closed)
-    assert sent[:, lid].max() > (0.9 if closed_frames == 1 else 0.99) * closed
-    assert sent[-1, lid] == pytest.approx(HEAD.joints["lid_left"].rest_rad, abs=1e-9)
+    assert asked[:, LID].max() == pytest.approx(closed)
+    assert sent[:, LID].max() > (0.9 if closed_frames == 1 else 0.99) * closed
+    assert sent[-1, LID] == pytest.approx(HEAD.joints["lid_left"].rest_rad, abs=1e-9)
     assert not sent[:, JOINTS.index("lid_right")].any()
+
+
+def recorded_nods() -> list[np.ndarray]:
+    """Pitch [rad] of recorded heads, 25 a second, from rest and to it."""
+    clips = [
+        np.asarray(clip)[:, CHANNEL_INDEX["pitch"]]
+        for motion in load(data_dir("sim") / "listeners" / "motions.npz").values()
+        for clip in motion.heads
+        if len(clip) >= 25
+    ]
+    fades = [np.minimum(1.0, np.minimum(np.arange(len(c)), np.arange(len(c))[::-1]) / 5) for c in clips]
+    return [np.pad((clip - clip[0]) * fade, 12) for clip, fade in zip(clips, fades, strict=True)]
+
+
+def test_recorded_nods_are_commanded_with_at_most_one_and_a_half_times_the_jerk_asked_for():
+    runs = [played(motions(len(nod), pitch=nod)) for nod in recorded_nods()]
+    asked = np.concatenate([wanted[:, PITCH] for wanted, _ in runs])
+    sent = np.concatenate([commanded[:, PITCH] for _, commanded in runs])
+    assert len(runs) >= 2 and np.ptp(asked) > np.radians(5)
+    assert rms_jerk(sent) <= 1.5 * rms_jerk(asked)
+
+
+@pytest.mark.parametrize("from_shut_to_open", [False, True])
+def test_a_lid_that_can_closes_forty_degrees_in_under_80_ms(from_shut_to_open):
+    """900 deg/s; the other limits are those of the shipped face's lids."""
+    lid = HEAD.limits["lid"]
+    rates = np.radians([900.0, lid.acceleration_deg_s2, lid.jerk_deg_s3])
+    span = np.radians(40.0)
+    limiter = JerkLimiter(JointLimits(np.zeros(1), np.full(1, span), *rates[:, None]), TICK_S)
+    start, end = (span, 0.0) if from_shut_to_open else (0.0, span)
+    state, ticks = limiter.start(np.array([start])), 0
+    angle = start
+    while abs(angle - end) > np.radians(0.5):
+        goals, state = limiter.step(np.array([[end], [0.0], [0.0]]), state)
+        angle, ticks = float(goals[0]), ticks + 1
+    assert ticks * TICK_S < 0.080

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.app.wiring import calibration_of, firmware_maps
+from sfms_robot.config import Head, load_head
 from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.motion.audit import Audit
-from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.chase import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
@@ -38,10 +38,7 @@ class Law:
 
     def __init__(self, head: Head, chase) -> None:
         joints = head.joints
-        maps = {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
-        calibration = Calibration(
-            joints, np.array([maps[joint.model].ticks_per_revolution for joint in joints.values()])
-        )
+        maps, calibration = firmware_maps(joints), calibration_of(joints)
         servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in joints.items()]
         self.limits = JointLimits.of(head)
         self.count = len(servos)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from motion_rows import motions
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, SHAPES, Plan
 from sfms_robot.motion.timeline import EASE_S, HISTORY, LEAD_S, STALL_S, PlanTimeline
@@ -14,13 +15,6 @@ TIMELINE = PlanTimeline(TICK_S)
 def plan(made_at_s: float, frames) -> Plan:
     frames = np.asarray(frames, np.float32)
     return Plan(made_at_s, made_at_s + FRAME_S * np.arange(1, len(frames) + 1), frames)
-
-
-def faces(count: int, **channels) -> np.ndarray:
-    frames = np.zeros((count, MOTION_DIM), np.float32)
-    for name, values in channels.items():
-        frames[:, CHANNEL_INDEX[name]] = values
-    return frames
 
 
 def cut(frames, start: int, horizon: int = 8) -> Plan:
@@ -79,7 +73,7 @@ def test_a_nod_is_played_without_lag_or_added_jerk(lead_s):
     def nod(t):
         return np.radians(2.5) * np.sin(2 * np.pi * 2.0 * t)
 
-    frames = faces(120, pitch=nod(FRAME_S * np.arange(120)))
+    frames = motions(120, pitch=nod(FRAME_S * np.arange(120)))
     times, rows, _ = ran(frames, lead_s)
     played, true = rows[50:, PITCH].astype(np.float64), nod(times[50:])
     assert np.abs(played - true).max() < np.radians(0.002)
@@ -92,14 +86,14 @@ def test_a_nod_is_played_without_lag_or_added_jerk(lead_s):
 
 @pytest.mark.parametrize("phase_s", np.arange(0, FRAME_S, 0.003))
 def test_a_blink_of_one_frame_reaches_its_peak_at_a_tick_wherever_the_ticks_fall(phase_s):
-    frames = faces(30, eyeBlinkLeft=[1.0 if k == 15 else 0.0 for k in range(30)])
+    frames = motions(30, eyeBlinkLeft=[1.0 if k == 15 else 0.0 for k in range(30)])
     _, rows, _ = ran(frames, lead_s=phase_s)
     assert rows[:, BLINK].max() == pytest.approx(1.0)
     assert rows[:, BLINK].min() == 0.0
 
 
 def test_a_newer_plan_takes_over_within_two_frames():
-    old, new = faces(8, pitch=0.0, mouthSmileLeft=0.0), faces(8, pitch=0.3, mouthSmileLeft=0.9)
+    old, new = motions(8, pitch=0.0, mouthSmileLeft=0.0), motions(8, pitch=0.3, mouthSmileLeft=0.9)
     state = TIMELINE.accept(plan(0.0, old), TIMELINE.start())
     state = TIMELINE.accept(plan(0.08, new), state)
     first, second, third = at(state, 0.12, 0.16, 0.20)
@@ -108,7 +102,7 @@ def test_a_newer_plan_takes_over_within_two_frames():
 
 
 def test_blinks_are_joined_by_maximum():
-    shut, open_ = faces(8, eyeBlinkLeft=1.0), faces(8)
+    shut, open_ = motions(8, eyeBlinkLeft=1.0), motions(8)
     for one, other in ((shut, open_), (open_, shut)):
         state = TIMELINE.accept(plan(0.0, one), TIMELINE.start())
         state = TIMELINE.accept(plan(0.12, other), state)
@@ -142,7 +136,7 @@ def test_speed_is_continuous_however_plans_disagree(horizon, hop, lead_s):
 
 
 def test_past_the_horizon_it_goes_on_for_one_frame_then_holds_and_counts():
-    state = TIMELINE.accept(plan(0.0, faces(8, pitch=0.01 * np.arange(8))), TIMELINE.start())
+    state = TIMELINE.accept(plan(0.0, motions(8, pitch=0.01 * np.arange(8))), TIMELINE.start())
     rows, after = TIMELINE.sample(np.array([0.32, 0.36]), 0.3, state)
     assert rows[:, PITCH] == pytest.approx([0.07, 0.08]) and after.held == 0
     rows, after = TIMELINE.sample(np.array([0.40, 0.45]), 0.4, after)
@@ -150,7 +144,7 @@ def test_past_the_horizon_it_goes_on_for_one_frame_then_holds_and_counts():
 
 
 def test_without_plans_the_face_eases_to_neutral_and_the_next_plan_is_taken_up():
-    smile = faces(8, mouthSmileLeft=1.0, pitch=0.2)
+    smile = motions(8, mouthSmileLeft=1.0, pitch=0.2)
     state = TIMELINE.accept(plan(0.0, smile), TIMELINE.start())
     assert at(state, STALL_S)[0, SMILE] == pytest.approx(1.0)
     fading = at(state, *(STALL_S + np.linspace(0, EASE_S, 50)))[:, SMILE]
@@ -163,14 +157,14 @@ def test_without_plans_the_face_eases_to_neutral_and_the_next_plan_is_taken_up()
 
 
 def test_plans_of_one_frame_are_played_one_frame_late():
-    ramp = faces(40, pitch=0.01 * np.arange(40))
+    ramp = motions(40, pitch=0.01 * np.arange(40))
     times, rows, state = ran(ramp, horizon=1, hop=1)
     assert rows[20:, PITCH] == pytest.approx(0.01 * (times[20:] / FRAME_S - 1), abs=1e-5)
     assert state.held == state.late == 0
 
 
 def test_plans_that_always_come_late_still_move_the_face():
-    frames = faces(80, mouthSmileLeft=[k >= 20 for k in range(80)])
+    frames = motions(80, mouthSmileLeft=[k >= 20 for k in range(80)])
     _, rows, state = ran(frames, lead_s=0.2, horizon=1, hop=1, latency_ticks=8)
     assert rows[-1, SMILE] == pytest.approx(1.0) and state.refused == 0
 
@@ -178,18 +172,18 @@ def test_plans_that_always_come_late_still_move_the_face():
 @pytest.mark.parametrize(
     "bad",
     [
-        plan(0.2, faces(8, pitch=np.nan)),
-        plan(0.2, faces(8, eyeBlinkLeft=np.inf)),
+        plan(0.2, motions(8, pitch=np.nan)),
+        plan(0.2, motions(8, eyeBlinkLeft=np.inf)),
         plan(0.2, np.zeros((8, 57))),
         plan(0.2, np.zeros((0, 58))),
-        Plan(0.2, np.array([0.28, 0.24]), faces(2)),
-        Plan(np.nan, np.array([0.24]), faces(1)),
-        plan(0.0, faces(8)),
+        Plan(0.2, np.array([0.28, 0.24]), motions(2)),
+        Plan(np.nan, np.array([0.24]), motions(1)),
+        plan(0.0, motions(8)),
     ],
     ids=["NaN", "inf", "narrow", "empty", "time running backwards", "no time", "older than the last"],
 )
 def test_a_plan_that_cannot_be_used_is_counted_and_changes_nothing(bad):
-    state = TIMELINE.accept(plan(0.1, faces(8, pitch=0.1)), TIMELINE.start())
+    state = TIMELINE.accept(plan(0.1, motions(8, pitch=0.1)), TIMELINE.start())
     after = TIMELINE.accept(bad, state)
     assert after.refused == 1 and after.curve is state.curve
 
@@ -197,13 +191,13 @@ def test_a_plan_that_cannot_be_used_is_counted_and_changes_nothing(bad):
 def test_the_jaw_pose_replaces_jaw_open():
     jaw = np.zeros((8, 3), np.float32)
     jaw[:, 1] = np.radians(12.5)
-    with_jaw = Plan(0.0, FRAME_S * np.arange(1, 9), faces(8, jawOpen=0.9), jaw)
+    with_jaw = Plan(0.0, FRAME_S * np.arange(1, 9), motions(8, jawOpen=0.9), jaw)
     state = TIMELINE.accept(with_jaw, TIMELINE.start())
     assert at(state, 0.2)[0, CHANNEL_INDEX["jawOpen"]] == pytest.approx(0.5)
 
 
 def test_the_state_stays_small():
-    _, _, state = ran(faces(200, pitch=0.1), hop=1)
+    _, _, state = ran(motions(200, pitch=0.1), hop=1)
     assert len(state.curve.knots.times_s) <= HISTORY + 12
 
 
@@ -217,7 +211,7 @@ def horizon_left_s(horizon: int, hop: int, latency_s: float) -> float:
 
 
 def test_the_horizon_left_is_enough_to_never_hold():
-    frames = faces(60, pitch=0.1)
+    frames = motions(60, pitch=0.1)
     for horizon, hop in ((8, 4), (8, 7), (1, 1)):
         lead_s = horizon_left_s(horizon, hop, latency_s=0.02)
         _, _, state = ran(frames, lead_s - TICK_S, horizon, hop, latency_ticks=2)
@@ -258,6 +252,6 @@ def test_a_listener_that_hangs_for_a_while_gets_its_lead_back():
     for tick in range(3000):
         now_s = tick * TICK_S
         if tick % 4 == 0 and not 300 < tick < 600:
-            state = TIMELINE.accept(plan(now_s, faces(8)), state)
+            state = TIMELINE.accept(plan(now_s, motions(8)), state)
         _, state = TIMELINE.sample(np.array([now_s]), now_s, state)
     assert TIMELINE.lead_limit_s(state) == LEAD_S

@@ -2,21 +2,15 @@
 
 import numpy as np
 import pytest
+from motion_rows import motion
 
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
+from sfms_robot.frames import CHANNELS
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
-
-
-def motion(**channels: float) -> np.ndarray:
-    out = np.zeros(MOTION_DIM, np.float32)
-    for name, size in channels.items():
-        out[CHANNEL_INDEX[name]] = size
-    return out
 
 
 @pytest.mark.parametrize("name", HEADS)

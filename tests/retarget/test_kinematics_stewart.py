@@ -1,12 +1,10 @@
 """The six-legged platform of Reachy Mini: inverse in closed form, forward by Newton, one against the other."""
 
-import csv
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from published import rows
 
 from sfms_robot.config import load_head
 from sfms_robot.config.kinematics import StewartPlatform
@@ -30,12 +28,7 @@ def in_reach(seed: int, count: int = 400) -> np.ndarray:
     return tried[NECK.reachable(tried)]
 
 
-def vectors() -> list[dict[str, str]]:
-    with (Path(__file__).parents[1] / "assets" / "reachy_mini_ik.csv").open() as stream:
-        return list(csv.DictReader(line for line in stream if not line.startswith("#")))
-
-
-@pytest.mark.parametrize("row", vectors(), ids=lambda row: row["name"])
+@pytest.mark.parametrize("row", rows("reachy_mini_ik.csv"), ids=lambda row: row["name"])
 def test_the_inverse_is_that_of_the_published_geometry(row):
     wanted = np.array([float(row[key]) for key in ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")])
     angles = [float(row[f"q{leg}_rad"]) for leg in range(1, 7)]

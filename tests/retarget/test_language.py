@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from motion_rows import motion
 
 from sfms_robot.config import Expression, Head, parse
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
+from sfms_robot.frames import CHANNELS, MOTION_DIM
 from sfms_robot.retarget.channel_mapping import ChannelMapping
 
 EXTREMES = np.array([0.0, 1.0, -1.0, 1e-30, 7.0, -1e4, 3e38, -3e38], np.float32)
@@ -29,11 +30,8 @@ def head_of(joints, **parts) -> Head:
 
 def shown(head, knobs=None, **channels):
     """Angles in tenths of the range of 10 degrees: joint units."""
-    motion = np.zeros(MOTION_DIM, np.float32)
-    for name, size in channels.items():
-        motion[CHANNEL_INDEX[name]] = size
     mapping = ChannelMapping(head)
-    return (np.degrees(mapping.angles(motion, knobs)) / 10).tolist()
+    return (np.degrees(mapping.angles(motion(**channels), knobs)) / 10).tolist()
 
 
 def test_a_shared_expression_is_what_it_says_wherever_it_is_used():

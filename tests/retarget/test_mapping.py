@@ -111,8 +111,3 @@ def test_what_is_not_finite_is_refused_by_name(bad):
 def test_a_wrong_shape_is_refused(shape):
     with pytest.raises(ValueError, match="not"):
         ChannelMapping(head_of(Expression(channel="jawOpen"))).angles(np.zeros(shape, np.float32))
-
-
-def test_blind_channels_are_those_that_nothing_follows():
-    mapping = ChannelMapping(head_of(Expression(max=(Expression(channel="jawOpen"), Expression(channel="roll"))), None))
-    assert set(CHANNELS) - set(mapping.blind_channels) == {"jawOpen", "roll"}

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from motion_rows import motion
 
 from sfms_robot.config import load_head
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget.channel_mapping import ChannelMapping
 
 HEAD = load_head("reachy_mini")
@@ -14,10 +14,7 @@ REST_RAD = np.array([joint.rest_rad for joint in HEAD.joints.values()])
 
 def raised_deg(**channels: float) -> tuple[float, float]:
     """How far the right and the left antenna go up from rest."""
-    motion = np.zeros(MOTION_DIM, np.float32)
-    for name, size in channels.items():
-        motion[CHANNEL_INDEX[name]] = size
-    turned = np.degrees(MAPPING.angles(motion) - REST_RAD)
+    turned = np.degrees(MAPPING.angles(motion(**channels)) - REST_RAD)
     assert turned[:7] == pytest.approx(np.zeros(7))  # body and legs follow the head pose, not the face
     right, left = turned[7:]
     return float(right), -float(left)

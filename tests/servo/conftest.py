@@ -6,57 +6,28 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from chain_rig import bus_of
+from emulated_port import BAUD
 from hypothesis import settings
+from virtual_time import Time
 
-from sfms_robot.config import Bus, Faults, Safety, load_firmware_map
+from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
-from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import VirtualTimePort
 
 settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure
 settings.load_profile("no_stopwatch")
-
-RAD_PER_TICK = 2 * np.pi / 4096
-
-
-class Linear:
-    """Middle of the servo is 0 rad; angles outside +-limit give the ticks of the limit."""
-
-    def __init__(self, limit_rad: float, center_ticks: int = 2048, rad_per_tick: float = RAD_PER_TICK):
-        self.limit_rad = limit_rad
-        self.center_ticks = center_ticks
-        self.rad_per_tick = rad_per_tick
-
-    def to_ticks(self, angles_rad):
-        inside = np.clip(angles_rad, -self.limit_rad, self.limit_rad)
-        return np.rint(self.center_ticks + inside / self.rad_per_tick).astype(np.int64)
-
-    def to_rad(self, ticks):
-        return (ticks - self.center_ticks) * self.rad_per_tick
-
-
-@dataclass
-class Time:
-    """Virtual time: moves when told."""
-
-    t: float = 0.0
-
-    def now_s(self) -> float:
-        return self.t
-
-    def wait_until(self, time_s: float) -> None:
-        self.t = max(self.t, time_s)
 
 
 @dataclass
 class Rig:
     chain: Chain
     clock: Time
-    bus: Dynamixel2Bus
     count: int
     baud: int
+    bus: Dynamixel2Bus | None = None
 
     def port(self) -> VirtualTimePort:
         return VirtualTimePort(self.chain.device, self.chain.control, self.baud, self.clock)
@@ -91,41 +62,34 @@ class Rig:
                 return self.clock.t - began_s, readings
         raise AssertionError(f"not within {limit_s} s")
 
+    def until_all_back(self, goals_rad, limit_s: float):
+        """Ticks until every joint has rejoined."""
+        back: set[str] = set()
 
-LIMIT_RAD = 1.0
+        def all_back(readings) -> bool:
+            back.update(joint for joint, r in readings.items() if r.rejoined)
+            return len(back) == self.count
+
+        self.until(goals_rad, all_back, limit_s)
 
 
 @contextmanager
 def rig_of(
-    servos: Sequence[EmulatedServo],
-    expected: Sequence[int] = (),
-    baud: int = 1_000_000,
-    firmware_map=None,
-    safety: Safety | None = None,
-    faults: Faults | None = None,
-    **config,
+    servos: Sequence[EmulatedServo], expected: Sequence[int] = (), firmware_map=None, baud: int = BAUD, **more
 ) -> Iterator[Rig]:
     """`expected`, `firmware_map`: ids and model that the head names; those plugged in unless told otherwise.
 
-    `config`: of the bus, as in a head's file.
+    `more`: as for `bus_of`.
     """
-    table = firmware_map or load_firmware_map("xl330-m288")
     ids = expected or [servo.id for servo in servos]
+    maps = [firmware_map or load_firmware_map("xl330-m288")] * len(ids)
     with launch(servos, virtual=True) as chain:
-        clock = Time()
-        bus = Dynamixel2Bus(
-            "face",
-            [BusServo(f"joint{i}", i, table, -LIMIT_RAD, LIMIT_RAD, safety or Safety()) for i in ids],
-            Linear(LIMIT_RAD, table.center_ticks, 2 * np.pi / table.ticks_per_revolution),
-            lambda: VirtualTimePort(chain.device, chain.control, baud, clock),
-            baud,
-            config=Bus(family="dynamixel", baud=baud, **config),
-            faults=faults,
-        )
+        rig = Rig(chain, Time(), len(ids), baud)
+        rig.bus = bus_of(maps, ids, rig.port, baud=baud, **more)
         try:
-            yield Rig(chain, clock, bus, len(ids), baud)
+            yield rig
         finally:
-            bus.close()
+            rig.bus.close()
 
 
 @pytest.fixture
@@ -139,8 +103,3 @@ def rig() -> Iterator[Rig]:
     starts = [1900, 2048, 2300, 2100]
     with rig_of([EmulatedServo(i + 1, start_ticks=ticks) for i, ticks in enumerate(starts)]) as rig:
         yield rig
-
-
-@pytest.fixture
-def linear():
-    return Linear

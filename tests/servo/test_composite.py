@@ -1,24 +1,20 @@
 import threading
-import time
 
 import numpy as np
 import pytest
+from chain_rig import bus_of
+from emulated_port import BAUD
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import Reading
 from sfms_robot.ports import STOP_S
+from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.absent_bus import AbsentBus
-from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import SerialPort
-
-
-class Monotonic:
-    def now_s(self) -> float:
-        return time.monotonic()
 
 
 def test_two_buses_answer_as_one_in_the_order_of_the_head(make_rig):
@@ -56,17 +52,13 @@ def test_bus_that_fails_to_connect_closes_the_others(make_rig):
         good.bus.connect()  # its port is free again
 
 
-class Gate:
-    """A bus whose write waits until somebody opens it: a slow wire, without a stopwatch."""
+class Steady:
+    """A bus in this process that works until it is told to fail."""
 
-    capabilities = {"slow": frozenset({"torque"})}
-    joints = ("slow",)
-
-    def __init__(self):
-        self.open = threading.Event()
-        self.begun = threading.Event()
-        self.written = []
-        self.refuse = False
+    def __init__(self, joint, failing_with=None):
+        self.joints, self.capabilities = (joint,), {joint: frozenset({"torque"})}
+        self.failing_with = failing_with
+        self.written, self.calls = [], []
 
     def connect(self): ...
 
@@ -74,18 +66,18 @@ class Gate:
         return np.zeros(len(joints))
 
     def write(self, goals_rad, now_s):
-        if self.refuse:
-            raise ValueError("goal of slow is not in range")
-        self.begun.set()
-        self.open.wait(30.0)
         self.written.append((float(goals_rad[0]), now_s))
 
     def poll(self, now_s):
-        return {"slow": Reading(0.5, 0.0, rejoined=len(self.written) == 1)}
+        if self.failing_with is not None:
+            raise self.failing_with
+        return {self.joints[0]: Reading(0.1, 0.0)}
 
-    def torque_off(self, policy): ...
+    def torque_off(self, policy):
+        self.calls.append(("torque_off", policy))
 
-    def stop(self, policy, within_s=STOP_S): ...
+    def stop(self, policy, within_s=STOP_S):
+        self.calls.append(("stop", policy))
 
     def close(self): ...
 
@@ -93,20 +85,35 @@ class Gate:
         return {"writes": len(self.written)}
 
 
-def test_slow_bus_does_not_hold_up_the_others_and_gets_the_newest_goals(linear):
-    slow, clock = Gate(), Monotonic()
+class Gate(Steady):
+    """A bus whose write waits until somebody opens it: a slow wire, without a stopwatch."""
+
+    def __init__(self):
+        super().__init__("slow")
+        self.open = threading.Event()
+        self.begun = threading.Event()
+        self.refuse = False
+
+    def write(self, goals_rad, now_s):
+        if self.refuse:
+            raise ValueError("goal of slow is not in range")
+        self.begun.set()
+        self.open.wait(30.0)
+        super().write(goals_rad, now_s)
+
+    def poll(self, now_s):
+        return {"slow": Reading(0.5, 0.0, rejoined=len(self.written) == 1)}
+
+
+def test_slow_bus_does_not_hold_up_the_others_and_gets_the_newest_goals():
+    slow = Gate()
     with launch([EmulatedServo(1)]) as chain:
-        fast = Dynamixel2Bus(
-            "fast",
-            [BusServo("quick", 1, load_firmware_map("xl330-m288"), -1.0, 1.0)],
-            linear(1.0),
-            lambda: SerialPort(chain.device, 1_000_000, clock),
-            1_000_000,
-            read_deadline_s=1.0,
-        )
-        bus = CompositeBus({"slow": slow, "fast": fast}, ["slow", "quick"], {"slow": 1000.0, "fast": 1000.0})
+        port = chain.device, BAUD, RealClock()
+        maps = [load_firmware_map("xl330-m288")]
+        fast = bus_of(maps, [1], lambda: SerialPort(*port), read_deadline_s=1.0)
+        bus = CompositeBus({"slow": slow, "fast": fast}, ["slow", "joint1"], {"slow": 1000.0, "fast": 1000.0})
         bus.connect()
-        bus.enable(["slow", "quick"])
+        bus.enable(["slow", "joint1"])
         goals = np.array([0.0, 0.0])
         bus.write(goals, 0.0)
         assert slow.begun.wait(30.0)
@@ -161,39 +168,6 @@ def test_goal_that_is_not_finite_reaches_no_thread(bad):
         bus.write(np.array([bad]), 0.0)
     bus.close()
     assert slow.written == []
-
-
-class Steady:
-    """A bus in this process that works until it is told to fail."""
-
-    def __init__(self, joint, failing_with=None):
-        self.joints, self.capabilities = (joint,), {joint: frozenset({"torque"})}
-        self.failing_with = failing_with
-        self.written, self.calls = [], []
-
-    def connect(self): ...
-
-    def enable(self, joints):
-        return np.zeros(len(joints))
-
-    def write(self, goals_rad, now_s):
-        self.written.append(now_s)
-
-    def poll(self, now_s):
-        if self.failing_with is not None:
-            raise self.failing_with
-        return {self.joints[0]: Reading(0.1, 0.0)}
-
-    def torque_off(self, policy):
-        self.calls.append(("torque_off", policy))
-
-    def stop(self, policy, within_s=STOP_S):
-        self.calls.append(("stop", policy))
-
-    def close(self): ...
-
-    def statistics(self):
-        return {"writes": len(self.written)}
 
 
 def test_bus_that_fails_is_said_once_and_the_others_go_on():

@@ -1,8 +1,7 @@
 """Two servos with one id are noticed by what a ping brings; one servo, however it is set, is not."""
 
-from collections.abc import Callable
-
 import pytest
+from emulated_port import ScriptedPort
 
 from sfms_robot.servo.chain.duplicate_ids import ping_replies
 from sfms_robot.servo.codecs import dxl2, protocol1
@@ -11,34 +10,8 @@ ONE = dxl2.encode_status(3, 0, bytes([0xB0, 0x04, 53]))
 OTHER = dxl2.encode_status(3, 0, bytes([0xA6, 0x04, 52]))
 
 
-class Wire:
-    """A port whose other end is a function from the bytes sent to the pieces that come back."""
-
-    def __init__(self, answer: Callable[[bytes], list[bytes]]):
-        self.name, self._answer, self._pieces, self._now_s = "wire", answer, [], 0.0
-
-    def write(self, data: bytes) -> None:
-        self._pieces = list(self._answer(data))
-
-    def read(self, n: int, deadline_s: float) -> bytes:
-        if self._pieces:
-            return self._pieces.pop(0)
-        self._now_s = deadline_s
-        return b""
-
-    def discard_input(self) -> None:
-        self._pieces = []
-
-    def now_s(self) -> float:
-        return self._now_s
-
-    def set_baud(self, baud: int) -> None: ...
-
-    def close(self) -> None: ...
-
-
 def heard(*pieces: bytes, echo: bool = False, protocol: int = 2):
-    return ping_replies(Wire(lambda sent: [sent, *pieces] if echo else list(pieces)), protocol, 3, 0.02)
+    return ping_replies(ScriptedPort(*pieces, echo=echo), protocol, 3, 0.02)
 
 
 def test_one_servo_is_one_answer_also_in_pieces_and_behind_an_echo():

@@ -1,18 +1,16 @@
-import csv
-from pathlib import Path
-
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from published import byte_by_byte, rows
+from vendor_port import VendorPort
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, crc16, encode_fast_status, encode_instruction, encode_status
 from sfms_robot.servo.codecs.dxl2 import maybe_packet as take
 
-ASSET = Path(__file__).parent.parent / "assets" / "dxl2_packets.csv"
-ROWS = list(csv.DictReader(line for line in ASSET.read_text().splitlines() if not line.startswith("#")))
+ROWS = rows("dxl2_packets.csv")
 PACKETS = [pytest.param(bytes.fromhex(row["packet"]), id=row["name"]) for row in ROWS]
 
 ids = st.integers(0, dxl2.MAX_ID) | st.just(dxl2.BROADCAST)
@@ -42,12 +40,7 @@ def test_known_packet_is_read_and_written(wire):
 
 @pytest.mark.parametrize("wire", PACKETS)
 def test_packet_arriving_one_byte_at_a_time(wire):
-    buffer = bytearray()
-    for byte in wire[:-1]:
-        buffer.append(byte)
-        assert take(buffer) is None
-    buffer.append(wire[-1])
-    assert take(buffer) == take(bytearray(wire))
+    assert byte_by_byte(take, wire) == take(bytearray(wire))
 
 
 def test_alert_and_error_of_a_status_are_kept():
@@ -107,40 +100,14 @@ def test_too_long_a_packet_is_refused():
         encode_instruction(1, dxl2.WRITE, bytes(1020))
 
 
-class Wire:
-    """What the vendor SDK writes, kept; what it reads, given."""
-
-    is_using = False
-
-    def __init__(self, answer: bytes = b""):
-        self.sent, self.answer = b"", answer
-
-    def clearPort(self):
-        pass
-
-    def writePort(self, packet):
-        self.sent += bytes(packet)
-        return len(packet)
-
-    def readPort(self, length):
-        data, self.answer = self.answer[:length], self.answer[length:]
-        return list(data)
-
-    def setPacketTimeout(self, length):
-        pass
-
-    def isPacketTimeout(self):
-        return not self.answer
-
-
 @given(st.integers(0, 252), st.integers(0, 1000), st.binary(min_size=1, max_size=20))
 def test_vendor_sdk_writes_the_same_bytes(servo, address, data):
     # Version 4.1.0 of the SDK throws its own stuffing away, so it cannot be compared where stuffing is due.
     body = address.to_bytes(2, "little") + data
     if b"\xff\xff\xfd" not in body:
-        wire = Wire()
+        wire = VendorPort()
         Protocol2PacketHandler().writeTxOnly(wire, servo, address, len(data), list(data))
-        assert wire.sent == encode_instruction(servo, dxl2.WRITE, body)
+        assert wire.written == encode_instruction(servo, dxl2.WRITE, body)
 
 
 @given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=20) | tricky.filter(bool))
@@ -148,12 +115,14 @@ def test_vendor_sdk_reads_what_we_write(servo, error, data):
     # The SDK removes stuffing in place and then looks at bytes it has moved: behind the first it may see another.
     _, header, rest = (bytes([dxl2.STATUS, error]) + data).partition(b"\xff\xff\xfd")
     assume(not header or b"\xfd\xfd" not in rest)
-    answer, result, told = Protocol2PacketHandler().readRx(Wire(encode_status(servo, error, data)), servo, len(data))
+    answer, result, told = Protocol2PacketHandler().readRx(
+        VendorPort(encode_status(servo, error, data)), servo, len(data)
+    )
     assert (bytes(answer), result, told) == (data, 0, error)
 
 
 def test_vendor_sdk_reads_our_fast_status():
     wire = encode_fast_status([(1, 0, b"\x01\x02"), (2, 0x80, b"\x03\x04")])
-    answer, result, _ = Protocol2PacketHandler().fastSyncReadRx(Wire(wire), dxl2.BROADCAST, 2 * 6)
+    answer, result, _ = Protocol2PacketHandler().fastSyncReadRx(VendorPort(wire), dxl2.BROADCAST, 2 * 6)
     assert result == 0
     assert bytes(answer[:4]) == b"\x00\x01\x01\x02" and bytes(answer[6:10]) == b"\x80\x02\x03\x04"

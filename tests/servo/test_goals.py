@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from emulated_port import Straight
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,17 +11,9 @@ from sfms_robot.servo.policy import BusServo
 RAD = 2 * np.pi / 4096
 
 
-class Linear:
-    def to_ticks(self, angles_rad):
-        return np.rint(2048 + np.clip(angles_rad, -1.0, 1.0) / RAD).astype(np.int64)
-
-    def to_rad(self, ticks):
-        return (ticks - 2048) * RAD
-
-
 def goals_of(count=1) -> Goals:
     table = load_firmware_map("sts3215")
-    return Goals("face", [BusServo(f"joint{i}", i, table, -1.0, 1.0) for i in range(count)], Linear())
+    return Goals("face", [BusServo(f"joint{i}", i, table, -1.0, 1.0) for i in range(count)], Straight(table, 1.0))
 
 
 FIRST, BOTH, NOBODY = np.array([0]), np.array([0, 1]), np.zeros(0, np.intp)

@@ -1,6 +1,5 @@
 """Every shipped firmware map, and what a map must not say."""
 
-import csv
 import json
 import re
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import pytest
 import typer
 import yaml
+from published import rows
 from typer.testing import CliRunner
 
 from sfms_robot.app.servo.maps import check_maps, list_maps
@@ -17,7 +17,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.servo.registers import Table
 
 MODELS = [file.stem for file in map_files()]
-FACTS = Path(__file__).parent.parent / "assets" / "servo_addresses.csv"
+FACTS = rows("servo_addresses.csv")
 
 CLI = typer.Typer()
 CLI.command()(servo_command.maps)
@@ -65,11 +65,6 @@ def wide(**changes: object) -> dict[str, object]:
     return {"protocol": 2, "registers": goal(**changes)["registers"] | {"counter": counter}}
 
 
-def facts() -> list[dict[str, str]]:
-    with FACTS.open(encoding="utf-8") as file:
-        return list(csv.DictReader(line for line in file if not line.startswith("#")))
-
-
 def write(folder: Path, **changes: object) -> Path:
     raw = MADE_UP | changes
     file = folder / f"{raw['model']}.yaml"
@@ -81,7 +76,7 @@ def test_shipped_maps_are_sound():
     assert check_maps() == []
 
 
-@pytest.mark.parametrize("fact", facts(), ids=lambda fact: fact["model"])
+@pytest.mark.parametrize("fact", FACTS, ids=lambda fact: fact["model"])
 def test_registers_lie_where_the_makers_say(fact):
     table = Table.of(load_firmware_map(fact["model"]))
     assert str(table.model_number or "") == fact["number"]
@@ -95,7 +90,7 @@ def test_registers_lie_where_the_makers_say(fact):
 
 def test_every_table_of_the_facts_has_a_map_and_the_rest_are_boards():
     boards = [row["model"] for row in list_maps() if row["channels"]]
-    assert sorted(MODELS) == sorted([fact["model"] for fact in facts()] + boards)
+    assert sorted(MODELS) == sorted([fact["model"] for fact in FACTS] + boards)
     assert sorted(boards) == ["maestro-12", "maestro-18", "maestro-24", "maestro-6", "ssc-32"]
 
 

@@ -3,9 +3,11 @@
 import logging
 
 import pytest
+from chain_rig import ServoRig
+from emulated_devices import device_of, servos_of
+from emulated_port import BAUD, LossyPort, Straight, link_on
 from hypothesis import given
 from hypothesis import strategies as st
-from lossy_port import BAUD, LossyPort, device_of, link_on
 
 from sfms_robot.config import Safety, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
@@ -22,15 +24,7 @@ LIMIT_DEG, LOW_DEG = 40.0, 45.0  # of the joint; stored in the servo
 BY_TIME = 0x04  # drive mode
 
 
-class Straight:
-    def __init__(self, table):
-        self.center, self.rad = table.center_ticks, 6.283185307179586 / table.ticks_per_revolution
-
-    def to_ticks(self, angles_rad):
-        return (self.center + angles_rad / self.rad).round().astype(int)
-
-
-class Rig:
+class Rig(ServoRig):
     """One servo that stands `outside_deg` beyond an end of what it has stored (below 0: the lower one)."""
 
     def __init__(self, model, outside_deg, registers=None, tries=3):
@@ -44,9 +38,9 @@ class Rig:
         end, sign = (self.limits[0], -1) if outside_deg < 0 else (self.limits[1], 1)
         self.start = end + sign * max(1, round(abs(outside_deg) / self.deg))
         stored = dict(zip(self.names, self.limits, strict=True)) | (registers or {})
-        self.device = device_of(table, {"id": 1, "start_ticks": self.start, "registers": stored})
-        self.servo = self.device.servo(1)
-        self.port = LossyPort(self.device)
+        (there,) = servos_of(model, 1, start_ticks=self.start, registers=stored)
+        self.port = LossyPort(device_of(there))
+        self.leg = self.servo(1)
         self.fastest_deg_s, self.goals = 0.0, []
         self.port.write = self._watched(self.port.write)
         limit_rad = LIMIT_DEG * 6.283185307179586 / 360.0
@@ -57,7 +51,7 @@ class Rig:
     def _watched(self, write):
         def watched(data):
             write(data)
-            state = self.servo.state(self.port.t)
+            state = self.leg.state(self.clock.t)
             self.fastest_deg_s = max(self.fastest_deg_s, abs(state["speed"]) * self.deg)
             if state["torque"]:
                 self.goals.append(state["goal"])
@@ -65,11 +59,18 @@ class Rig:
         return watched
 
     def held(self, name):
-        field = self.table.role(name) or self.table[name]
-        return field.from_bytes(self.servo.read(field.address, field.size, self.port.t)[1])
+        return self.register(1, name)
+
+    def on_the_way(self):
+        """The steps of a startup that has its servo moving by now."""
+        self.startup.run()
+        steps = self.startup.torque_on(0)
+        while not (self.state()["torque"] and self.state()["speed"]):
+            self.clock.t += next(steps)
+        return steps
 
     def state(self):
-        return self.servo.state(self.port.t)
+        return self.leg.state(self.clock.t)
 
     def inside(self, ticks):
         return self.limits[0] <= round(ticks) <= self.limits[1]
@@ -90,7 +91,7 @@ def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, 
     assert all(rig.inside(goal) for goal in rig.goals)
     assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
     assert rig.state()["position"] == pytest.approx(held, abs=2)
-    rig.port.t += 1.0
+    rig.clock.t += 1.0
     assert rig.state()["position"] == pytest.approx(held, abs=2)
 
 
@@ -115,7 +116,7 @@ def test_whatever_is_lost_it_never_goes_faster_or_further_out(model, fate):
         assert set(fate) - {""}
     assert all(rig.inside(goal) for goal in rig.goals)
     assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
-    rig.port.fate, rig.port.t = iter(()), rig.port.t + 0.3
+    rig.port.fate, rig.clock.t = iter(()), rig.clock.t + 0.3
     rig.startup.run()  # by now perhaps inside, perhaps lost half way
     assert rig.inside(rig.startup.switch_on(0)) and rig.usual_profile()
     assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
@@ -125,34 +126,28 @@ def test_whatever_is_lost_it_never_goes_faster_or_further_out(model, fate):
 def test_one_that_does_not_come_is_let_go_and_named(model):
     rig = Rig(model, 12.0)
     rig.startup.run()
-    rig.servo.plant.stuck = True
+    rig.leg.plant.stuck = True
     low, high = rig.limits
     expected = rf"leg \(id 1\) stands at {rig.start}, outside its own limits {low}\.\.{high}.*torque is off"
     with pytest.raises(ServoError, match=expected):
         rig.startup.switch_on(0)
-    assert not rig.state()["torque"] and rig.port.t < 5.0 and rig.usual_profile()
+    assert not rig.state()["torque"] and rig.clock.t < 5.0 and rig.usual_profile()
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_whoever_takes_the_torque_meanwhile_ends_it(model):
     rig = Rig(model, -12.0)
-    rig.startup.run()
-    steps, torque = rig.startup.torque_on(0), rig.table.role("torque_enable")
-    while not (rig.state()["torque"] and rig.state()["speed"]):
-        rig.port.t += next(steps)
-    rig.servo.write(torque.address, torque.to_bytes(0), rig.port.t)
+    steps, torque = rig.on_the_way(), rig.table.role("torque_enable")
+    rig.leg.write(torque.address, torque.to_bytes(0), rig.clock.t)
     with pytest.raises(ServoError, match="leg"):
-        finish(steps, lambda duration_s: rig.port.wait_until(rig.port.t + duration_s))
+        finish(steps, lambda duration_s: rig.port.wait_until(rig.clock.t + duration_s))
     assert not rig.state()["torque"] and not rig.inside(rig.state()["position"])
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_a_job_that_is_dropped_half_way_leaves_torque_off(model):
     rig = Rig(model, -12.0)
-    rig.startup.run()
-    steps = rig.startup.torque_on(0)
-    while not (rig.state()["torque"] and rig.state()["speed"]):
-        rig.port.t += next(steps)
+    steps = rig.on_the_way()
     steps.close()
     assert not rig.state()["torque"]
 
@@ -160,10 +155,7 @@ def test_a_job_that_is_dropped_half_way_leaves_torque_off(model):
 @pytest.mark.parametrize("model", MODELS)
 def test_one_that_was_lost_sight_of_half_way_is_let_go_before_its_profile_is_made_usual(model):
     rig = Rig(model, -30.0)
-    rig.startup.run()
-    steps = rig.startup.torque_on(0)
-    while not (rig.state()["torque"] and rig.state()["speed"]):
-        rig.port.t += next(steps)
+    steps = rig.on_the_way()
     rig.port.fate = iter(["request"] * 40)
     with pytest.raises(Silent):
         finish(steps)
@@ -192,7 +184,7 @@ def test_one_that_would_go_round_the_other_side_is_refused():
     """It hangs 5 degrees below its lower limit, past the end of the turn, and so reads high up."""
     table = Table.of(load_firmware_map("sts3215"))
     rig = Rig("sts3215", 45.0, {"min_position_limit": 20, "max_position_limit": 3000})
-    rig.servo.turn(4060, 0.0)
+    rig.leg.turn(4060, 0.0)
     rig.limits = (20, 3000)
     assert table.center_ticks == 2048
     with pytest.raises(ServoError, match=r"stands at 4060, outside its own limits 20\.\.3000.*turn it in by hand"):

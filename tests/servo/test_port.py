@@ -6,21 +6,15 @@ from array import array
 from contextlib import contextmanager
 
 import pytest
+from emulated_port import ScriptedPort
+from virtual_time import Time
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.discovery import stable_name
 from sfms_robot.servo.port import SerialPort, VirtualTimePort
-
-
-class Frozen:
-    """A clock that stands still: a deadline at `now` has passed."""
-
-    def now_s(self) -> float:
-        return 0.0
 
 
 @contextmanager
@@ -37,7 +31,7 @@ def terminal():
 
 def test_bytes_go_out_and_come_in():
     with terminal() as (far, device):
-        port = SerialPort(device, 1_000_000, Frozen())
+        port = SerialPort(device, 1_000_000, Time())
         port.write(b"abc")
         assert os.read(far, 10) == b"abc"
         os.write(far, b"defg")
@@ -53,11 +47,11 @@ def test_bytes_go_out_and_come_in():
 
 def test_port_is_ours_alone():
     with terminal() as (_, device):
-        port = SerialPort(device, 57600, Frozen())
+        port = SerialPort(device, 57600, Time())
         with pytest.raises(PortError, match=f"{device}: is held by another program"):
-            SerialPort(device, 57600, Frozen())
+            SerialPort(device, 57600, Time())
         port.close()
-        SerialPort(device, 57600, Frozen()).close()
+        SerialPort(device, 57600, Time()).close()
 
 
 def test_a_relative_path_is_a_path_like_any_other(tmp_path, monkeypatch):
@@ -65,20 +59,20 @@ def test_a_relative_path_is_a_path_like_any_other(tmp_path, monkeypatch):
     (tmp_path / "folder").mkdir()
     with terminal() as (_, device):
         (tmp_path / "head").symlink_to(device)
-        port = SerialPort("head", 57600, Frozen())
+        port = SerialPort("head", 57600, Time())
         with pytest.raises(PortError, match="^head: is held by another program"):
-            SerialPort("head", 57600, Frozen())
+            SerialPort("head", 57600, Time())
         port.close()
     with pytest.raises(PortError, match="^folder: is a directory"):
-        SerialPort("folder", 57600, Frozen())
+        SerialPort("folder", 57600, Time())
     with pytest.raises(PortError, match="^nowhere: no such device"):
-        SerialPort("nowhere", 57600, Frozen())
+        SerialPort("nowhere", 57600, Time())
 
 
 @pytest.mark.parametrize("baud", [250_000, 1_234_567, 4_500_000])
 def test_any_baud_rate_will_do(baud):
     with terminal() as (far, device):
-        port = SerialPort(device, 57600, Frozen())
+        port = SerialPort(device, 57600, Time())
         port.set_baud(baud)
         settings = array("I", [0] * 64)
         fcntl.ioctl(far, 0x802C542A, settings, True)  # TCGETS2: what the far end sees
@@ -90,8 +84,8 @@ def test_any_baud_rate_will_do(baud):
 def test_impossible_baud_rate_is_an_error_of_one_line(baud):
     with terminal() as (_, device):
         with pytest.raises(PortError, match=f"{device}: "):
-            SerialPort(device, baud, Frozen())
-        SerialPort(device, 57600, Frozen()).close()
+            SerialPort(device, baud, Time())
+        SerialPort(device, 57600, Time()).close()
 
 
 def test_servo_at_four_and_a_half_megabaud_is_found(make_rig):
@@ -102,15 +96,10 @@ def test_servo_at_four_and_a_half_megabaud_is_found(make_rig):
 
 def test_device_that_takes_no_more_bytes_is_a_failure_and_no_hang():
     with terminal() as (_, device):
-        port = SerialPort(device, 57600, Frozen())
+        port = SerialPort(device, 57600, Time())
         with pytest.raises(BusError, match="takes no more bytes"):
             port.write(bytes(1 << 20))
         port.close()
-
-
-def test_name_of_a_device_without_a_serial_number_stays():
-    assert stable_name("/dev/ttyNOSUCH") == "/dev/ttyNOSUCH"
-    assert stable_name("socket://robot:4000") == "socket://robot:4000"
 
 
 @contextmanager
@@ -122,7 +111,7 @@ def listening():
 
 def test_a_network_port_sends_at_once_what_is_written():
     with listening() as (server, url):
-        port = SerialPort(url, 1_000_000, Frozen())
+        port = SerialPort(url, 1_000_000, Time())
         peer, _ = server.accept()
         with peer, socket.socket(fileno=os.dup(port._serial.fileno())) as near:
             assert near.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
@@ -139,24 +128,14 @@ def test_a_network_port_sends_at_once_what_is_written():
 @pytest.mark.parametrize("url", ["loop://", "spy:///dev/null", "hwgrep://x", "nonsense://"])
 def test_a_url_without_servos_behind_it_is_refused_in_one_line(url):
     with pytest.raises(PortError, match=f"^{url}: no servos can be behind .*socket://HOST:PORT") as caught:
-        SerialPort(url, 57600, Frozen())
+        SerialPort(url, 57600, Time())
     assert "\n" not in str(caught.value)
-
-
-def test_missing_device_is_named():
-    with pytest.raises(PortError, match="/dev/no-such-port: no such device"):
-        SerialPort("/dev/no-such-port", 57600, Frozen())
-
-
-def test_folder_is_no_port(tmp_path):
-    with pytest.raises(PortError, match="is a directory, not a serial port"):
-        SerialPort(str(tmp_path), 57600, Frozen())
 
 
 def test_device_that_goes_away_is_a_failure_of_the_bus():
     master, slave = os.openpty()
     tty.setraw(slave)
-    port = SerialPort(os.ttyname(slave), 57600, Frozen())
+    port = SerialPort(os.ttyname(slave), 57600, Time())
     os.close(slave)
     os.close(master)
     with pytest.raises(BusError, match="the device is gone|cannot be read any more"):
@@ -166,7 +145,7 @@ def test_device_that_goes_away_is_a_failure_of_the_bus():
 
 def test_virtual_port_needs_an_emulator(tmp_path):
     with pytest.raises(PortError, match="no emulator answers there"):
-        VirtualTimePort("/dev/null", str(tmp_path / "control"), 57600, Frozen())
+        VirtualTimePort("/dev/null", str(tmp_path / "control"), 57600, Time())
 
 
 def test_rubbish_neither_hangs_nor_confuses(make_rig):
@@ -189,55 +168,30 @@ def test_second_host_in_virtual_time_starts_from_zero(make_rig):
                 assert link.read(1, 132, 4) is not None
 
 
-class Script:
-    """A port with answers to come, each given whole to one read."""
-
-    name = "script"
-
-    def __init__(self, *chunks: bytes):
-        self.chunks = list(chunks)
-        self.sent: list[bytes] = []
-
-    def write(self, data: bytes) -> None:
-        self.sent.append(data)
-
-    def read(self, n: int, deadline_s: float) -> bytes:
-        return self.chunks.pop(0) if self.chunks else b""
-
-    def discard_input(self) -> None: ...
-
-    def now_s(self) -> float:
-        return 0.0
-
-    def set_baud(self, baud: int) -> None: ...
-
-    def close(self) -> None: ...
-
-
 def test_answers_are_taken_by_id_and_length():
     four, late, foreign = (
         dxl2.encode_status(1, 0, b"\x01\x02\x03\x04"),
         dxl2.encode_status(1, 0, b"\x09"),
         dxl2.encode_status(2, 0, b"\x05\x06\x07\x08"),
     )
-    link = Dynamixel2Link(Script(late + foreign[:5], foreign[5:] + b"\xff\xff" + four), 1_000_000, 0.003)
+    link = Dynamixel2Link(ScriptedPort(late + foreign[:5], foreign[5:] + b"\xff\xff" + four), 1_000_000, 0.003)
     assert link.read(1, 132, 4).data == b"\x01\x02\x03\x04"
 
 
 def test_own_echo_is_not_an_answer():
     echo = dxl2.encode_instruction(1, dxl2.PING)
-    link = Dynamixel2Link(Script(echo), 1_000_000, 0.003)
+    link = Dynamixel2Link(ScriptedPort(echo), 1_000_000, 0.003)
     assert link.ping(1) is None
 
 
 def test_refusal_without_data_is_an_answer():
-    link = Dynamixel2Link(Script(dxl2.encode_status(1, dxl2.ACCESS_ERROR)), 1_000_000, 0.003)
+    link = Dynamixel2Link(ScriptedPort(dxl2.encode_status(1, dxl2.ACCESS_ERROR)), 1_000_000, 0.003)
     assert link.read(1, 132, 4).error == dxl2.ACCESS_ERROR
 
 
 @pytest.mark.parametrize("data", [b"\xff\xff\xfd\x00", b"\xff\xff\xfd\xfd", b"\x00\xff\xff\xfd"])
 def test_data_that_look_like_a_header_are_stuffed(data):
-    port = Script()
+    port = ScriptedPort()
     link = Dynamixel2Link(port, 1_000_000, 0.003)
     link.write(1, 116, data)
     link.sync_write(116, {1: data, 2: bytes(4)})

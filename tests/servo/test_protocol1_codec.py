@@ -1,19 +1,18 @@
-import csv
 import random
-from pathlib import Path
 
 import pytest
 from dynamixel_sdk import Protocol1PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
+from published import byte_by_byte, rows
+from vendor_port import VendorPort
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import Frame, encode, salvage
 from sfms_robot.servo.codecs.protocol1 import maybe_frame as take
 
-ASSET = Path(__file__).parent.parent / "assets" / "protocol1_packets.csv"
-ROWS = list(csv.DictReader(line for line in ASSET.read_text().splitlines() if not line.startswith("#")))
+ROWS = rows("protocol1_packets.csv")
 FRAMES = [pytest.param(bytes.fromhex(row["frame"]), id=row["name"]) for row in ROWS]
 
 ids = st.integers(0, protocol1.BROADCAST)
@@ -32,12 +31,7 @@ def test_known_frame_is_read_and_written(wire):
 
 @pytest.mark.parametrize("wire", FRAMES)
 def test_frame_arriving_one_byte_at_a_time(wire):
-    buffer = bytearray()
-    for byte in wire[:-1]:
-        buffer.append(byte)
-        assert take(buffer) is None
-    buffer.append(wire[-1])
-    assert take(buffer) == take(bytearray(wire))
+    assert byte_by_byte(take, wire) == take(bytearray(wire))
 
 
 def frame_of(name: str) -> Frame:
@@ -128,42 +122,16 @@ def test_error_bits_about_the_request_are_told_from_those_about_the_servo():
     assert dxl1.refusal_text(dxl1.OVERLOAD | dxl1.VOLTAGE | dxl1.OVERHEATING) == ""
 
 
-class Capture:
-    """What the SDK's packet handler needs of a port; keeps what is written."""
-
-    is_using = False
-
-    def __init__(self, answer: bytes = b""):
-        self.written, self.answer = b"", answer
-
-    def clearPort(self):
-        self.written = b""
-
-    def writePort(self, packet):
-        self.written += bytes(packet)
-        return len(packet)
-
-    def readPort(self, length):
-        data, self.answer = self.answer[:length], self.answer[length:]
-        return list(data)
-
-    def setPacketTimeout(self, length):
-        self.is_using = True
-
-    def isPacketTimeout(self):
-        return not self.answer
-
-
 @given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=200))
 def test_writes_are_those_of_the_vendor_sdk(servo, address, data):
-    port = Capture()
+    port = VendorPort()
     Protocol1PacketHandler().writeTxOnly(port, servo, address, len(data), list(data))
     assert port.written == encode(servo, protocol1.WRITE, bytes([address]) + data)
 
 
 @given(st.dictionaries(st.integers(0, 252), st.binary(min_size=2, max_size=2), min_size=1, max_size=40))
 def test_sync_writes_are_those_of_the_vendor_sdk(values):
-    port = Capture()
+    port = VendorPort()
     flat = [byte for servo, data in values.items() for byte in (servo, *data)]
     Protocol1PacketHandler().syncWriteTxOnly(port, 30, 2, flat, len(flat))
     assert port.written == encode(protocol1.BROADCAST, protocol1.SYNC_WRITE, dxl1.sync_write_params(30, values))
@@ -171,6 +139,6 @@ def test_sync_writes_are_those_of_the_vendor_sdk(values):
 
 @given(st.integers(0, 252), st.integers(0, 127), st.binary(min_size=1, max_size=100))
 def test_the_vendor_sdk_reads_our_status_frames(servo, error, data):
-    port = Capture(encode(servo, error, data))
+    port = VendorPort(encode(servo, error, data))
     got, result, told = Protocol1PacketHandler().readRx(port, servo, len(data))
     assert (bytes(got), result, told) == (data, 0, error)

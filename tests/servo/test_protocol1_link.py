@@ -1,23 +1,27 @@
 import pytest
+from chain_rig import rig_of
+from emulated_port import Says, link_on
 from hypothesis import given
 from hypothesis import strategies as st
-from protocol1_rig import rig_of
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink
-from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.codecs.protocol1 import encode
 
 
 def link_of(model, starts, **more):
     rig = rig_of(model, starts, **more)
-    link = Protocol1Link(rig.wire, 1_000_000, 0.003, rig.bus.family)
-    return link, rig
+    return link_on(rig.port, rig.servo(1).table), rig
 
 
 @pytest.mark.parametrize(
     ("model", "found"),
-    [("ax-12a", Found(12, 3)), ("mx-64-1.0", Found(310, 3)), ("sts3215", Found(777, 3)), ("scs0009", Found(1284, 3))],
+    [
+        ("ax-12a", Found(12, 53)),
+        ("mx-64-1.0", Found(310, 53)),
+        ("sts3215", Found(777, 53)),
+        ("scs0009", Found(1284, 53)),
+    ],
 )
 def test_ping_tells_who_is_there_whatever_the_byte_order(model, found):
     link, _ = link_of(model, [500, 600])
@@ -32,11 +36,8 @@ def test_registers_are_read_and_written(model):
     link, rig = link_of(model, [500])
     position = rig.servo(1).table["present_position"]
     assert link.read(1, position.address, 2) == Answer(0, b"\xf4\x01")
-    torque = rig.servo(1).table["torque_enable"].address
-    assert link.write(1, torque, b"\x01") == Answer(0, b"")
     goal = rig.servo(1).table["goal_position"].address
-    assert link.reg_write(1, goal, b"\x00\x02") == Answer(0, b"")
-    link.action()
+    assert link.write(1, goal, b"\x00\x02") == Answer(0, b"")
     assert link.read(1, goal, 2) == Answer(0, b"\x00\x02")
 
 
@@ -55,20 +56,10 @@ def test_what_the_protocol_cannot_do_is_said():
     assert link.factory_reset(1, 0xFF) == Answer(0, b"")
 
 
-class Says:
-    """A device that answers anything with the same bytes, then as another one would."""
-
-    def __init__(self, data, other=None):
-        self.data, self.other = data, other
-
-    def receive(self, data, baud, now_s):
-        return self.data + (self.other.receive(data, baud, now_s) if self.other else b"")
-
-
 @pytest.mark.parametrize("other", [encode(2, 0, b"\x01\x02"), encode(1, 0, b"\x01"), encode(1, 0, b"\x01\x02\x03")])
 def test_answer_of_another_servo_or_length_is_left_alone(other):
     link, rig = link_of("ax-12a", [500])
-    rig.wire.device = Says(other)
+    rig.port.device = Says(other)
     assert link.read(1, 36, 2) is None
 
 
@@ -93,7 +84,7 @@ class Late:
 @given(st.lists(st.sampled_from([0, 0, 0, 1, 2, 5]), max_size=30))
 def test_no_answer_is_ever_that_of_an_earlier_request(lags):
     link, rig = link_of("ax-12a", [512])
-    rig.wire.device = device = Late(lags)
+    rig.port.device = device = Late(lags)
     for _ in range(40):
         rig.clock.t += 0.01
         answer = link.read(1, 36, 2)
@@ -104,21 +95,21 @@ def test_no_answer_is_ever_that_of_an_earlier_request(lags):
 
 def test_debt_is_forgotten_after_a_second():
     link, rig = link_of("ax-12a", [512])
-    rig.device.kill(1)
+    rig.kill(1)
     assert link.read(1, 36, 2) is None
-    rig.device.revive(1)
+    rig.revive(1)
     rig.clock.t = 5.0
-    before = rig.wire.requests
+    before = len(rig.port.sent)
     assert link.read(1, 36, 2) is not None
-    assert rig.wire.requests - before == 1
+    assert len(rig.port.sent) - before == 1
 
 
 @pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
 def test_own_words_heard_again_are_no_answer(model):
     link, rig = link_of(model, [500])
-    rig.wire.hears_itself = True
+    rig.port.hears_itself = True
     assert link.read(1, rig.servo(1).table["present_position"].address, 2) == Answer(0, b"\xf4\x01")
-    rig.device.kill(1)
+    rig.kill(1)
     assert link.ping(1) is None
     assert link.read(1, 36, 2) is None
 
@@ -127,17 +118,17 @@ def test_own_words_heard_again_are_no_answer(model):
 @pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
 def test_servo_whose_answer_to_a_ping_is_the_ping_itself_is_there(model, hears_itself):
     link, rig = link_of(model, [500, 500])
-    rig.wire.hears_itself = hears_itself
+    rig.port.hears_itself = hears_itself
     rig.servo(1).set_supply(20.0, 0.0)  # error byte 1 is the code of a ping
     assert link.read(1, 0, 1).error == 1
     number = rig.servo(1).table.model_number
     assert link.ping(1).model_number == number and set(link.broadcast_ping()) == {1, 2}
-    rig.device.kill(1)
+    rig.kill(1)
     assert link.ping(1) is None
 
 
 @given(st.binary(max_size=40))
 def test_rubbish_before_an_answer_does_not_hide_it(rubbish):
     link, rig = link_of("sts3215", [500])
-    rig.wire.device = Says(rubbish.replace(b"\xff", b"\x00"), rig.device)
+    rig.port.device = Says(rubbish.replace(b"\xff", b"\x00"), rig.device)
     assert link.read(1, 56, 2) == Answer(0, b"\xf4\x01")

@@ -1,82 +1,18 @@
 import logging
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from device_port import DevicePort, Time
+from board_rig import LIMIT_RAD, Bench
+from emulated_port import EmulatedPort, Says, Straight
 
-from sfms_robot.config import Safety, load_firmware_map
-from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
+from sfms_robot.config import load_firmware_map
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.servo.boards.maestro_bus import MaestroBus
-from sfms_robot.servo.boards.ssc32_bus import Ssc32Bus
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.registers import Table
 
-LIMIT_RAD = 0.7
-KINDS = {
-    "maestro-24": (MaestroBus, MaestroBoard),
-    "maestro-6": (MaestroBus, MaestroBoard),
-    "ssc-32": (Ssc32Bus, Ssc32Board),
-}
-
-
-class Pulses:
-    """0 rad is 1500 us; angles outside +-limit give the ticks of the limit."""
-
-    def __init__(self, table, limit_rad=LIMIT_RAD):
-        self.center, self.limit_rad = table.center_ticks, limit_rad
-        self.per_rad = table.ticks_per_revolution / (2 * math.pi)
-
-    def to_ticks(self, angles_rad):
-        return np.rint(self.center + np.clip(angles_rad, -self.limit_rad, self.limit_rad) * self.per_rad).astype(int)
-
-    def to_rad(self, ticks):
-        return (np.asarray(ticks) - self.center) / self.per_rad
-
-
-class Bench:
-    """One board with servos on `channels`, and its bus."""
-
-    def __init__(self, model="maestro-24", channels=(0, 1, 2, 5), baud=115200, limit_rad=LIMIT_RAD, **more):
-        firmware_map = load_firmware_map(model)
-        bus_class, board_class = KINDS[model]
-        table = Table.of(firmware_map)
-        self.clock = Time()
-        self.ports = []
-        rows = [{"id": i, "baud": baud, "start_ticks": table.center_ticks} for i in channels]
-        self.board = board_class(table, rows)
-        self.bus = bus_class(
-            "face",
-            [BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad) for i in channels],
-            Pulses(table, limit_rad),
-            lambda: self.ports.append(DevicePort(self.board, baud, self.clock)) or self.ports[-1],
-            baud,
-            **{"confirmed": True} | more,
-        )
-
-    @property
-    def port(self):
-        return self.ports[-1]
-
-    def hold(self):
-        self.bus.connect()
-        return self.bus.enable(self.bus.joints)
-
-    def ticks(self, goals_rad, n, period_s=0.1):
-        for _ in range(n):
-            self.clock.t += period_s
-            self.bus.write(np.asarray(goals_rad, dtype=float), self.clock.t)
-            readings = self.bus.poll(self.clock.t)
-        return readings
-
-    def sent_since(self, mark):
-        return b"".join(self.port.sent[mark:])
-
-    def pulses(self):
-        return {channel.id: channel.pulse for channel in self.board.servos}
+KINDS = ("maestro-24", "maestro-6", "ssc-32")
 
 
 @pytest.fixture(params=KINDS)
@@ -126,15 +62,6 @@ def test_pulses_that_maestro_sends_already_are_kept_and_cost_no_wait():
     assert len(second.port.waits) == waits
 
 
-def test_goals_arrive_in_pulses(bench):
-    bench.hold()
-    bench.ticks([0.5, -0.5, 0.25, 0.0], 5)
-    bench.board.advance(bench.clock.t + 1.0)
-    per_rad = bench.bus._conversion.per_rad
-    shafts = [(c.plant.position - bench.board.table.center_ticks) / per_rad for c in bench.board.servos]
-    assert shafts == pytest.approx([0.5, -0.5, 0.25, 0.0], abs=0.001)
-
-
 def test_what_did_not_change_is_sent_in_turn_only(bench):
     held = bench.hold()
     bench.ticks(held, 10)
@@ -166,7 +93,7 @@ def test_slow_wire_carries_the_newest_goals_and_never_piles_up():
     for _ in range(2):
         bench.clock.t += 0.5
         bench.bus.poll(bench.clock.t)
-    assert len(bench.sent_since(mark)) * 10 / 9600 <= bench.clock.t - start_s
+    assert sum(map(len, bench.port.sent[mark:])) * 10 / 9600 <= bench.clock.t - start_s
     counts = bench.bus.statistics()
     assert counts["deferred"] > 250 and 8 < counts["writes"] < 40
     last = bench.bus._conversion.to_ticks(goals)
@@ -182,17 +109,6 @@ def test_ssc32_draws_lines_between_slow_goals():
     assert b"T200\r" in bench.port.sent[-1]
     bench.ticks(held + 0.3, 1, 0.01)
     assert b"T" not in bench.port.sent[-1]
-
-
-def test_release_ends_the_pulses_and_hold_keeps_them(bench):
-    bench.hold()
-    kept = bench.pulses()
-    bench.bus.stop("hold")
-    assert bench.pulses() == kept
-    bench.bus.stop("release")
-    assert set(bench.pulses().values()) == {0}
-    with pytest.raises(ValueError, match="no joint is enabled"):
-        bench.bus.write(np.zeros(4), 0.0)
 
 
 def test_maestro_errors_become_faults_and_goals_are_sent_anew():
@@ -220,16 +136,14 @@ def test_damaged_bytes_are_counted_and_blame_no_joint():
 def test_silent_board_gets_no_goals_and_is_taken_back(bench):
     held = bench.hold()
     bench.ticks(held, 1)
-    for channel in bench.board.servos:
-        channel.dead = True
+    bench.kill()
     silent = bench.ticks(held, 40)
     assert {r.fault for r in silent.values()} == {"no answer"}
     assert bench.bus.statistics()["silent"] == [0, 1, 2, 5]
     mark = len(bench.port.sent)
     bench.ticks(held + 0.1, 5)
     assert not any(b"P" in line or line[0] in (0x84, 0x9F) for line in bench.port.sent[mark:])
-    for channel in bench.board.servos:
-        channel.dead = False
+    bench.revive()
     assert {r.fault for r in bench.ticks(held, 11).values()} == {None}
     after = bench.bus.statistics()
     assert after["silent"] == [] and after["reconnects"] == 1
@@ -241,12 +155,10 @@ def test_channels_that_lost_their_supply_come_on_again_one_at_a_time():
     bench = Bench()
     held = bench.hold()
     bench.ticks(held, 1)
-    for channel in bench.board.servos:
-        channel.dead = True
+    bench.kill()
     bench.ticks(held, 50)
     bench.board.restart(bench.clock.t)
-    for channel in bench.board.servos:
-        channel.dead = False
+    bench.revive()
     lit = []
     for _ in range(60):
         readings = bench.ticks(held + 0.1, 1)
@@ -262,8 +174,7 @@ def test_channels_that_lost_their_supply_come_on_again_one_at_a_time():
 
 def test_asking_the_board_blocks_nobody(bench):
     held = bench.hold()
-    for channel in bench.board.servos:
-        channel.dead = True
+    bench.kill()
     waits = len(bench.port.waits)
     for _ in range(400):
         bench.ticks(held, 1, 0.01)
@@ -271,19 +182,8 @@ def test_asking_the_board_blocks_nobody(bench):
         waits = len(bench.port.waits)
 
 
-def test_joint_that_must_hold_keeps_its_pulses_when_the_others_are_released(bench):
-    servos = bench.bus._servos
-    stiff = [replace(servos[0], safety=Safety(stop="hold")), *servos[1:]]
-    bus = type(bench.bus)("face", stiff, bench.bus._conversion, bench.bus._open_port, 115200, confirmed=True)
-    bus.connect()
-    bus.enable(bus.joints)
-    bus.stop("release")
-    assert [pulse != 0 for pulse in bench.pulses().values()] == [True, False, False, False]
-
-
 def test_absent_board_is_named(bench):
-    for channel in bench.board.servos:
-        channel.dead = True
+    bench.kill()
     with pytest.raises(BusError, match=rf"bus 'face' on emulated at 115200 baud: no {bench.bus.model} answers"):
         bench.bus.connect()
     assert bench.port.closed
@@ -309,17 +209,13 @@ def test_two_boards_on_one_bus_are_refused():
     six, all_ = load_firmware_map("maestro-6"), load_firmware_map("maestro-24")
     servos = [BusServo("a", 0, six, -0.1, 0.1), BusServo("b", 1, all_, -0.1, 0.1)]
     with pytest.raises(ConfigError, match="one board is one model, the head says maestro-6 and maestro-24"):
-        MaestroBus("face", servos, Pulses(Table.of(six)), lambda: DevicePort(None, 1, Time()), 115200)
+        MaestroBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200)
 
 
 def test_noise_that_comes_back_is_no_answer():
     assert ssc32.DONE != b"?"
 
-    class Babble:
-        def receive(self, data, baud, now_s):
-            return b"?"
-
     bench = Bench("ssc-32")
-    bench.board = Babble()
+    bench.board = Says(b"?")
     with pytest.raises(BusError, match="no ssc-32 answers"):
         bench.bus.connect()

@@ -4,34 +4,15 @@ import math
 
 import numpy as np
 import pytest
-from device_port import DevicePort, Time
+from board_rig import Bench
+from emulated_port import EmulatedPort
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sfms_robot.config import Safety, load_firmware_map
-from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.boards.maestro_bus import MaestroBus
-from sfms_robot.servo.boards.ssc32_bus import Ssc32Bus
-from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.registers import Table
 
-KINDS = {"maestro-24": (MaestroBus, MaestroBoard), "ssc-32": (Ssc32Bus, Ssc32Board)}
+KINDS = ("maestro-24", "ssc-32")
 FIVE = (0, 1, 2, 5, 7)
-
-
-class Pulses:
-    """0 rad is the middle."""
-
-    def __init__(self, table, limit_rad):
-        self.center, self.limit_rad = table.center_ticks, limit_rad
-        self.per_rad = table.ticks_per_revolution / (2 * math.pi)
-
-    def to_ticks(self, angles_rad):
-        return np.rint(self.center + np.clip(angles_rad, -self.limit_rad, self.limit_rad) * self.per_rad).astype(int)
-
-    def to_rad(self, ticks):
-        return (np.asarray(ticks) - self.center) / self.per_rad
 
 
 class Adapter:
@@ -58,7 +39,7 @@ class Adapter:
             interrupt()
 
 
-class PluggedPort(DevicePort):
+class PluggedPort(EmulatedPort):
     """A port on which silence costs time."""
 
     def __init__(self, adapter, *rest):
@@ -83,36 +64,22 @@ class PluggedPort(DevicePort):
         super().discard_input()
 
 
-class Bench:
-    def __init__(self, model, channels=FIVE, limit_rad=0.7, baud=115200, stiff=()):
-        firmware_map = load_firmware_map(model)
-        bus_class, board_class = KINDS[model]
-        table = Table.of(firmware_map)
-        self.clock, self.adapter, self.ports = Time(), Adapter(), []
-        rows = [{"id": i, "baud": baud, "start_ticks": table.center_ticks} for i in channels]
-        self.board = board_class(table, rows)
+class ConnectedBench(Bench):
+    """A connected bus, on an adapter that may be unplugged."""
 
-        def open_port():
-            self.ports.append(PluggedPort(self.adapter, self.board, baud, self.clock))
-            return self.ports[-1]
-
-        safety = {True: Safety(stop="hold"), False: Safety()}
-        servos = [BusServo(f"j{i}", i, firmware_map, -limit_rad, limit_rad, safety[i in stiff]) for i in channels]
-        conversion = Pulses(table, limit_rad)
-        self.bus = bus_class("face", servos, conversion, open_port, baud, confirmed=True)
+    def __init__(self, model, channels=FIVE, **more):
+        self.adapter = Adapter()
+        super().__init__(model, channels, **more)
         self.bus.connect()
+
+    def new_port(self, *rest):
+        return PluggedPort(self.adapter, *rest)
 
     def enable(self):
         return self.bus.enable(self.bus.joints)
 
-    def tick(self, goals_rad=None, period_s=0.02):
-        self.clock.t += period_s
-        if goals_rad is not None:
-            self.bus.write(goals_rad, self.clock.t)
-        return self.bus.poll(self.clock.t)
-
-    def on(self):
-        return [channel.id for channel in self.board.servos if channel.pulse]
+    def tick(self, goals_rad=None):
+        return self.ticks(goals_rad, 1, 0.02)
 
 
 @pytest.fixture(params=KINDS)
@@ -128,10 +95,10 @@ EVENTS = st.lists(st.tuples(st.integers(0, 40), st.sampled_from(["unplug", "plug
     events=EVENTS,
     ticks=st.integers(0, 40),
     last=st.sampled_from(["stop", "torque_off"]),
-    model=st.sampled_from(list(KINDS)),
+    model=st.sampled_from(KINDS),
 )
 def test_stop_ends_the_pulses_of_a_board_that_can_be_reached_and_of_one_that_comes_back(events, ticks, last, model):
-    bench = Bench(model)
+    bench = ConnectedBench(model)
     held = bench.enable()
     for count, event in events:
         for _ in range(count):
@@ -153,9 +120,9 @@ def test_stop_ends_the_pulses_of_a_board_that_can_be_reached_and_of_one_that_com
         assert bench.on() == []
 
 
-@given(at=st.integers(1, 150), model=st.sampled_from(list(KINDS)))
+@given(at=st.integers(1, 150), model=st.sampled_from(KINDS))
 def test_torque_off_anywhere_in_enable_ends_it_and_no_pulse_comes_on_afterwards(at, model):
-    bench = Bench(model)
+    bench = ConnectedBench(model)
     bench.adapter.calls, bench.adapter.at = 0, at
     bench.adapter.interrupt = lambda: bench.bus.torque_off("release")
     try:
@@ -176,9 +143,9 @@ def test_torque_off_anywhere_in_enable_ends_it_and_no_pulse_comes_on_afterwards(
     assert bench.on() == list(FIVE)
 
 
-@given(at=st.integers(1, 60), model=st.sampled_from(list(KINDS)))
+@given(at=st.integers(1, 60), model=st.sampled_from(KINDS))
 def test_torque_off_anywhere_in_a_tick_is_the_last_word(at, model):
-    bench = Bench(model)
+    bench = ConnectedBench(model)
     held = bench.enable()
     bench.adapter.calls, bench.adapter.at = 0, at
     bench.adapter.interrupt = lambda: bench.bus.torque_off("release")
@@ -191,17 +158,19 @@ def test_torque_off_anywhere_in_a_tick_is_the_last_word(at, model):
         bench.tick(held)
 
 
-def test_joint_that_must_hold_keeps_its_pulses_in_torque_off(model):
-    bench = Bench(model, stiff=(2,))
+def test_joint_that_must_hold_keeps_its_pulses_when_the_others_are_released(model):
+    bench = ConnectedBench(model, stiff=(2,))
     bench.enable()
     bench.bus.torque_off("hold")
     assert bench.on() == list(FIVE)
     bench.bus.torque_off("release")
     assert bench.on() == [2]
+    bench.bus.stop("release")
+    assert bench.on() == [2]
 
 
 def test_torque_off_waits_for_nothing_and_stop_for_half_a_second_when_the_board_is_mute(model):
-    bench = Bench(model, channels=range(24), baud=9600)
+    bench = ConnectedBench(model, channels=range(24), baud=9600)
     held = bench.enable()
     bench.clock.t += 5.0
     bench.tick(held + 0.1)
@@ -215,7 +184,7 @@ def test_torque_off_waits_for_nothing_and_stop_for_half_a_second_when_the_board_
 
 
 def test_stop_asks_whether_the_pulses_are_off_and_repeats_itself():
-    bench = Bench("maestro-24")
+    bench = ConnectedBench("maestro-24")
     bench.enable()
     receive, lost = bench.board.receive, []
 
@@ -231,7 +200,7 @@ def test_stop_asks_whether_the_pulses_are_off_and_repeats_itself():
 
 
 def test_one_joint_comes_on_within_a_second(model):
-    bench = Bench(model, limit_rad=1.5 if model == "ssc-32" else 1.1, baud=9600)
+    bench = ConnectedBench(model, limit_rad=1.5 if model == "ssc-32" else 1.1, baud=9600)
     for joint in bench.bus.joints:
         start_s = bench.clock.t
         bench.bus.enable([joint])
@@ -239,7 +208,7 @@ def test_one_joint_comes_on_within_a_second(model):
 
 
 def test_torque_off_before_connect_and_after_close_does_nothing(model):
-    bench = Bench(model)
+    bench = ConnectedBench(model)
     bench.enable()
     bench.bus.close()
     sent = [list(port.sent) for port in bench.ports]

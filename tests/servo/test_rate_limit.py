@@ -1,27 +1,15 @@
-from device_port import DevicePort, Time
+from emulated_port import EmulatedPort, Says
 
 from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 
 
-class Echo:
-    """A device that answers with what it heard, as soon as it is told to."""
-
-    def __init__(self):
-        self.waiting = b""
-
-    def receive(self, data, baud, now_s):
-        self.waiting += data
-        return b""
-
-
-def wire_of(device, baud=9600, patience_s=0.02):
-    clock = Time()
-    port = DevicePort(device, baud, clock)
-    return RateLimitedPort(port, baud, patience_s), port, clock
+def wire_of(baud=9600, patience_s=0.02):
+    port = EmulatedPort(Says(b""), baud)
+    return RateLimitedPort(port, baud, patience_s), port, port.clock
 
 
 def test_wire_is_busy_until_its_bytes_have_left():
-    wire, _, clock = wire_of(Echo())
+    wire, _, clock = wire_of()
     assert wire.free
     assert wire.send(bytes(96)) == 0.0
     assert wire.send(bytes(96)) == 0.1
@@ -32,7 +20,7 @@ def test_wire_is_busy_until_its_bytes_have_left():
 
 
 def test_answer_is_taken_when_it_is_whole_and_nobody_waits_for_it():
-    wire, port, clock = wire_of(Echo())
+    wire, port, clock = wire_of()
     wire.request(b"?", 2)
     assert wire.awaiting and wire.answer() is None
     port.inbox += b"a"
@@ -43,7 +31,7 @@ def test_answer_is_taken_when_it_is_whole_and_nobody_waits_for_it():
 
 
 def test_answer_that_is_late_or_too_long_is_none():
-    wire, port, clock = wire_of(Echo())
+    wire, port, clock = wire_of()
     wire.request(b"?", 2)
     clock.t = 1.0
     assert wire.answer() == b""
@@ -53,6 +41,6 @@ def test_answer_that_is_late_or_too_long_is_none():
 
 
 def test_what_was_there_before_the_question_is_no_answer():
-    wire, port, _ = wire_of(Echo())
+    wire, port, _ = wire_of()
     port.inbox += b"ab"
     assert wire.exchange(b"?", 2) is None

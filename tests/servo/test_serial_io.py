@@ -8,16 +8,12 @@ from contextlib import contextmanager
 
 import pytest
 import serial
+from virtual_time import Time
 
 from sfms_robot.config import load_head
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.servo.port import SerialPort
 from sfms_robot.servo.serial_io import PolledIO, RtsDirection, serial_io
-
-
-class Still:
-    def now_s(self) -> float:
-        return 0.0
 
 
 @contextmanager
@@ -101,8 +97,8 @@ def test_a_device_without_a_direction_is_refused_and_left_closed(how, problem):
     tty.setraw(near)
     device = os.ttyname(near)
     with pytest.raises(PortError, match=f"{device}: rs485 = '{how}': .*{problem}"):
-        SerialPort(device, 57600, Still(), how)
-    SerialPort(device, 57600, Still()).close()  # somebody who still held it would be in the way
+        SerialPort(device, 57600, Time(), how)
+    SerialPort(device, 57600, Time()).close()  # somebody who still held it would be in the way
     os.close(near)
     os.close(far)
 

@@ -1,21 +1,20 @@
-import csv
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from published import byte_by_byte, rows
 
 from sfms_robot.servo.codecs import ssc32
 from sfms_robot.servo.codecs.ssc32 import Group, Move, Query, Unknown, maybe_command
 
-ASSET = Path(__file__).parents[1] / "assets" / "board_commands.csv"
-ROWS = csv.DictReader(line for line in ASSET.read_text().splitlines() if not line.startswith("#"))
-PUBLISHED = {row["name"]: row["bytes"].replace("<CR>", "\r").encode() for row in ROWS if row["protocol"] == "ssc32"}
+PUBLISHED = {
+    row["name"]: row["bytes"].replace("<CR>", "\r").encode()
+    for row in rows("board_commands.csv")
+    if row["protocol"] == "ssc32"
+}
 BUILT = {
     "group move": ssc32.group_move({5: Move(1600), 10: Move(750)}, 2500),
     "single with speed": ssc32.group_move({5: Move(1600, 750)}),
     "query movement": ssc32.query_moving(),
-    "query pulse": ssc32.query_pulse(5),
 }
 MEANT = {
     "group move": Group({5: Move(1600), 10: Move(750)}, 2500),
@@ -49,13 +48,8 @@ def test_reader_gives_back_what_the_builder_made(moves, time_ms):
 
 
 def test_command_arriving_one_byte_at_a_time():
-    buffer = bytearray()
     line = ssc32.group_move({1: Move(1500), 2: Move(900, 100)}, 40)
-    for byte in line[:-1]:
-        buffer.append(byte)
-        assert maybe_command(buffer) is None
-    buffer.append(line[-1])
-    assert maybe_command(buffer) == Group({1: Move(1500), 2: Move(900, 100)}, 40)
+    assert byte_by_byte(maybe_command, line) == Group({1: Move(1500), 2: Move(900, 100)}, 40)
 
 
 def test_escape_throws_away_what_came_before_it():

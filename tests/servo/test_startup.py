@@ -1,12 +1,14 @@
 """Startup: who is absent stops nobody, and what a unit has stored against its head's file keeps its torque off."""
 
-import numpy as np
 import pytest
+from chain_rig import ServoRig
+from emulated_devices import device_of
+from emulated_port import BAUD, LossyPort, Straight, link_on
 from hypothesis import given
 from hypothesis import strategies as st
-from lossy_port import BAUD, LossyPort, device_of, link_on
 
 from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
 from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
 from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
@@ -21,40 +23,27 @@ MODELS = ("xl330-m288", "mx-28-2.0", "xl-320", "ax-12a", "mx-28-1.0", "sts3215",
 WITH_TURNS = ("xl330-m288", "mx-28-2.0")
 
 
-class Straight:
-    """The middle of the servo is 0 rad."""
-
-    def __init__(self, table, ratio=1.0):
-        self.center, self.rad = table.center_ticks, 2 * np.pi / table.ticks_per_revolution / ratio
-
-    def to_ticks(self, angles_rad):
-        return np.rint(self.center + np.asarray(angles_rad) / self.rad).astype(np.int64)
-
-    def to_rad(self, ticks):
-        return (ticks - self.center) * self.rad
-
-
-class Rig:
+class Rig(ServoRig):
     """A few servos of one model, and the startup of a bus that wants ids 1, 2, ..."""
 
     def __init__(self, model, *rows, limit_rad=LIMIT_RAD, ratio=1.0, wanted=None, stored=None, safety=None, tries=3):
         firmware_map = load_firmware_map(model)
         self.table = Table.of(firmware_map)
-        self.device = device_of(self.table, *rows)
-        self.port = LossyPort(self.device)
+        usual = {"model": model, "start_ticks": self.table.center_ticks}
+        there = [EmulatedServo(**{"id": i, **usual, **row}) for i, row in enumerate(rows or ({},), 1)]
+        self.port = LossyPort(device_of(*there))
         servos = [
             BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety or Safety(stored=stored or {}))
-            for i in wanted or range(1, 1 + max(1, len(rows)))
+            for i in wanted or range(1, 1 + len(there))
         ]
         kind = Dynamixel2Startup if self.table.protocol == 2 else Protocol1Startup
-        self.conversion = Straight(self.table, ratio)
-        self.needs = needs_of(servos, self.conversion)
+        conversion = Straight(self.table, ratio=ratio)
+        self.needs = needs_of(servos, conversion)
         link = link_on(self.port, self.table)
-        self.startup = kind("face", link, servos, [self.table] * len(servos), self.conversion, BAUD, tries)
+        self.startup = kind("face", link, servos, [self.table] * len(servos), conversion, BAUD, tries)
 
     def held(self, name, servo=1):
-        field = self.table.role(name) or self.table[name]
-        return field.from_bytes(self.device.servo(servo).read(field.address, field.size, self.port.t)[1])
+        return self.register(servo, name)
 
     def values(self):
         """All registers, as doctor reads them."""
@@ -78,7 +67,7 @@ def test_absent_servos_do_not_stop_the_others(model):
     assert rig.startup.run() == {0: 0, 2: 0}
     assert rig.startup.switch_on(2) == rig.table.center_ticks
     assert [rig.held("torque_enable", i) for i in (1, 3)] == [0, 1]
-    assert rig.port.t < 2 * 3 * 2 * PATIENCE_S  # two absent, three pings each, with room for the others
+    assert rig.clock.t < 2 * 3 * 2 * PATIENCE_S  # two absent, three pings each, with room for the others
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -102,7 +91,7 @@ def test_torque_is_on_only_where_the_servo_stands_whatever_is_lost(model, fate):
         assert set(fate) - {""}
     if rig.held("torque_enable"):
         assert rig.held("goal_position") == 500
-    assert rig.device.servo(1).state(rig.port.t)["position"] == pytest.approx(500, abs=1)
+    assert rig.servo(1).state(rig.clock.t)["position"] == pytest.approx(500, abs=1)
 
 
 def test_a_servo_that_was_away_and_is_mute_is_silent_and_not_refused():
@@ -230,17 +219,17 @@ def test_a_joint_turned_by_hand_past_one_turn_starts_where_it_stands(model, foun
     rig.startup.run()
     assert rig.startup.switch_on(0) == found % 4096
     assert rig.held("torque_enable") == 1
-    assert rig.device.servo(1).state(rig.port.t + 1.0)["position"] == found % 4096
+    assert rig.servo(1).state(rig.clock.t + 1.0)["position"] == found % 4096
 
 
 def test_turns_are_not_cleared_under_torque():
     rig = Rig("xl330-m288", {"start_ticks": 4150, "registers": {"operating_mode": 4}})
-    servo = rig.device.servo(1)
+    servo = rig.servo(1)
     for name, value in (("goal_position", 4150), ("torque_enable", 1)):
         servo.write(rig.table[name].address, rig.table[name].to_bytes(value), 0.0)
     with pytest.raises(ServoError, match="present_position is 4150, wanted 54: it was turned past one turn"):
         rig.startup.run()
-    assert servo.state(rig.port.t)["torque"]
+    assert servo.state(rig.clock.t)["torque"]
 
 
 def test_a_servo_that_cannot_forget_its_turns_is_refused_with_the_way_out():
@@ -254,7 +243,7 @@ def test_an_offset_shifts_the_one_turn_that_there_is():
     """Of a servo with a homing offset of a quarter turn, readings up to 5119 are no turn too many."""
     rig = Rig("xl330-m288", {"start_ticks": 5000, "registers": {"homing_offset": 1024}}, stored={"homing_offset": 1024})
     rig.startup.run()
-    assert rig.device.servo(1).state(rig.port.t)["position"] == 5000
+    assert rig.servo(1).state(rig.clock.t)["position"] == 5000
 
 
 # --- more than one turn -----------------------------------------------------------------------------------------
@@ -268,9 +257,9 @@ def test_a_geared_joint_works_in_extended_position_control(model):
     rig.startup.run()
     assert rig.held("operating_mode") == 4 and rig.startup.wanted(0)["operating_mode"] == 4
     rig.startup.switch_on(0)
-    servo, goal = rig.device.servo(1), rig.table["goal_position"]
-    assert servo.write(goal.address, goal.to_bytes(5000), rig.port.t) == 0
-    assert servo.state(rig.port.t + 60.0)["position"] == pytest.approx(5000, abs=2)
+    servo, goal = rig.servo(1), rig.table["goal_position"]
+    assert servo.write(goal.address, goal.to_bytes(5000), rig.clock.t) == 0
+    assert servo.state(rig.clock.t + 60.0)["position"] == pytest.approx(5000, abs=2)
 
 
 @given(ticks=st.integers(-1081, 5177))
@@ -285,17 +274,17 @@ def test_torque_comes_on_only_where_the_lost_count_of_turns_leaves_one_place(tic
     else:
         with pytest.raises(ServoError, match="turns is lost.*by hand to where it will read 1082..3014"):
             rig.startup.run()
-        assert not rig.device.servo(1).state(rig.port.t)["torque"]
+        assert not rig.servo(1).state(rig.clock.t)["torque"]
 
 
 def test_a_geared_joint_that_kept_its_torque_kept_its_count():
     rig = Rig("xl330-m288", **GEARED)
     rig.startup.run()
     rig.startup.switch_on(0)
-    servo, goal = rig.device.servo(1), rig.table["goal_position"]
-    servo.write(goal.address, goal.to_bytes(5000), rig.port.t)
+    servo, goal = rig.servo(1), rig.table["goal_position"]
+    servo.write(goal.address, goal.to_bytes(5000), rig.clock.t)
     servo.advance(60.0)
-    rig.port.t = 60.0
+    rig.clock.t = 60.0
     assert rig.startup.run() == {0: 0}
     assert finish(rig.startup.bring_back(0, reboot=False)) == pytest.approx(5000, abs=2)
 
@@ -303,10 +292,10 @@ def test_a_geared_joint_that_kept_its_torque_kept_its_count():
 def test_a_geared_joint_whose_supply_failed_far_out_stays_without_torque():
     rig = Rig("xl330-m288", {"start_ticks": 2000}, **GEARED)
     rig.startup.run()
-    servo = rig.device.servo(1)
-    servo.turn(5150, rig.port.t)
-    servo.reboot(rig.port.t)
-    rig.port.t += 1.0
+    servo = rig.servo(1)
+    servo.turn(5150, rig.clock.t)
+    servo.reboot(rig.clock.t)
+    rig.clock.t += 1.0
     with pytest.raises(ServoError, match="present_position is 1054.*count of turns"):
         finish(rig.startup.bring_back(0, reboot=False))
 

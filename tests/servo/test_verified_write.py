@@ -1,27 +1,22 @@
 """A verified write: what it returns from is in the servo, whatever was lost; what it gives up is said as it was."""
 
 import pytest
+from emulated_devices import chain_of, table_of
+from emulated_port import SILENCE_S, LossyPort, link_on
 from hypothesis import given
 from hypothesis import strategies as st
-from lossy_port import SILENCE_S, LossyPort, device_of, link_on
 
-from sfms_robot.config import load_firmware_map
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain.verified_write import Silent, finish, verified_write
-from sfms_robot.servo.registers import Table
 
 MODELS = ("xl330-m288", "xl-320", "ax-12a", "mx-28-1.0", "sts3215", "scs0009")
 FATES = st.lists(st.sampled_from(["", "", "request", "answer"]), max_size=24)
 
 
-def table_of(model):
-    return Table.of(load_firmware_map(model))
-
-
 def rig(model, fate=()):
     table = table_of(model)
-    device = device_of(table)
-    port = LossyPort(device, iter(fate))
+    device = chain_of(model)
+    port = LossyPort(device, fate=iter(fate))
     return table, device.servo(1), port, link_on(port, table)
 
 
@@ -39,7 +34,7 @@ def test_what_was_written_is_there_or_an_error_says_that_it_may_not_be(model, fa
     except ServoError:
         assert "request" in fate or "answer" in fate
     else:
-        assert held(servo, field, port.t) == table.center_ticks + 7
+        assert held(servo, field, port.clock.t) == table.center_ticks + 7
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -47,9 +42,9 @@ def test_a_lost_acknowledgement_costs_its_silence_and_nothing_else(model):
     table, servo, port, link = rig(model, ["answer"])
     field = table.role("goal_position")
     finish(verified_write(link, 1, field, table.center_ticks - 5))
-    assert held(servo, field, port.t) == table.center_ticks - 5
-    assert port.packets == 2  # written once: the value read back is what counts
-    assert SILENCE_S < port.t < 2 * SILENCE_S
+    assert held(servo, field, port.clock.t) == table.center_ticks - 5
+    assert len(port.sent) == 2  # written once: the value read back is what counts
+    assert SILENCE_S < port.clock.t < 2 * SILENCE_S
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -57,7 +52,7 @@ def test_a_lost_request_is_repeated(model):
     table, servo, port, link = rig(model, ["request"])
     field = table.role("goal_position")
     finish(verified_write(link, 1, field, table.center_ticks + 9))
-    assert held(servo, field, port.t) == table.center_ticks + 9
+    assert held(servo, field, port.clock.t) == table.center_ticks + 9
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -66,7 +61,7 @@ def test_a_silent_servo_is_named_and_costs_a_bounded_time(model, tries):
     table, servo, port, link = rig(model, ["request"] * 99)
     with pytest.raises(Silent, match="joint_a .* does not answer to"):
         finish(verified_write(link, 1, table.role("goal_position"), 5, tries=tries, about="joint_a (id 1)"))
-    assert port.t <= 3 * tries * (SILENCE_S + 0.0005)  # a write, a read back, and what the link asks to be sure
+    assert port.clock.t <= 3 * tries * (SILENCE_S + 0.0005)  # a write, a read back, and what the link asks to be sure
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -75,8 +70,8 @@ def test_a_running_bus_is_told_to_end_its_tick_after_a_silence(model):
     began_s, waits = 0.0, []
     steps = verified_write(link, 1, table.role("goal_position"), table.center_ticks)
     for wait_s in steps:
-        waits.append((port.t - began_s >= SILENCE_S, wait_s > 0))
-        began_s = port.t
+        waits.append((port.clock.t - began_s >= SILENCE_S, wait_s > 0))
+        began_s = port.clock.t
     assert len(waits) >= 3
     assert all(silent == told for silent, told in waits)
 
@@ -84,7 +79,7 @@ def test_a_running_bus_is_told_to_end_its_tick_after_a_silence(model):
 def test_a_value_that_is_not_taken_is_told_with_both():
     """A servo of the old frame acknowledges what it does not take: torque after a shutdown."""
     table, servo, port, link = rig("sts3215")
-    servo.fail_named("overheating", port.t)
+    servo.fail_named("overheating", port.clock.t)
     with pytest.raises(ServoError, match="id 1: torque_enable was set to 1 and reads 0"):
         finish(verified_write(link, 1, table.role("torque_enable"), 1))
 
@@ -100,7 +95,7 @@ def test_a_value_that_does_not_fit_is_refused_with_nothing_sent():
     table, _, port, link = rig("xl330-m288")
     with pytest.raises(ServoError, match="torque_enable = 300 does not fit"):
         finish(verified_write(link, 1, table["torque_enable"], 300))
-    assert port.packets == 0
+    assert len(port.sent) == 0
 
 
 @pytest.mark.parametrize("model", ["sts3215", "scs0009"])
@@ -113,16 +108,16 @@ def test_eeprom_behind_a_lock_is_kept_for_good_and_the_lock_is_closed(model, fat
     except ServoError:
         assert fate
         return
-    assert held(servo, lock, port.t) == 1
-    servo.power_cycle(port.t)
-    assert held(servo, field, port.t) == 7
+    assert held(servo, lock, port.clock.t) == 1
+    servo.power_cycle(port.clock.t)
+    assert held(servo, field, port.clock.t) == 7
 
 
 def test_a_write_that_is_dropped_half_way_closes_the_lock():
     table, servo, port, link = rig("sts3215")
     lock = table.role("lock")
     steps = verified_write(link, 1, table.role("return_delay"), 7, lock=lock)
-    while held(servo, lock, port.t) or port.packets < 3:
+    while held(servo, lock, port.clock.t) or len(port.sent) < 3:
         next(steps)
     steps.close()
-    assert held(servo, lock, port.t) == 1
+    assert held(servo, lock, port.clock.t) == 1

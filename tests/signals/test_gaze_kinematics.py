@@ -96,7 +96,9 @@ def test_the_eyes_leave_first_and_the_head_arrives_after_them(seed):
 @settings(max_examples=20, deadline=None)
 def test_the_head_hardly_moves_for_a_small_shift_and_has_a_larger_share_of_a_larger_one(seed):
     state = gaze.start(seed)
-    shares = [gaze.head_share((math.radians(size), 0.0), state.share)[0] / math.radians(size) for size in (4, 8, 16, 28)]
+    shares = [
+        gaze.head_share((math.radians(size), 0.0), state.share)[0] / math.radians(size) for size in (4, 8, 16, 28)
+    ]
     assert shares == sorted(shares)
     assert shares[0] < 0.16 and shares[1] < 0.3 and shares[-1] > 0.3
 

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from sfms_robot.app.bench.measure import HEAD, Row, row
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
-from sfms_robot.config import Head, load_firmware_map
+from sfms_robot.app.wiring import calibration_of
+from sfms_robot.config import Head
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.motion.calibration import Calibration
-from sfms_robot.ports import Clock, Tick
+from sfms_robot.ports import Clock, Observer, Tick
 from sfms_robot.runtime.feed import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt
 
@@ -85,13 +85,12 @@ class Waves:
     def close(self) -> None: ...
 
 
-class Onlooker:
-    """`ports.Observer` that reads the shafts off the emulated servos, whether or not their bus can."""
+class Onlooker(Observer):
+    """Reads the shafts off the emulated servos, whether or not their bus can."""
 
     def __init__(self, head: Head, chains: dict[str, Chain], clock: Clock) -> None:
         self._head, self._chains, self._clock = head, chains, clock
-        turns = [load_firmware_map(joint.model).ticks_per_revolution for joint in head.joints.values()]
-        self._calibration = Calibration(head.joints, np.array(turns))
+        self._calibration = calibration_of(head.joints)
         self.times_s: list[float] = []
         self.angles_rad: list[Doubles] = []
 
@@ -101,12 +100,6 @@ class Onlooker:
         ticks = [self._chains[joint.bus].state(joint.id)["position"] for joint in self._head.joints.values()]
         self.times_s.append(seen.time_s)
         self.angles_rad.append(self._calibration.to_rad(np.array(ticks)))
-
-    def heard(self, frame: SpeakerFrame) -> None: ...
-
-    def planned(self, plan: Plan) -> None: ...
-
-    def close(self) -> None: ...
 
 
 def delays(head: str, duration_s: float = DURATION_S) -> Delays:

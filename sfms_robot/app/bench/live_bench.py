@@ -41,7 +41,7 @@ from sfms_robot.emulator.phone import EmulatedPhone
 from sfms_robot.emulator.sound_server import SoundServer
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import AUDIO_HZ
-from sfms_robot.ports import Source
+from sfms_robot.ports import Observer, Source
 from sfms_robot.runtime.clock import RealClock, tick_times
 from sfms_robot.runtime.safety import realtime_priority
 from sfms_robot.signals.audio import read_audio
@@ -301,7 +301,7 @@ def _push(voice: PushedVoice, over: threading.Event) -> None:
         piece += 1
 
 
-class ProcessorTime:
+class ProcessorTime(Observer):
     """An observer of processor time: of this process and those that it started, between two ticks a second apart."""
 
     def __init__(self) -> None:
@@ -317,12 +317,6 @@ class ProcessorTime:
         self._last_s, self._last = time.monotonic(), processor_times_s()
         if self._first is None:
             self._first_s, self._first = self._last_s, self._last
-
-    def heard(self, frame: object) -> None: ...
-
-    def planned(self, plan: object) -> None: ...
-
-    def close(self) -> None: ...
 
     def report(self) -> dict[str, float]:
         """Seconds a second, by role."""

@@ -14,8 +14,8 @@ from typing import Final
 from sfms_robot.app.bench.lead import Waves
 from sfms_robot.app.bench.measure import Row, row
 from sfms_robot.app.session import RunOptions, run
-from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.errors import BusError
+from sfms_robot.ports import Observer, Tick
 
 HEAD: Final = "interbotix_wxxms"  # two servos: hours pass quickly
 HOURS: Final = 4.0
@@ -23,7 +23,7 @@ _HOUR_S: Final = 3600.0
 _LOOKS: Final = 20  # an hour
 
 
-class ResidentMemory:
+class ResidentMemory(Observer):
     """An observer that looks at the memory of its own process every so often."""
 
     def __init__(self, every_s: float = _HOUR_S / _LOOKS) -> None:
@@ -38,19 +38,18 @@ class ResidentMemory:
             self.times_s.append(seen.time_s)
             self.resident_mb.append(pages * self._page_mb)
 
-    def heard(self, frame: SpeakerFrame) -> None: ...
-
-    def planned(self, plan: Plan) -> None: ...
-
-    def close(self) -> None: ...
-
 
 def memory(hours: float = HOURS) -> dict[str, Row]:
-    """Growth after the first hour in MB, beside what was resident then; Linux only."""
+    """Growth after the first hour in MB, beside what was resident then; Linux only.
+
+    Raises BusError when the run does not come to its end.
+    """
     looks = ResidentMemory()
     with TemporaryDirectory() as folder:
         options = RunOptions(head=HEAD, fast=True, audio="none", duration_s=hours * _HOUR_S, record=Path(folder))
-        run(options, feed=Waves(), observers=[looks], signals=False)
+        report = run(options, feed=Waves(), observers=[looks], signals=False)
+    if report["exit"] != "done":
+        raise BusError(f"bench memory: the run ended early ({report['exit']}: {report['error']})")
     settled = _between(looks, min(1.0, hours / 2) * _HOUR_S, float("inf"))
     return {"memory.growth": row([settled[-1] - settled[0]], [settled[0]], "MB", "resident after the first hour")}
 

@@ -17,7 +17,7 @@ from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.ports import Source, Tick
+from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.runtime.feed import IDLE_FEED
 from sfms_robot.runtime.safety import EASE_S, Interrupt, smooth
 
@@ -158,8 +158,8 @@ class NobodyThere(Source):
         return IDLE_FEED
 
 
-class Furthest:
-    """An observer of how far from rest each joint was sent once the face began to rise, and how far it went."""
+class Furthest(Observer):
+    """How far from rest each joint was sent once the face began to rise, and how far it went."""
 
     def __init__(self, joints: Sequence[str], rest_rad: Doubles) -> None:
         self._joints, self._rest_rad = tuple(joints), rest_rad
@@ -175,15 +175,6 @@ class Furthest:
             at = seen.readings[joint].position_rad if joint in seen.readings else None
             if at is not None and abs(at - rest) >= abs(self._reached.get(joint, 0.0)):
                 self._reached[joint] = float(at - rest)
-
-    def heard(self, frame: SpeakerFrame) -> None:
-        """Nobody speaks."""
-
-    def planned(self, plan: Plan) -> None:
-        """Nobody listens."""
-
-    def close(self) -> None:
-        """Nothing is open."""
 
     def moved(self) -> dict[str, dict[str, float | None]]:
         """Joints that were sent away from rest, in degrees from there; None where a servo does not tell."""

@@ -14,7 +14,6 @@ from sfms_robot import config
 from sfms_robot.config import load
 from sfms_robot.evaluation.baselines.dense import DenseTokenizer
 from sfms_robot.evaluation.baselines.grouped import GroupedTokenizer
-from sfms_robot.evaluation.keyframe_bits import bits_per_window
 from sfms_robot.frames import BLENDSHAPES, CHANNELS
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import Tokenizer
@@ -87,13 +86,20 @@ class TableModel(nn.Module):
         codes = [group.codes for group in settings.groups.values()]
         if (strategy or settings.placement) in FREE_PLACES:
             return sum(n * math.log2(size) for n, size in zip(counts, codes, strict=True))
-        return bits_per_window(self.window, counts, codes)
+        return sum(keyframe_bits(self.window, k, n) for k, n in zip(counts, codes, strict=True))
 
     def sparse(self) -> Tokenizer:
         """The tokenizer, where it has keyframes."""
         if not isinstance(self.tokenizer, Tokenizer):
             raise TypeError(f"{self.recipe.model.kind} has no keyframes")
         return self.tokenizer
+
+
+def keyframe_bits(frames: int, k: int, codes: int) -> float:
+    """One track of a window: which k of its frames (log2 of the binomial) and k codes out of `codes`."""
+    if not 0 <= k <= frames:
+        raise ValueError(f"{k} keyframes in {frames} frames")
+    return math.log2(math.comb(frames, k)) + k * math.log2(codes)
 
 
 def _tokenizer(recipe: config.Recipe) -> Tokenizer | DenseTokenizer:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,10 @@ from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.resume import digest_of
 from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
 from sfms_robot.learning.sfms.losses import next_tokens
+from sfms_robot.learning.sfms.missed_keyframes import without_last_keyframes
 from sfms_robot.learning.sfms.soft_dtw import keyframe_dtw
 from sfms_robot.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
-from sfms_robot.learning.sfms.tokens import held_tokens, tokenise
+from sfms_robot.learning.sfms.tokens import held_tokens, keyframe_tokens, tokenise
 from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
@@ -83,6 +85,8 @@ def listener_job(
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
     held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+    motion = model.standardise(corpus.frames.motion)
+    dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
 
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
 
@@ -100,7 +104,15 @@ def listener_job(
         seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
         seen = augment(seen, levels, neutral, phase, generator)
         target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
-        return _loss(model, seen, target, settings, generator)
+        return _loss(model, seen, target, settings, generator, partial(missing, chosen, generator))
+
+    def missing(chosen: Tensor, generator: torch.Generator, meant: Tensor, first: Tensor) -> Tensor:
+        if not phase.missed_keyframes:
+            return meant
+        cut = [windows(one, chosen, listener.window_frames) for one in (dense, motion)]
+        costs = torch.tensor(model.tokenizer.costs, device=device)
+        member, share = model.tokenizer.member, phase.missed_keyframes
+        return without_last_keyframes(meant, *cut, first, member, costs, share, generator)
 
     return Job(
         name="listener",
@@ -139,14 +151,24 @@ def corrected(settings: config.Training) -> config.Sfms:
 
 
 def _loss(
-    model: SfmsModel, seen: Context, target: Tensor, settings: config.Training, generator: torch.Generator
+    model: SfmsModel,
+    seen: Context,
+    target: Tensor,
+    settings: config.Training,
+    generator: torch.Generator,
+    missing: Callable[[Tensor, Tensor], Tensor] = lambda meant, first: meant,
 ) -> Tensor:
     """Cross-entropy (14) and soft-DTW on the future behind a random number of frames that are drawn already.
 
-    None of them drawn is the paper's training; a stream of hop 4 plans with 4 of them drawn.
+    None of them drawn is the paper's training; a stream of hop 4 plans with 4 of them drawn. `missing`: tokens
+    (B, P + H, G) and the first frame to draw (B,) -> those that are seen and learned instead.
     """
     training, (b, h, _) = settings.predictor, target.shape
-    drawn = (torch.arange(h) < torch.randint(h, (b, 1), generator=generator)).to(target.device)  # (B, H)
+    count = torch.randint(h, (b, 1), generator=generator).to(target.device)
+    drawn = torch.arange(h, device=target.device) < count  # (B, H)
+    past = seen.tokens[:, :-h]
+    meant = missing(torch.cat([past, target], dim=1), past.shape[1] + count[:, 0])
+    seen, target = replace(seen, tokens=torch.cat([meant[:, :-h], seen.tokens[:, -h:]], dim=1)), meant[:, -h:]
     future = torch.where(drawn[..., None], target, UNDECIDED)
     seen = replace(seen, tokens=torch.cat([seen.tokens[:, :-h], future], dim=1))
     logits = model.predictor.teacher_forced(seen, target)

@@ -13,9 +13,9 @@ from sfms_robot.frames import FRAME_HZ, Doubles, Floats, ListenerEvent
 from sfms_robot.listeners.sfms.sway import BANDS, BANDS_HZ
 
 CUT_HZ: Final = 1.0
-HEAD_KINDS: Final = ("nod", "shake", "tilt", "laugh")  # events that move the head
+HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head
 MARGIN_FRAMES: Final = 2  # around an event that may still be it
-UNKNOWN: Final = 1e-6  # weight of a frame in which sway cannot be seen
+UNKNOWN: Final = 1e-4  # weight of a frame in which sway cannot be seen: below 0.1 Hz it still counts
 LONGEST: Final = 2048  # frames of a spectrum
 
 

@@ -46,8 +46,14 @@ def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Tokens (N, G) of every listener in the corpus."""
     motion = model.standardise(corpus.frames.motion)
     mask = place_all(model.tokenizer, motion, corpus.lengths)
-    parts = zip(torch.split(motion, 4096), torch.split(mask, 4096), strict=True)
-    return torch.cat([model.tokenizer.encode(m[None], k[None])[0] for m, k in parts])
+    return torch.where(mask > 0.5, keyframe_tokens(model, motion), 0)
+
+
+@torch.no_grad()
+def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
+    """What each frame of standardised motion (N, C) would be as a keyframe (N, G)."""
+    quantizer = model.tokenizer.quantizer
+    return torch.cat([quantizer.indices(quantizer.encode(m[None]))[0] + 1 for m in torch.split(motion, 4096)])
 
 
 def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:

@@ -6,8 +6,8 @@ anything. There are two ways to the same numbers: of whole recordings (`heard_in
 (`hear`, `done`).
 
 Of the others' voices together (`signals.phase`): how long the phrase lasts so far, their silence, the last phrase. The
-floor is held by whoever, oneself among them, was the latest to speak for a second. Whose look counts: of those who
-speak now, else of the holder of the floor.
+floor is held by whoever, oneself among them, is in a phrase of a second or more; of several the latest to begin, and
+the last one while nobody is. Whose look counts: of those who speak now, else of the holder of the floor.
 """
 
 from __future__ import annotations
@@ -132,11 +132,9 @@ def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
     frames, people = speaks.shape
     index = np.arange(frames)
     lengths = np.stack([phase.times(speaks[:, who])[:, 0] for who in range(people)], axis=1)
-    long = lengths > (FLOOR_FRAMES - 0.5) * FRAME_S
-    takes = long & ~np.concatenate([np.zeros((1, people), bool), long])[:-1]
-    taker = np.where(takes.any(axis=1), people - 1 - np.argmax(takes[:, ::-1], axis=1), _NOBODY)
-    newest = np.maximum.accumulate(np.where(taker >= 0, index, -1))
-    holder = np.where(newest >= 0, taker[newest], _NOBODY)
+    lengths[lengths < (FLOOR_FRAMES - 0.5) * FRAME_S] = np.inf
+    newest = np.maximum.accumulate(np.where(np.isfinite(lengths).any(axis=1), index, -1))
+    holder = np.where(newest >= 0, np.argmin(lengths, axis=1)[newest], _NOBODY)
     changed = holder != np.r_[_NOBODY, holder][:-1]
     return holder, np.maximum.accumulate(np.where(changed, index, 0))
 
@@ -191,9 +189,9 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
     each = tuple(one.after(speaks) for one, speaks in zip(before.each, instant.speaks, strict=True))
     spoke = tuple(now if speaks else at for speaks, at in zip(instant.speaks, before.spoke, strict=True))
     holder, held = before.holder, before.held
-    for who, (one, was) in enumerate(zip(each, before.each, strict=True)):
-        if one.speech >= FLOOR_FRAMES > was.speech:
-            holder = who
+    long = [(one.speech, who) for who, one in enumerate(each) if one.speech >= FLOOR_FRAMES]
+    if long:
+        holder = min(long)[1]
     if holder != before.holder:
         held = now
     counts = [

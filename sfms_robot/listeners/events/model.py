@@ -3,8 +3,8 @@
     person's frame -> evidence (sensing) -> log-odds of each kind (hazards) -> a number drawn falls below: event
 
 A hazard is asked every 80 ms. What is decided begins `LEAD_FRAMES` after the next frame's beginning, so that a plan
-made every second frame still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a shake or
-a tilt; nobody nods, laughs or says "mm-hm" who is speaking or has not been spoken to for two seconds.
+made every second frame still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a
+shake or a tilt; nobody nods, laughs or says "mm-hm" who is speaking or has not been spoken to for two seconds.
 
 Laws: the same evidence and seed give the same events; a later frame changes nothing before; memory is never changed in
 place; hazards are finite whatever comes in; more of a `Calmness` rate is never less of its hazard.

@@ -10,6 +10,9 @@ still, and restlessness that nobody called for rarer. The paper has none, which 
 
 Listeners are trained while somebody speaks. When nobody has for a while (from 1.6 s of silence on, wholly from 3.2 s)
 little was learned: guidance fades to 1 there, and a group may draw from a smaller nucleus, which keeps it still.
+
+Both made rare nods come when they should. A listener that is told of events has no need of them: its nods are decided
+elsewhere. The weights of 0.1.0 have.
 """
 
 from __future__ import annotations

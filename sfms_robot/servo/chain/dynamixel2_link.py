@@ -108,15 +108,6 @@ class Dynamixel2Link(RegisterLink):
             return ""
         return dxl2.error_text(answer.error) + (", and reports a hardware error" if answer.error & dxl2.ALERT else "")
 
-    def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
-        """As `write`, but kept by the servo until `action`."""
-        self._send(dxl2.encode_instruction(servo, dxl2.REG_WRITE, address.to_bytes(2, "little") + data))
-        return self._answer(servo, 0)
-
-    def action(self) -> None:
-        """All registered writes take effect at once. Nothing answers."""
-        self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.ACTION))
-
     # --- many servos --------------------------------------------------------------------------------------------
 
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:

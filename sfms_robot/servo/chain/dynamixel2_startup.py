@@ -11,14 +11,12 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.link import Found
 from sfms_robot.servo.chain.startup import Silent, Startup, Steps
-from sfms_robot.servo.policy import torque_limit
 from sfms_robot.servo.registers import Table
-from sfms_robot.servo.stored_settings import contradictions, operating_mode
+from sfms_robot.servo.stored_settings import contradictions
 
 log = logging.getLogger(__name__)
 
 _TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
-_UNLIMITED: Final = ("profile_acceleration", "profile_velocity", "moving_speed")  # 0 = none; the last of the XL-320
 _REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
 _AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers that startup reads
 
@@ -27,6 +25,7 @@ class Dynamixel2Startup(Startup[Dynamixel2Link]):
     """`Startup` with servos that tell their firmware, which decides where their registers lie."""
 
     can_reboot = True
+    unlimited = ("profile_acceleration", "profile_velocity", "moving_speed")  # the last of the XL-320
 
     @property
     def family(self) -> str:
@@ -56,19 +55,12 @@ class Dynamixel2Startup(Startup[Dynamixel2Link]):
         self._acknowledge(index)
         now = yield from self._clear_turns(index, (yield from self._state(index)))
         now = yield from self._release_outside(index, now)
-        torque = now[self._name(index, "torque_enable")]
         for name, target in self._settings(index, now).items():
             if name not in now:
                 now[name] = self.value(index, table[name])
                 yield 0.0
-            if now[name] == target:
-                continue
-            if table[name].eeprom and torque:
-                if name == self._name(index, "return_delay"):
-                    continue  # slower, not wrong
-                raise self._error(index, f"has torque on and {name} {now[name]}, must be {target}: release it first")
-            yield from self._write(index, table[name], target)
-            if name == self._name(index, "operating_mode"):
+            written = yield from self._set(index, now, name, target)
+            if written and name == self._name(index, "operating_mode"):
                 now = yield from self._state(index)  # another mode resets gains, profile and goals
         error = table.role("error_status")
         return now[error.name] if error is not None else 0
@@ -89,17 +81,6 @@ class Dynamixel2Startup(Startup[Dynamixel2Link]):
         yield 0.0
         yield from self.prepare(index)
         return (yield from self.torque_on(index))
-
-    def wanted(self, index: int) -> Mapping[str, int]:
-        table, safety = self.tables[index], self._servos[index].safety
-        mode = operating_mode(table, self._needs[index])
-        wanted = {} if mode is None else {self._name(index, "operating_mode"): mode}
-        current = table.fields.get("goal_current")
-        if current is not None and safety.current_limit_mA is not None:
-            wanted[current.name] = min(current.high, round(safety.current_limit_mA / current.scale))
-        wanted |= dict.fromkeys(_UNLIMITED, 0)
-        wanted |= torque_limit(self._servos[index])
-        return {name: value for name, value in wanted.items() if name in table.fields} | self._registers(index)
 
     def _settings(self, index: int, now: Mapping[str, int]) -> dict[str, int]:
         """Register values before torque; the mode comes first, since it resets others."""

@@ -89,14 +89,6 @@ class Protocol1Link(RegisterLink):
         """Feetech has no bit that says so: its error byte is about the servo alone."""
         return dxl1.refusal_text(answer.error) if self.family == "dynamixel" else ""
 
-    def reg_write(self, servo: int, address: int, data: bytes) -> Answer | None:
-        """A write that the servo keeps until `action`."""
-        return self._ask(servo, protocol1.REG_WRITE, bytes([address]) + data, 0)
-
-    def action(self) -> None:
-        """Carry out what was kept, all servos at once. Nothing answers."""
-        self._send(BROADCAST, protocol1.ACTION, b"")
-
     def reboot(self, servo: int) -> Answer | None:
         """Raises PacketError: there is no such instruction in these protocols."""
         raise PacketError(

@@ -7,7 +7,6 @@ the servo stands. They have no reboot, and tell their faults in every answer.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
 
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain.link import Found
@@ -17,15 +16,13 @@ from sfms_robot.servo.chain.verified_write import finish
 from sfms_robot.servo.codecs import feetech
 from sfms_robot.servo.policy import torque_limit
 from sfms_robot.servo.registers import Field
-from sfms_robot.servo.stored_settings import operating_mode
-
-_UNLIMITED: Final = ("moving_speed", "goal_velocity", "acceleration", "goal_acceleration", "goal_time")  # 0 = none
 
 
 class Protocol1Startup(Startup[Protocol1Link]):
     """`Startup` with servos that have no reboot, and tell their faults in every answer."""
 
     can_reboot = False
+    unlimited = ("moving_speed", "goal_velocity", "acceleration", "goal_acceleration", "goal_time")
 
     @property
     def family(self) -> str:
@@ -55,15 +52,10 @@ class Protocol1Startup(Startup[Protocol1Link]):
             self._acknowledge(index)
         yield 0.0
         now = yield from self._release_outside(index, (yield from self._snapshot(index, table.size)))
-        torque = now[self._name(index, "torque_enable")]
         for name, target in self._settings(index, now).items():
-            if now[name] == target or (name == self._name(index, "torque_limit") and not now[name]):
+            if name == self._name(index, "torque_limit") and not now[name]:
                 continue  # a torque limit of 0 is a shutdown, and stays until the goal is where the servo stands
-            if torque and table[name].eeprom:
-                if name == self._name(index, "return_delay"):
-                    continue  # slower, and no reason to let go
-                raise self._error(index, f"has torque on and {name} {now[name]}, must be {target}: release it first")
-            yield from self._write(index, table[name], target)
+            yield from self._set(index, now, name, target)
         return 0
 
     def bring_back(self, index: int, reboot: bool) -> Steps[int]:
@@ -72,13 +64,6 @@ class Protocol1Startup(Startup[Protocol1Link]):
         yield 0.0
         yield from self.prepare(index)
         return (yield from self.torque_on(index))
-
-    def wanted(self, index: int) -> Mapping[str, int]:
-        table = self.tables[index]
-        mode = operating_mode(table, self._needs[index])
-        wanted = {} if mode is None else {self._name(index, "operating_mode"): mode}
-        wanted |= dict.fromkeys(_UNLIMITED, 0) | torque_limit(self._servos[index])
-        return {name: value for name, value in wanted.items() if name in table.fields} | self._registers(index)
 
     def _settings(self, index: int, now: Mapping[str, int]) -> dict[str, int]:
         """Position mode, no delay, no speed limit of its own, all of its torque unless the head's file says less."""

@@ -30,9 +30,16 @@ from sfms_robot.servo.chain.slow_profile import SPEED_DEG_S, WayInside, slow_pro
 from sfms_robot.servo.chain.verified_write import TRIES, finish, verified_write
 from sfms_robot.servo.chain.verified_write import Silent as Silent
 from sfms_robot.servo.chain.verified_write import Steps as Steps
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.policy import BusServo, torque_limit
 from sfms_robot.servo.registers import Field, Table
-from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names, limits_count
+from sfms_robot.servo.stored_settings import (
+    Contradiction,
+    JointNeeds,
+    contradictions,
+    limit_names,
+    limits_count,
+    operating_mode,
+)
 
 L = TypeVar("L", bound=RegisterLink)
 
@@ -56,9 +63,11 @@ class Startup(ABC, Generic[L]):
 
     Attributes:
         can_reboot: whether the protocol has an instruction for it.
+        unlimited: registers of speed and acceleration, in which 0 is no limit.
     """
 
     can_reboot: ClassVar[bool]
+    unlimited: ClassVar[tuple[str, ...]]
 
     def __init__(
         self,
@@ -220,15 +229,37 @@ class Startup(ABC, Generic[L]):
         yield from self._write(index, torque, 0)
         return {**now, torque.name: 0}
 
-    @abstractmethod
     def wanted(self, index: int) -> Mapping[str, int]:
         """Registers and values that are to be in force as long as the bus runs: mode, profile, torque limit, and those
         of the head's file. Raises ServoError for a register that the model does not have.
         """
+        table, safety = self.tables[index], self._servos[index].safety
+        mode = operating_mode(table, self._needs[index])
+        wanted = {} if mode is None else {self._name(index, "operating_mode"): mode}
+        current = table.fields.get("goal_current")
+        if current is not None and safety.current_limit_mA is not None:
+            wanted[current.name] = min(current.high, round(safety.current_limit_mA / current.scale))
+        wanted |= dict.fromkeys(self.unlimited, 0) | torque_limit(self._servos[index])
+        return {name: value for name, value in wanted.items() if name in table.fields} | self._registers(index)
 
     def _restore_torque(self, index: int) -> Steps[None]:
         """What a servo took back when it shut down."""
         yield from ()
+
+    def _set(self, index: int, now: Mapping[str, int], name: str, target: int) -> Steps[bool]:
+        """Write a register that holds another value; whether it was written. `now`: what they hold.
+
+        Raises ServoError for one of the EEPROM under torque.
+        """
+        field = self.tables[index][name]
+        if now[name] == target:
+            return False
+        if field.eeprom and now[self._name(index, "torque_enable")]:
+            if name == self._name(index, "return_delay"):
+                return False  # slower, and no reason to let go
+            raise self._error(index, f"has torque on and {name} {now[name]}, must be {target}: release it first")
+        yield from self._write(index, field, target)
+        return True
 
     def own_limits(self, index: int) -> tuple[int, int] | None:
         """The position limits stored in the servo, ticks; None where it has none or they do not count."""

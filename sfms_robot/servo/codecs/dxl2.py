@@ -99,16 +99,16 @@ def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:
     return _encode(servo, (bytes([STATUS, error]) + data).replace(_LOOKALIKE, _STUFFED))
 
 
-def encode_fast_status(replies: Iterable[tuple[int, int, bytes]]) -> bytes:
+def encode_fast_status(replies: Iterable[tuple[int, int, bytes]], length: int | None = None) -> bytes:
     """The one status packet that answers a fast sync read; `replies` are (id, error, data) in list order.
 
     Each device appends error, id, data and the crc of everything so far; the last crc closes the packet. Nothing is
-    stuffed: a device cannot know what the ones before it sent.
+    stuffed: a device cannot know what the ones before it sent. `length`: what LEN says where the packet stops short.
     """
     parts = [bytes([error, servo]) + data for servo, error, data in replies]
-    # LEN counts from the instruction on: 1, then error, id, data and crc of each device.
-    out = _HEADER + bytes([BROADCAST]) + (1 + sum(len(part) + 2 for part in parts)).to_bytes(2, "little")
-    out += bytes([STATUS])
+    if length is None:  # LEN counts from the instruction on: 1, then error, id, data and crc of each device
+        length = 1 + sum(len(part) + 2 for part in parts)
+    out = _HEADER + bytes([BROADCAST]) + length.to_bytes(2, "little") + bytes([STATUS])
     for part in parts:
         out += part
         out += crc16(out).to_bytes(2, "little")

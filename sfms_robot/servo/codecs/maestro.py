@@ -3,7 +3,7 @@
 1. A command byte has its top bit set, data bytes do not; so a reader that lost its place finds it again at the next
    command byte. Words of 14 bits travel low seven bits first. (The one exception, Mini SSC, takes 0..254.)
 2. Compact protocol: command, data. Pololu protocol, for several boards on one wire: AA, device number, command
-   without its top bit, data. With CRC enabled on the board, either is followed by one CRC-7 byte.
+   without its top bit, data. (A third form, with CRC, is not spoken here.)
 3. Targets and positions are in quarter microseconds of pulse; target 0 switches the pulses off.
 4. A board that detects its baud rate hears nothing before the byte AA.
 5. Only two bytes or one ever come back, without any frame: to `GET_POSITION`, `GET_MOVING` and `GET_ERRORS`.
@@ -35,7 +35,6 @@ FACTORY_PULSE_US: Final = (992, 2000)  # of every channel; wider is set over USB
 
 # Bits of the error register, section 4.e; bits 6 to 8 are the script's.
 SIGNAL_ERROR: Final = 1 << 0  # Serial Signal Error: a stop bit was not where it should be
-CRC_ERROR: Final = 1 << 3  # Serial CRC Error (bits 1 and 2: overrun, buffer full)
 PROTOCOL_ERROR: Final = 1 << 4  # Serial Protocol Error: a command that is none, or one cut short
 TIMEOUT_ERROR: Final = 1 << 5  # Serial Timeout: no command for as long as its setting says
 WIRE_ERRORS: Final = 0x1F  # bytes were lost or damaged on the way: nothing is wrong with the board itself
@@ -60,16 +59,6 @@ class Command(NamedTuple):
     error: int = 0
 
 
-def crc7(data: bytes) -> int:
-    """CRC-7, polynomial 0x91, low bit first."""
-    crc = 0
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc ^ 0x91) >> 1 if crc & 1 else crc >> 1
-    return crc
-
-
 def word(value: int) -> bytes:
     """14 bits as two data bytes. Raises ValueError for what does not fit."""
     if not 0 <= value <= MAX_WORD:
@@ -92,38 +81,14 @@ def set_targets(first: int, quarter_us: Sequence[int]) -> bytes:
     return bytes([SET_TARGETS, len(quarter_us), first]) + b"".join(map(word, quarter_us))
 
 
-def set_speed(channel: int, speed: int) -> bytes:
-    """`speed` in quarter microseconds per 10 ms; 0 = no limit."""
-    return bytes([SET_SPEED, channel]) + word(speed)
-
-
-def set_acceleration(channel: int, acceleration: int) -> bytes:
-    """`acceleration` 0..255 in quarter microseconds per 10 ms per 80 ms; 0 = no limit."""
-    return bytes([SET_ACCELERATION, channel]) + word(acceleration)
-
-
 def get_position(channel: int) -> bytes:
     """Answered by two bytes, low byte first: the pulse sent now, in quarter microseconds; 0 = none."""
     return bytes([GET_POSITION, channel])
 
 
-def get_moving() -> bytes:
-    """Answered by one byte: 1 while a speed or acceleration limit holds some channel back from its target."""
-    return bytes([GET_MOVING])
-
-
 def get_errors() -> bytes:
     """Answered by two bytes, low byte first: the error register, which this clears."""
     return bytes([GET_ERRORS])
-
-
-def go_home() -> bytes:
-    return bytes([GO_HOME])
-
-
-def mini_ssc(channel: int, value: int) -> bytes:
-    """`value` 0..254 around the neutral 127."""
-    return bytes([MINI_SSC, channel, value])
 
 
 def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
@@ -134,12 +99,7 @@ def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
     return bytes([BAUD_INDICATION, device, command[0] & 0x7F]) + command[1:]
 
 
-def with_crc(command: bytes) -> bytes:
-    """A command for a board on which CRC is enabled."""
-    return command + bytes([crc7(command)])
-
-
-def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = False) -> Command | None:
+def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE) -> Command | None:
     """Take the next command for board `device` off the front of `buffer`, or None: more bytes are needed.
 
     What a board would call an error comes as a Command with `error` set and the offending bytes removed. Commands to
@@ -168,7 +128,6 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
         if end < 0:
             del buffer[:start]
             return Command(code, error=PROTOCOL_ERROR)
-        end += crc
         cut = next((i for i in range(start, min(end, len(buffer))) if code != MINI_SSC and buffer[i] >= 0x80), None)
         if cut is not None:  # another command interrupts this one
             del buffer[:cut]
@@ -179,9 +138,7 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
         del buffer[:end]
         if other:
             continue
-        if crc and crc7(whole[:-1]) != whole[-1]:
-            return Command(code, error=CRC_ERROR)
-        return Command(code, whole[start : end - crc])
+        return Command(code, whole[start:])
     return None
 
 

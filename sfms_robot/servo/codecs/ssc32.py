@@ -93,11 +93,6 @@ def query_moving() -> bytes:
     return b"Q\r"
 
 
-def query_pulse(channel: int) -> bytes:
-    """Answered by one byte: the pulse in 10 us."""
-    return f"QP{channel}\r".encode()
-
-
 def maybe_command(buffer: bytearray) -> Group | Query | Unknown | None:
     """Take the first whole command off the front of `buffer`, or None: more bytes are needed.
 

@@ -66,6 +66,20 @@ def test_an_event_changes_nothing_before_it_is_told(told, start_s: float):
     assert any(not np.array_equal(without[i].frames, with_it[i].frames) for i in without)
 
 
+@pytest.mark.parametrize("hop", [1, 2])
+@pytest.mark.parametrize("start_s", [0.52, 0.8, 1.0, 1.31])
+def test_what_is_told_shows_within_120_ms_of_its_beginning(hop: int, start_s: float):
+    """Tokens that were drawn before it was known do not stand in its way; with weights that heed what is told."""
+    listener = told_listener(hop=hop)
+    with torch.no_grad():
+        listener.model.predictor.control_in[2].weight.mul_(50)
+    speaker = speech(50)
+    shown = [rollout(listener, speaker, [1], events).motion[0] for events in ((), (replace(NOD, start_s=start_s),))]
+    differs = np.abs(shown[0] - shown[1]).max(axis=1) > 1e-6
+    first = int(differs.argmax())
+    assert differs.any() and start_s - 0.12 <= first * 0.04 <= start_s + 0.12
+
+
 def test_what_is_told_again_as_it_was_calls_nothing_off(told):
     memory, last = told.start(1), None
     past, ahead = told.control_frames

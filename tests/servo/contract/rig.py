@@ -19,30 +19,14 @@ EASE_RAD_S = 0.5  # as slowly as a limiter begins: a joint that rejoins takes go
 
 
 @dataclass
-class Line:
-    """What a test listens to, and babbles into."""
-
-    sent: list[bytes] = field(default_factory=list)
-    noise: list[bytes] = field(default_factory=list)
-
-
-@dataclass
 class Tapped(WrappedPort):
-    """A port that notes what goes out, and gives noise before what comes in."""
+    """A port that notes what goes out."""
 
-    line: Line
+    sent: list[bytes]
 
     def write(self, data: bytes) -> None:
-        self.line.sent.append(bytes(data))
+        self.sent.append(bytes(data))
         super().write(data)
-
-    def read(self, n: int, deadline_s: float) -> bytes:
-        if not self.line.noise:
-            return super().read(n, deadline_s)
-        chunk = self.line.noise.pop(0)
-        if len(chunk) > n:
-            self.line.noise.insert(0, chunk[n:])
-        return chunk[:n]
 
 
 @dataclass
@@ -52,7 +36,7 @@ class Rig:
     family: Family
     bus: Bus
     clock: Clock
-    line: Line
+    sent: list[bytes]
     chain: Chain | None
     easing: dict[int, float] = field(default_factory=dict)
 
@@ -131,11 +115,10 @@ def real(name: str, device: str, servos: str) -> Iterator[Rig]:
 def _rig(
     family: Family, open_port: Callable[[], Port], clock: Clock, chain: Chain | None, deadline_s: float
 ) -> Iterator[Rig]:
-    line = Line()
-    bus = family.build(lambda: Tapped(open_port(), line), deadline_s)
+    sent: list[bytes] = []
+    bus = family.build(lambda: Tapped(open_port(), sent), deadline_s)
     try:
-        yield Rig(family, bus, clock, line, chain)
+        yield Rig(family, bus, clock, sent, chain)
     finally:
-        line.noise.clear()
         bus.stop("release")
         bus.close()

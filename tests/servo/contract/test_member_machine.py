@@ -60,7 +60,7 @@ class Troubles(RuleBasedStateMachine):
     def goals_sent(self):
         table = self.rig.family.table
         goal = table.role("goal_position")
-        for _, packet in self.rig.port.sent[self.mark : self.mark + 1]:
+        for packet in self.rig.port.sent[self.mark : self.mark + 1]:
             if table.protocol == 2 and packet[7] == 0x83 and int.from_bytes(packet[8:10], "little") == goal.address:
                 body = packet[12:-2]
             elif table.protocol == 1 and packet[4] == 0x83 and packet[5] == goal.address:

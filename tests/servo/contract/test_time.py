@@ -7,7 +7,8 @@ import pytest
 from families import FAMILIES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from timed import CHAINS, READ_DEADLINE_S, Time, timed
+from timed import CHAINS, READ_DEADLINE_S, timed
+from virtual_time import Time
 
 from sfms_robot.config import LoadRule, Safety
 from sfms_robot.ports import STOP_S
@@ -91,7 +92,7 @@ def test_torque_off_is_on_the_wire_before_anybody_is_asked(family):
     began_s, mark = rig.clock.t, len(rig.port.sent)
     rig.bus.stop("release")
     assert rig.clock.t - began_s <= 0.5
-    sent_s, packet = rig.port.sent[mark]
+    sent_s, packet = rig.port.sent_at_s[mark], rig.port.sent[mark]
     assert sent_s - began_s <= 0.02
     assert rig.torques() == [0] * 28
     rig.port.mute.clear()
@@ -122,7 +123,7 @@ def test_any_number_of_mute_buses_have_torque_off_within_20_ms_and_stop_within_h
     bus.stop("release")
     assert clock.t - began_s <= STOP_S
     for each, mark in zip(rigs, marks, strict=True):
-        assert each.port.sent[mark][0] - began_s <= 0.02
+        assert each.port.sent_at_s[mark] - began_s <= 0.02
         assert each.torques() == [0] * 28
 
 
@@ -155,7 +156,7 @@ def test_watchdogs_are_switched_off_after_the_torque(family):
     assert {rig.register(i, "bus_watchdog") for i in rig.ids} == {10}
     mark = len(rig.port.sent)
     rig.bus.stop("release")
-    addresses = [int.from_bytes(packet[8:10], "little") for _, packet in rig.port.sent[mark:]]
+    addresses = [int.from_bytes(packet[8:10], "little") for packet in rig.port.sent[mark:]]
     assert addresses.index(rig.family.table.role("torque_enable").address) < addresses.index(watchdog.address)
     assert {rig.register(i, "bus_watchdog") for i in rig.ids} == {0}
 
@@ -199,7 +200,7 @@ def loses_answers_about(rig, servo_id, role_or_name):
     here = table.role(role_or_name) or table[role_or_name]
 
     def lost(servo):
-        packet = rig.port.sent[-1][1]
+        packet = rig.port.sent[-1]
         address = int.from_bytes(packet[8:10], "little") if table.protocol == 2 else packet[5]
         return servo == servo_id and address == here.address
 

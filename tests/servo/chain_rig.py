@@ -1,0 +1,142 @@
+"""Buses of chains of servos that are emulated in this process, in virtual time."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from emulated_devices import device_of, servos_of
+from emulated_port import BAUD, EmulatedPort, FaultyPort, Straight
+
+from sfms_robot.config import Bus, Faults, FirmwareMap, Safety, load_firmware_map
+from sfms_robot.servo.chain.chain_bus import ChainBus
+from sfms_robot.servo.families import families
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port
+
+LIMIT_RAD = 1.0
+
+
+def bus_of(
+    maps: Sequence[FirmwareMap],
+    ids: Sequence[int],
+    open_port: Callable[[], Port],
+    limit_rad: float = LIMIT_RAD,
+    conversion: Any = None,
+    safety: Safety | None = None,
+    faults: Faults | None = None,
+    baud: int = BAUD,
+    read_deadline_s: float = 0.003,
+    **config,
+) -> Any:
+    """A bus of the joints joint1, ... as a head names them; `config` as in a head's file."""
+    servos = [
+        BusServo(f"joint{i}", i, each, -limit_rad, limit_rad, safety or Safety())
+        for i, each in zip(ids, maps, strict=True)
+    ]
+    of = maps[0].family, maps[0].protocol
+    name, family = next((name, each) for name, each in families().items() if each.maps == of)
+    conversion = conversion or Straight(maps[0], limit_rad)
+    options = Bus(family=name, baud=baud, **config)
+    more = {"confirmed": True} if family.board else {"faults": faults}  # hobby servos jump to their first pose
+    return family.bus_class()("face", servos, conversion, open_port, baud, read_deadline_s, config=options, **more)
+
+
+@dataclass
+class ServoRig:
+    """Emulated servos in this process and the port to them; looked at and changed beside the wire."""
+
+    port: EmulatedPort
+
+    @property
+    def device(self):
+        return self.port.device
+
+    @property
+    def clock(self):
+        return self.port.clock
+
+    def servo(self, servo_id: int) -> Any:
+        return self.device.servo(servo_id)
+
+    def register(self, servo_id: int, name: str) -> int:
+        """By its role, or its name."""
+        field = self._field(servo_id, name)
+        return field.from_bytes(self.servo(servo_id).read(field.address, field.size, self.clock.t)[1])
+
+    def set(self, servo_id: int, name: str, value: int) -> None:
+        field = self._field(servo_id, name)
+        self.servo(servo_id).write(field.address, field.to_bytes(value), self.clock.t)
+
+    def _field(self, servo_id: int, name: str):
+        table = self.servo(servo_id).table
+        return table.role(name) or table[name]
+
+    def kill(self, *servo_ids: int) -> None:
+        """Their cables are out."""
+        for servo_id in servo_ids:
+            self.servo(servo_id).dead = True
+
+    def revive(self, *servo_ids: int) -> None:
+        for servo_id in servo_ids:
+            self.servo(servo_id).dead = False
+
+    def torques(self) -> list[int]:
+        return [self.register(servo.id, "torque_enable") for servo in self.device.servos]
+
+
+@dataclass
+class BusRig(ServoRig):
+    bus: ChainBus
+
+    @property
+    def conversion(self):
+        return self.bus._conversion
+
+    def hold(self) -> np.ndarray:
+        self.bus.connect()
+        return self.bus.enable(self.bus.joints)
+
+
+@dataclass
+class Rig(BusRig):
+    port: FaultyPort
+    rejoined: set[str] = field(default_factory=set)
+    goals: np.ndarray | None = None
+
+    def ticks(self, goals_rad, n: int, each: Callable[[], None] = lambda: None):
+        """`n` ticks of 10 ms: write, then poll; the last readings. A joint that rejoins begins where it stands."""
+        wanted = np.asarray(goals_rad, dtype=float)
+        goals = wanted.copy() if self.goals is None else self.goals
+        for _ in range(n):
+            self.clock.t += 0.01
+            away = np.array([joint in self.rejoined for joint in self.bus.joints])
+            goals = np.where(away, goals + np.clip(wanted - goals, -0.01, 0.01), wanted)
+            self.bus.write(goals, self.clock.t)
+            readings = self.bus.poll(self.clock.t)
+            for i, (joint, reading) in enumerate(readings.items()):
+                if reading.rejoined:
+                    self.rejoined.add(joint)
+                    goals[i] = reading.position_rad
+            each()
+        self.goals = goals
+        return readings
+
+
+def rig_of(
+    model: str | Sequence[str],
+    starts: Sequence[int],
+    baud: int = BAUD,
+    servo_baud: int | None = None,
+    **more,
+) -> Rig:
+    """Servos 1, 2, ... that stand at `starts`. `more`: as for `bus_of`."""
+    models = [model] * len(starts) if isinstance(model, str) else list(model)
+    servos = [
+        each
+        for i, (model, ticks) in enumerate(zip(models, starts, strict=True), 1)
+        for each in servos_of(model, i, start_ticks=ticks, baud=servo_baud or baud)
+    ]
+    port = FaultyPort(device_of(*servos), baud, name="wire")
+    maps = [load_firmware_map(model) for model in models]
+    return Rig(port, bus_of(maps, [servo.id for servo in servos], lambda: port, baud=baud, **more))
