@@ -91,7 +91,7 @@ def print_robustness(result: Mapping[str, Any]) -> None:
     )
     screen().print(
         f"people: {ranges}; {len(result['outside'])} of {len(result['rows'])} rows are outside. Variance over mean of "
-        f"nods, median: {_cell(result['nods_variance_over_mean'])}.",
+        f"nods, median: {cell(result['nods_variance_over_mean'])}.",
         soft_wrap=True,
     )
 
