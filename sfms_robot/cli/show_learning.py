@@ -78,7 +78,7 @@ def print_timing(result: Mapping[str, Any]) -> None:
     console.print(
         f"{result['people']} people of {result['split']}, {result['meetings']} meetings, "
         f"{result['minutes']:g} minutes, {result['seeds']} seeds; in brackets 95 % intervals over people. "
-        + "; ".join((*result["notes"], "")),
+        f"{'; '.join(result['notes'])}.",
         soft_wrap=True,
     )
 
