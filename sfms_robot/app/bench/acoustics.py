@@ -32,6 +32,7 @@ PERSON_DB: Final = -30.0  # at the microphone
 _PERSON_M, _LOUDSPEAKER_M, _MOTORS_M = (1.2, 0.3, 0.2), (0.02, 0.0, -0.12), (0.0, 0.06, -0.05)  # from the microphone
 _LOUDSPEAKER_DELAY: Final = 640  # samples from the reference to the loudspeaker, 40 ms
 _HISS_DB: Final = -72.0
+GEAR_SEED: Final = 0  # of the gears of a scene's head
 _ORDER: Final = 30  # of reflections, at most
 _TRUTH_GAINS: Final = (2.0, 16.0)  # clean speech; truth does not change with what the gate asks
 _ALTERNATE_FRAMES: Final = 100  # own voice goes on and off by this when it talks over the person
@@ -111,7 +112,7 @@ def joint_speeds(n: int) -> Doubles:
     return np.resize(np.concatenate([speed, speed[::-1]]), (n, speed.shape[1]))
 
 
-def gear_noise(speed_rad_s: Doubles, seed: int = 0) -> Doubles:
+def gear_noise(speed_rad_s: Doubles, seed: int = GEAR_SEED) -> Doubles:
     """(n, J) -> (n * 640,): of each joint a whine of four harmonics, its pitch with the speed, and a hiss; both louder
     with the speed."""
     from scipy.signal import lfilter
