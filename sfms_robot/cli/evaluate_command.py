@@ -31,6 +31,7 @@ class Table(StrEnum):
 
 LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 JSON = typer.Option(False, "--json", help="Print one JSON object.")
+HOP = typer.Option(None, min=1, help="Frames between plans, as a run chooses them; default: what its config.yaml says.")
 
 
 @app.command()
@@ -78,6 +79,7 @@ def listener_(
     config: Path | None = typer.Option(None, help="How ablations are trained: configs/training/arig.yaml."),
     steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    hop: int | None = HOP,
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
@@ -86,18 +88,18 @@ def listener_(
     from sfms_robot.cli.show_learning import print_figures, print_listener_table, show
 
     if table is None:
-        show(evaluate_listener(listener, data, seed, order.value if order else None), json, print_figures)
+        show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json, print_figures)
         return
     if table.value.startswith("arig"):
-        if order is not None:
-            raise typer.BadParameter("--order is for --table 1 and 2, or none")
+        if order is not None or hop is not None:
+            raise typer.BadParameter("--order and --hop are for --table 1 and 2, or none")
         from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json, print_figures)
         return
-    result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None)
+    result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None, hop)
     show(result, json, print_listener_table)
 
 
@@ -111,6 +113,7 @@ def timing(
     everything: bool = typer.Option(False, "--all", help="All people, whole meetings: many hours."),
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices and sampling."),
     jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    hop: int | None = HOP,
     fit_table: Path | None = typer.Option(
         None, metavar="FILE", help="Only fit the table of nod rates on DIR and write it."
     ),
@@ -124,7 +127,7 @@ def timing(
         show(command.fit_table(data, fit_table), json, print_figures)
         return
     limits = (None, None) if everything else (people, minutes)
-    show(command.evaluate_timing(listener, data, seeds, *limits, seed, jobs), json, print_figures)
+    show(command.evaluate_timing(listener, data, seeds, *limits, seed, jobs, hop), json, print_figures)
 
 
 @app.command()

@@ -19,6 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
+from sfms_robot.app.evaluate.hop_choice import load_at_hop
 from sfms_robot.config import find
 from sfms_robot.corpora.compose.ami import Person, read_people, series
 from sfms_robot.corpora.compose.motions import Motions
@@ -29,7 +30,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import nod_table
 from sfms_robot.evaluation import timing as evaluation
 from sfms_robot.evaluation.rollout import rollout
-from sfms_robot.listeners.registry import load_listener, one_thread
+from sfms_robot.listeners.registry import one_thread
 from sfms_robot.ports import Listener
 
 TABLE: Final = "nod_table.yaml"  # in sim/listeners
@@ -49,20 +50,29 @@ class _Part:
     minutes: float | None
     seeds: int
     seed: int
+    hop: int | None
 
 
 def evaluate_timing(
-    name: str, data: Path, seeds: int, people: int | None, minutes: float | None, seed: int, jobs: int | None
+    name: str,
+    data: Path,
+    seeds: int,
+    people: int | None,
+    minutes: float | None,
+    seed: int,
+    jobs: int | None,
+    hop: int | None = None,
 ) -> dict[str, Any]:
     """Figures of design section 4 and more; None where the meetings hold too little to tell.
 
-    `people` and `minutes` (of each) bound what is played. Raises ConfigError or ModelError.
+    `people` and `minutes` (of each) bound what is played; `hop`: see `load_at_hop`. Raises ConfigError or ModelError.
     """
     folder = find("listeners", name, "config.yaml")
     everybody = read_people(tables(data))
     chosen = evaluation.choose_people(everybody, people)
-    parts = [_Part(person, everybody.index(person), minutes, seeds, seed) for person in chosen]
+    parts = [_Part(person, everybody.index(person), minutes, seeds, seed, hop) for person in chosen]
     table = nod_table.load(data_dir("sim") / "listeners" / TABLE)
+    heard_by = load_at_hop(folder, hop)  # what is wrong with it is said here, not by a process
     played = dict(_play_all(folder, parts, jobs or os.cpu_count() or 1))
     pairs = [played[number] for number in sorted(played)]
     scenes, answers = [scene for scene, _ in pairs], [answer for _, answer in pairs]
@@ -73,6 +83,7 @@ def evaluate_timing(
         "people": len(scenes),
         "minutes": round(sum(scene.minutes for scene in scenes), 2),
         "seeds": seeds,
+        "hop": heard_by.hop,
         **found,
         "nod_auc_people": len(ranks),
         "table": f"bundled, without the series of each person ({', '.join(known)})" if known else "bundled",
@@ -113,7 +124,6 @@ def _play_all(
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("people listening", total=len(parts))
-        load_listener(folder)  # what is wrong with it is said here, not by a process
         workers = min(jobs, len(parts))
         if workers == 1:
             for part in parts:
@@ -137,13 +147,13 @@ def _play(folder: Path, part: _Part) -> tuple[evaluation.Scene, evaluation.Answe
     rng = np.random.default_rng([part.seed, part.number])
     scene = evaluation.scene(part.person, part.minutes, voices, motions, rng)
     first = 1000 * (part.seed + part.number)
-    played = rollout(_listener(folder), scene.speaker, range(first, first + part.seeds)).motion
+    played = rollout(_listener(folder, part.hop), scene.speaker, range(first, first + part.seeds)).motion
     return replace(scene, speaker=()), evaluation.observe(played)
 
 
 @cache
-def _listener(folder: Path) -> Listener:
-    return load_listener(folder)
+def _listener(folder: Path, hop: int | None) -> Listener:
+    return load_at_hop(folder, hop)
 
 
 @cache
