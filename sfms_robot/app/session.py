@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.calibrated_head import calibrated_head
-from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.limitation import limitation
+from sfms_robot.app.listen.live_knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import figures_so_far, run_report
 from sfms_robot.app.listen.run_facts import run_facts
 from sfms_robot.app.listen.run_teller import RunTeller
@@ -67,7 +67,8 @@ SIM_READ_DEADLINE_S: Final = 0.02  # an emulator shares the computer's cores: it
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 INTERRUPTED: Final = 130
 
-Panel = Callable[[Callable[[], Mapping[str, Any]], Interrupt, HaltLatch], AbstractContextManager[object]]
+Document = Callable[[], Mapping[str, Any]]
+Panel = Callable[[Document, Interrupt, HaltLatch, Callable[[float], None]], AbstractContextManager[object]]
 
 
 # --- a head and its servos ------------------------------------------------------------------------------------------
@@ -402,7 +403,7 @@ def run(
     source: Source | None = None,
     feed: PlanFeed | None = None,
     observers: Sequence[Observer] = (),
-    knobs: Callable[[HeadRetargeter], Callable[[], Any]] | None = None,
+    knobs: LiveKnobs | None = None,
     overlay: Callable[[Floats, Doubles], Floats] | None = None,
     interrupt: Interrupt | None = None,
     halt: HaltLatch | None = None,
@@ -414,9 +415,10 @@ def run(
     torque came on nothing is raised any more: the report says `"exit": "failed"` and why, the head is at rest.
 
     Args:
-        panel: from the status document, what ends and what halts the run: shows it, and takes keys, while inside.
+        panel: from the status document, what ends, what halts the run and what turns the face up: shows it, and takes
+            keys, while inside.
         source, feed: instead of those that the options name.
-        knobs: from the retargeter of the opened head, what is asked at every tick; None: the options' own.
+        knobs: instead of those that the options name.
         observers, overlay: see `Programme`.
         interrupt: asked to end the run from another thread.
         halt: closed and opened from other threads.
@@ -452,7 +454,7 @@ def run(
             feed.wait_loaded()
             tick_s = 1.0 / opened.rate_hz
             feed.choose_hop_by(lambda: source.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
-        turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
+        live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
         recorder = _recorder(options, opened.config)
         log = run_log(opened)
         facts = {
@@ -471,9 +473,10 @@ def run(
         if recorder is not None:
             stack.callback(recorder.close)
         if panel is not None:
-            stack.enter_context(panel(status.document, interrupt, halt))
+            stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
         tellers = [RunTeller(outlet) for outlet in source.outlets]
         for teller in tellers:
+                "intensity": live.values["intensity"],
             stack.callback(teller.close)
         if options.status is not None:
             port = stack.enter_context(status_server(options.status, status.document))
@@ -481,7 +484,7 @@ def run(
         programme = Programme(
             source, feed, duration_s,
             life=Life(opened.config.life, options.seed, opened.config.camera),
-            knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
+            knobs=lambda: live.now,
             overlay=overlay,
             answers=True,
             halt=halt,

@@ -16,8 +16,8 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from sfms_robot.app.api.background import Background, Report
-from sfms_robot.app.api.live_knobs import LiveKnobs
 from sfms_robot.app.api.named_head import head_name
+from sfms_robot.app.listen.live_knobs import LiveKnobs
 from sfms_robot.app.session import RunOptions, prepare_head, run
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head, load_head
@@ -291,7 +291,7 @@ class Robot:
                 source=source,
                 feed=feed,
                 observers=[progress, self._events],
-                knobs=lambda _: lambda: self._knobs.now,
+                knobs=self._knobs,
                 overlay=self._puppet.overlay,
                 interrupt=interrupt,
                 halt=halt,

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from threading import Lock
+from typing import Final
 
 from sfms_robot.config import Head
-from sfms_robot.errors import InputError
+from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.retarget.channel_mapping import ChannelMapping as Face
 from sfms_robot.retarget.channel_mapping import Knobs
+
+STEP: Final = 0.1  # of a key
+MOST: Final = 2.0
 
 
 class Knob:
@@ -66,11 +70,19 @@ class LiveKnobs:
 
     def set(self, kind: str, region: str, value: float) -> None:
         """Raises InputError for a value outside 0..2."""
-        if not 0 <= value <= 2:
+        if not 0 <= value <= MOST:
             raise InputError(f"{kind} of {region} = {value:g} is not in 0..2")
         with self._lock:
-            self.values = {**self.values, kind: {**self.values[kind], region: float(value)}}
-            self.now = self._face.knobs(self.values["intensity"], self.values["style"])
+            self._turn({**self.values, kind: {**self.values[kind], region: float(value)}})
+
+    def turn_all(self, by: float) -> None:
+        """Intensity of every region up or down; none leaves 0..2."""
+        with self._lock:
+            louder = {name: round(min(max(at + by, 0.0), MOST), 3) for name, at in self.values["intensity"].items()}
+            self._turn({**self.values, "intensity": louder})
+
+    def _turn(self, values: dict[str, dict[str, float]]) -> None:
+        self.values, self.now = values, self._face.knobs(values["intensity"], values["style"])
 
     def _region(self, name: str) -> str:
         if name not in self._regions:
@@ -86,3 +98,21 @@ class LiveKnobs:
 
     def __len__(self) -> int:
         return len(self._regions)
+
+
+def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> LiveKnobs:
+    """`--intensity REGION=V` and `--style REGION=V`, over the head's file. Raises ConfigError for an unknown region or
+    a value outside 0..2.
+    """
+    return LiveKnobs(head, _values("--intensity", intensity), _values("--style", style))
+
+
+def _values(option: str, given: Sequence[str]) -> dict[str, float]:
+    values = {}
+    for text in given:
+        region, _, value = text.partition("=")
+        try:
+            values[region] = float(value)
+        except ValueError:
+            raise ConfigError(f"{option} {text!r} is not REGION=VALUE with a value from 0 to 2") from None
+    return values
