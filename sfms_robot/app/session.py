@@ -14,7 +14,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -28,7 +28,7 @@ from sfms_robot.app.listen.live_knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import figures_so_far, run_report
 from sfms_robot.app.listen.run_facts import run_facts
 from sfms_robot.app.listen.run_teller import RunTeller
-from sfms_robot.app.listen.status_server import status_server
+from sfms_robot.app.listen.status_server import StatusServer
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import Head, Joint, load_head
@@ -383,7 +383,8 @@ class RunOptions:
     style: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     halt_on: str | None = None
-    status: int | None = None
+    status: str | None = None
+    play: str | None = None
 
     @property
     def hears(self) -> str:
@@ -428,6 +429,8 @@ def run(
     prepare_head(options.servos)
     if options.fast and split_kind(options.hears)[0] == "mic":
         raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
+    if options.fast and options.play is not None:
+        raise ConfigError(f"--play {options.play}: what is heard of a loudspeaker takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
@@ -439,10 +442,15 @@ def run(
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
+        server = None
+        if options.status is not None:  # a port that is taken is found before a listener is loaded
+            server = stack.enter_context(closing(StatusServer(options.status)))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         if source is None:
-            source = open_source(options.hears, options.face, options.duration_s, agent_audio=options.agent_audio)
+            source = open_source(
+                options.hears, options.face, options.duration_s, agent_audio=options.agent_audio, play=options.play
+            )
             stack.callback(source.close)
         duration_s = source.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
@@ -468,6 +476,7 @@ def run(
                 **figures_so_far(log, opened.rate_hz, real=not options.fast),
                 "source": dict(source.statistics()),
                 "listener_state": dict(feed.statistics()),
+                "intensity": live.values["intensity"],
             },
         )
         if recorder is not None:
@@ -476,11 +485,10 @@ def run(
             stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
         tellers = [RunTeller(outlet) for outlet in source.outlets]
         for teller in tellers:
-                "intensity": live.values["intensity"],
             stack.callback(teller.close)
-        if options.status is not None:
-            port = stack.enter_context(status_server(options.status, status.document))
-            logger.warning("status: http://127.0.0.1:%d/", port)
+        if server is not None:
+            server.serve(status.document)
+            logger.warning("status: %s", server)
         programme = Programme(
             source, feed, duration_s,
             life=Life(opened.config.life, options.seed, opened.config.camera),
