@@ -39,10 +39,13 @@ class PlaybackOptions:
 
 
 class RecordedFace:
-    """`ports.Timeline` of a recording: between two ticks the face is interpolated, before and after them it stays."""
+    """`ports.Timeline` of a recording up to its way to rest: between two ticks the face is interpolated, before and
+    after them it stays.
+    """
 
     def __init__(self, recording: RunRecording) -> None:
-        self._times_s, self._motion = recording.times_s, recording.motion
+        listened = recording.times_s <= recording.listened_s
+        self._times_s, self._motion = recording.times_s[listened], recording.motion[listened]
 
     def start(self) -> None:
         return None
@@ -77,7 +80,7 @@ def play_back(folder: Path, options: PlaybackOptions, panel: Panel | None = None
     servos = HeadOptions(head, options.port, options.fast, options.yes)
     with signals_to(interrupt), halt_signals(halt), open_head(servos) as opened:
         log, alone = run_log(opened), NobodyThere()
-        facts = {"head": opened.config.name, "listener": "recorded", "duration_s": recording.duration_s}
+        facts = {"head": opened.config.name, "listener": "recorded", "duration_s": recording.listened_s}
         knobs = turned(opened.config)
         status = RunStatus(
             list(opened.config.joints),
@@ -88,7 +91,7 @@ def play_back(folder: Path, options: PlaybackOptions, panel: Panel | None = None
             },
         )
         programme = Programme(
-            alone, alone, recording.duration_s, RecordedFace(recording), knobs=lambda: knobs.now, halt=halt,
+            alone, alone, recording.listened_s, RecordedFace(recording), knobs=lambda: knobs.now, halt=halt,
             observers=[status],
         )  # fmt: skip
         with panel(status.document, interrupt, halt, knobs.turn_all) if panel is not None else nullcontext():
@@ -97,7 +100,7 @@ def play_back(folder: Path, options: PlaybackOptions, panel: Panel | None = None
         "version": 1,
         "head": opened.config.name,
         "port": options.port,
-        "recorded_s": round(recording.duration_s, 3),
+        "recorded_s": round(recording.listened_s, 3),
         "duration_s": round(log.listened_s, 3),
         "whole": recording.whole,
         "exit": drove.outcome,
