@@ -30,10 +30,9 @@ if TYPE_CHECKING:
         RobotError,
         ServoError,
     )
-    from sfms_robot.frames import BLENDSHAPES, CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
+    from sfms_robot.frames import BLENDSHAPES, CHANNELS, FaceFrame, ListenerEvent, Plan, Reading, SpeakerFrame
     from sfms_robot.ports import Listener, Source
     from sfms_robot.retarget.head_retargeter import HeadRetargeter as Retargeter
-    from sfms_robot.runtime.planned_events import MotionEvent
 
 __version__ = "0.2.0.dev0"
 
@@ -46,11 +45,11 @@ __all__ = [
     "Head",
     "InputError",
     "Listener",
+    "ListenerEvent",
     "ListenerStream",
     "LoadedListener",
     "MissingExtra",
     "ModelError",
-    "MotionEvent",
     "PacketError",
     "Plan",
     "PortError",
@@ -77,10 +76,9 @@ _NAMES: Final = {
         "BusError", "ConfigError", "InputError", "MissingExtra", "ModelError", "PacketError", "PortError",
         "RobotError", "ServoError",
     ),
-    "frames": ("BLENDSHAPES", "CHANNELS", "FaceFrame", "Plan", "Reading", "SpeakerFrame"),
+    "frames": ("BLENDSHAPES", "CHANNELS", "FaceFrame", "ListenerEvent", "Plan", "Reading", "SpeakerFrame"),
     "ports": ("Listener", "Source"),
     "retarget.head_retargeter": ("Retargeter",),
-    "runtime.planned_events": ("MotionEvent",),
 }  # fmt: skip
 _MODULE_OF: Final = {name: module for module, names in _NAMES.items() for name in names}
 _CALLED: Final = {"Retargeter": "HeadRetargeter"}

@@ -174,6 +174,40 @@ class SpeakerFrame:
     place_m: Floats | None = None
 
 
+# What a listener may decide to do. A laugh is heard and opens the mouth, a smile is only seen; "mm-hm" is for a voice.
+EVENT_KINDS: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "blink", "gaze_shift")
+
+
+@dataclass(frozen=True)
+class ListenerEvent:
+    """Something that a listener has decided to do, or that a person did.
+
+    Attributes:
+        kind: of `EVENT_KINDS`.
+        start_s, duration_s: when its motion begins and how long it lasts; a gaze shift lasts until the next one.
+        size: peak to peak [rad] of a nod, a shake, a tilt; 0..1 of what the face does; how far [rad] a gaze shift goes.
+        swings: of a nod or a shake, there and back each; 1 of everything else.
+        target_rad: (yaw, pitch) in space that a gaze shift goes to, (0, 0) at the person; None of everything else.
+        probability, draw: that it would be decided at this instant, and the number in 0..1 that fell below it; None
+            for what was not drawn.
+        evidence: what spoke for it and against it, by name: the largest terms of its log-odds.
+    """
+
+    kind: str
+    start_s: float
+    duration_s: float
+    size: float
+    swings: int = 1
+    target_rad: tuple[float, float] | None = None
+    probability: float | None = None
+    draw: float | None = None
+    evidence: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def end_s(self) -> float:
+        return self.start_s + self.duration_s
+
+
 @dataclass(frozen=True)
 class Plan:
     """What our face does next. A newer plan replaces an older one from its first time on.
@@ -183,12 +217,16 @@ class Plan:
         times_s: (H,) times_s[0] = made_at_s + one frame.
         frames: (H, 58) motion.
         jaw_rad: (H, 3) or None.
+        events: decided since the plan before, each told once; none from a listener that decides none.
+        hazards_hz: by kind, how many a second would be decided if things stayed as they are; empty likewise.
     """
 
     made_at_s: float
     times_s: Doubles
     frames: Floats
     jaw_rad: Floats | None = None
+    events: tuple[ListenerEvent, ...] = ()
+    hazards_hz: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -269,6 +269,7 @@ class Tick:
         goals_rad: (J,) what was written.
         readings: freshest reading per joint.
         state, why: of the run, see docs/safety.md; `why` names what is lost, or who halted.
+        written_s: loop time at which the goals were on the wire; None where nobody looked.
     """
 
     time_s: float
@@ -277,6 +278,7 @@ class Tick:
     readings: Mapping[str, Reading]
     state: str = "starting"
     why: tuple[str, ...] = ()
+    written_s: float | None = None
 
 
 class Clock(Protocol):

@@ -8,7 +8,7 @@ from sfms_robot import config
 from sfms_robot.config import parse_training
 from sfms_robot.corpora import clips
 from sfms_robot.corpora import conversational_states as labels
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES, ListenerEvent
 
 HZ = 25
 TINY = {
@@ -46,7 +46,17 @@ def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
     motion[:, CHANNEL_INDEX["pitch"]] = 0.05 * np.sin(np.arange(frames) / 3) * user
     face = motion[::-1].copy() if scene != "speaking" else np.full((frames, 58), np.nan, np.float32)
     states = labels.label(labels.of_activity(agent, user))
-    return clips.Dyad(name, voice(user), face, motion, user & ~agent, agent_audio=voice(agent), states=states)
+    return clips.Dyad(
+        name,
+        voice(user),
+        face,
+        motion,
+        user & ~agent,
+        agent_audio=voice(agent),
+        states=states,
+        events=tuple(ListenerEvent("nod", start_s, 0.6, 0.05, 2) for start_s in (2.0, 5.0, 9.0)),
+        head_of_gaze_rad=np.zeros((frames, 3), np.float32),
+    )
 
 
 def write(folder: Path) -> Path:

@@ -14,6 +14,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -23,15 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.calibrated_head import calibrated_head
+from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.limitation import limitation
-from sfms_robot.app.listen.live_knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import figures_so_far, run_report
 from sfms_robot.app.listen.run_facts import run_facts
 from sfms_robot.app.listen.run_teller import RunTeller
 from sfms_robot.app.listen.status_server import StatusServer
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
-from sfms_robot.config import Head, Joint, load_head
+from sfms_robot.config import Calmness, Head, Joint, load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError, RobotError
@@ -384,6 +385,7 @@ class RunOptions:
     without: tuple[str, ...] = ()
     halt_on: str | None = None
     status: str | None = None
+    calmness: Calmness | None = None
     play: str | None = None
 
     @property
@@ -447,15 +449,12 @@ def run(
             server = stack.enter_context(closing(StatusServer(options.status)))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
-        if source is None:
-            source = open_source(
-                options.hears, options.face, options.duration_s, agent_audio=options.agent_audio, play=options.play
-            )
-            stack.callback(source.close)
+        opening = _opening(options, stack) if source is None else None
+        opened = stack.enter_context(open_head(options.servos))
+        source = source if opening is None else opening.result()
         duration_s = source.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
             raise ConfigError("--fast without a recording never ends: give it a --duration")
-        opened = stack.enter_context(open_head(options.servos))
         if feed is None:
             return {"version": 1, "head": opened.config.name, "port": options.port, "exit": "done", **_present(opened)}
         if isinstance(feed, ListenerProcess):
@@ -517,6 +516,18 @@ def run(
     return report
 
 
+def _opening(options: RunOptions, stack: ExitStack) -> Future[Source]:
+    """The person, being opened in a thread: a microphone takes a second, and so does the head."""
+    worker = ThreadPoolExecutor(1, "source")
+    opening = worker.submit(
+        open_source, options.hears, options.face, options.duration_s, agent_audio=options.agent_audio,
+        play=options.play,
+    )  # fmt: skip
+    worker.shutdown(wait=False)
+    stack.callback(lambda: None if opening.exception() else opening.result().close())
+    return opening
+
+
 def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     """Inline in virtual time, so that one seed is one run; else in a process of its own, which loads from now on."""
     listener_folder(options.listener)
@@ -525,17 +536,23 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
         from sfms_robot.listeners.registry import load_listener, one_thread  # torch: only here in this process
 
         one_thread()
-        feed = InlineFeed(load_listener(options.listener), options.seed, FAST_LATENCY_S)
+        feed = InlineFeed(load_listener(options.listener, calmness=options.calmness), options.seed, FAST_LATENCY_S)
     else:
-        feed = ListenerProcess(options.listener, options.seed)
+        feed = ListenerProcess(options.listener, options.seed, options.calmness)
     stack.callback(feed.close)
     return feed
+
+
+def _rates(calmness: Calmness | None) -> dict[str, Any] | None:
+    return None if calmness is None else calmness.model_dump(exclude_none=True)
 
 
 def _recorder(options: RunOptions, head: Head) -> Recorder | None:
     if options.record is None:
         return None
-    about = run_facts(head, options.listener, asdict(options) | {"audio": options.hears})
+    about = run_facts(
+        head, options.listener, {**asdict(options), "audio": options.hears, "calmness": _rates(options.calmness)}
+    )
     when_full: FullPolicy = "wait" if options.fast else "drop"
     return Recorder(options.record, list(head.joints), when_full=when_full, about=about)
 

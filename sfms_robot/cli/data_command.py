@@ -19,8 +19,10 @@ class Order(StrEnum):
 @app.command()
 def compose(
     data: Path = typer.Option(..., help="Folder with ami_listener_annotations/ and, if at hand, more voices."),
-    out: Path = typer.Option(..., help="Folder to write train/ and validation/ into."),
-    minutes: float = typer.Option(75.0, min=1.0, help="Minutes of training dyads."),
+    out: Path = typer.Option(..., help="Folder to write train/, validation/ and test/ into."),
+    minutes: float = typer.Option(
+        240.0, min=1.0, help="Minutes of training dyads; all that the tables give if they give less."
+    ),
     seed: int = typer.Option(1, min=0, help="One seed composes the same dyads."),
     json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object."),
 ) -> None:

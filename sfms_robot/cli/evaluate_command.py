@@ -29,6 +29,14 @@ class Table(StrEnum):
     arig_4 = "arig-4"
 
 
+class Part(StrEnum):
+    """Of the meetings (`corpora.splits`)."""
+
+    train = "train"
+    validation = "validation"
+    test = "test"
+
+
 LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 JSON = typer.Option(False, "--json", help="Print one JSON object.")
 HOP = typer.Option(None, min=1, help="Frames between plans, as a run chooses them; default: what its config.yaml says.")
@@ -107,27 +115,61 @@ def listener_(
 def timing(
     listener: str = LISTENER,
     data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
-    seeds: int = typer.Option(8, min=1, help="How often each person's meeting is played."),
-    people: int | None = typer.Option(12, min=1, help="At most this many people, spread over the meetings."),
-    minutes: float | None = typer.Option(5.0, min=0.5, help="Of each, from the middle of the meeting."),
-    everything: bool = typer.Option(False, "--all", help="All people, whole meetings: many hours."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices and sampling."),
+    split: Part = typer.Option(Part.test, help="Whose meetings: test for what is reported, validation to choose by."),
+    allow_training: bool = typer.Option(False, "--allow-training", help="Play people that listeners learned from."),
+    meetings: int | None = typer.Option(None, min=1, help="At most this many, spread over the people; all of them."),
+    minutes: float = typer.Option(
+        5.0, min=0.0, help="Of motion, from the middle of each meeting; 0: hazards and decisions alone, in minutes."
+    ),
+    seeds: int = typer.Option(8, min=1, help="How often each meeting is played."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices, sampling and intervals."),
     jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
     hop: int | None = HOP,
-    fit_table: Path | None = typer.Option(
-        None, metavar="FILE", help="Only fit the table of nod rates on DIR and write it."
-    ),
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
-    from sfms_robot.app.evaluate import meetings as command
+    from sfms_robot.app.evaluate.meetings import TimingOptions, evaluate_timing
+    from sfms_robot.cli.show_learning import print_timing, show
+
+    options = TimingOptions(listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop)
+    show(evaluate_timing(options), json, print_timing)
+
+
+@app.command()
+def robustness(
+    listener: str = LISTENER,
+    data: Path | None = typer.Option(
+        None, metavar="DIR", help="Folder with more voices (speech_audio, conversation_audio, ...); the bundled ones."
+    ),
+    speakers: int | None = typer.Option(None, min=1, help="At most this many; everybody kept for test."),
+    minutes: float = typer.Option(1.0, min=0.1, help="Of each, in each way."),
+    seeds: int = typer.Option(8, min=1, help="How often each is played."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling, and of what is spoilt."),
+    jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    json: bool = JSON,
+) -> None:
+    """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
+    from sfms_robot.app.evaluate.unseen_speakers import evaluate_robustness
+    from sfms_robot.cli.show_learning import print_robustness, show
+
+    show(evaluate_robustness(listener, data, speakers, minutes, seeds, seed, jobs), json, print_robustness)
+
+
+@app.command()
+def naturalness(
+    listener: str = LISTENER,
+    data: Path = typer.Option(..., help="Composed dyads (`sfms-robot data compose`)."),
+    split: str = typer.Option("test", metavar="validation|test", help="Whose motion it is held against."),
+    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
+    drift: float = typer.Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    json: bool = JSON,
+) -> None:
+    """How a listener moves beside people whose motion it never saw: nods, smiles, gaze, sway, and a network's guess."""
+    from sfms_robot.app.evaluate.naturalness import evaluate_naturalness
     from sfms_robot.cli.show_learning import print_figures, show
 
-    if fit_table is not None:
-        show(command.fit_table(data, fit_table), json, print_figures)
-        return
-    limits = (None, None) if everything else (people, minutes)
-    show(command.evaluate_timing(listener, data, seeds, *limits, seed, jobs, hop), json, print_figures)
+    show(evaluate_naturalness(listener, data, split, clips, drift, seed), json, print_figures)
 
 
 @app.command()

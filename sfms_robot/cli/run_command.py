@@ -6,10 +6,14 @@ import json as json_module
 import sys
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from sfms_robot.cli import names
+
+if TYPE_CHECKING:
+    from sfms_robot.config import Calmness
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
@@ -67,6 +71,18 @@ def run(
         rich_help_panel=LISTENER,
         help="Shipped listener, or a folder with config.yaml and weights.",
     ),
+    calmness: list[str] = typer.Option(
+        [],
+        metavar="KIND=PER_MINUTE",
+        rich_help_panel=LISTENER,
+        help="How often it does something, as nod=2.2; may be repeated. Default: as often as people do.",
+    ),
+    addressed: str = typer.Option(
+        "sense",
+        metavar="sense|assume|never",
+        rich_help_panel=LISTENER,
+        help="Is it the head that is spoken to? By the person's look, and yes where no face is seen; always; never.",
+    ),
     seed: int = typer.Option(
         0,
         min=0,
@@ -121,18 +137,19 @@ def run(
     from sfms_robot.app.listen.preflight import begin_listening, check_names
 
     check_names(head, listener, port, audio, face, agent_audio, play, status)
+    calm = _calmness(calmness, addressed) if calmness or addressed != "sense" else None
     if check:
         _check(audio, duration, json)
         return
     with ExitStack() as stack:
         # The listener loads from here on, in a process of its own, while this one imports what drives a head.
-        feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(listener, seed)))
+        feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(listener, seed, calm)))
         from sfms_robot.app import session
         from sfms_robot.app.listen.panel import live_panel
 
         options = session.RunOptions(
             head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
-            tuple(intensity), tuple(style), tuple(without), halt_on, status, play,
+            tuple(intensity), tuple(style), tuple(without), halt_on, status, calm, play,
         )  # fmt: skip
         report = session.run(options, None if json else live_panel, feed=feed)
     if json:
@@ -147,6 +164,12 @@ def run(
     if report.get("error"):
         print(f"sfms-robot: {report['error']}", file=sys.stderr)
     raise typer.Exit(report.get("exit_code", 0))
+
+
+def _calmness(per_minute: list[str], addressed: str) -> Calmness:
+    from sfms_robot.app.listen.knobs import calmed
+
+    return calmed(per_minute, addressed)
 
 
 def _check(audio: str, duration_s: float | None, json: bool) -> None:

@@ -66,6 +66,38 @@ def _cell(value: object) -> str:
     return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+# --- evaluate timing, evaluate robustness -----------------------------------------------------------------------
+
+
+def print_timing(result: Mapping[str, Any]) -> None:
+    """Figures with their intervals; how well events are seen in motion; what has to be said with it."""
+    print_rows(result["rows"])
+    console = screen()
+    for title, told in (("known events", result["detector"]), ("events asked for", result["asked_and_seen"])):
+        for kind, one in told.items():
+            shares = ", ".join(f"{name} {_cell(one[name])}" for name in ("recall", "precision"))
+            console.print(
+                f"{title}: of {one['asked']} {kind}s {one['seen']} seen, {shares}, late by {_cell(one['offset_s'])} s"
+            )
+    console.print(
+        f"{result['people']} people of {result['split']}, {result['meetings']} meetings, "
+        f"{result['minutes']:g} minutes, {result['seeds']} seeds; in brackets 95 % intervals over people. "
+        + "; ".join((*result["notes"], "")),
+        soft_wrap=True,
+    )
+
+
+def print_robustness(result: Mapping[str, Any]) -> None:
+    """A row for every speaker in every way; then what is not as people do."""
+    print_rows(result["rows"])
+    ranges = ", ".join(
+        f"{name.replace('_', ' ')} {low:g} to {high:g}" for name, (low, high) in result["people"].items()
+    )
+    screen().print(
+        f"people: {ranges}; {len(result['outside'])} of {len(result['rows'])} rows are outside.", soft_wrap=True
+    )
+
+
 # --- evaluate interaction ---------------------------------------------------------------------------------------
 
 

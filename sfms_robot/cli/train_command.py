@@ -1,4 +1,4 @@
-"""`sfms-robot train`: the two phases of a listener."""
+"""`sfms-robot train`: the two phases of a listener, and when it does what."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sfms_robot.cli.data_command import Order
 
 INTERRUPTED = 130
 
-app = typer.Typer(help="Train a listener: first its tokenizer, then its predictor.", no_args_is_help=True)
+app = typer.Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
 
 
 class Placement(StrEnum):
@@ -86,6 +86,23 @@ def listener(
         config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None, overwrite
     )
     _show(interruptible(lambda: train_listener(options)), json)
+
+
+@app.command()
+def events(
+    data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
+    out: Path | None = typer.Option(None, metavar="FILE", help="Where the hazards go, as YAML."),
+    all_series: bool = typer.Option(
+        False, "--all-series", help="Learn from everybody, to compare; what comes out was taught on test."
+    ),
+    seed: int = typer.Option(1, min=0, help="Of the steps that are kept, and of the roll-outs."),
+    json: bool = JSON,
+) -> None:
+    """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
+    from sfms_robot.app.train.event_training import train_events
+    from sfms_robot.cli.show_learning import print_figures, show
+
+    show(interruptible(lambda: train_events(data, out, all_series, seed)), json, print_figures)
 
 
 def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:

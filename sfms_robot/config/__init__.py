@@ -1,8 +1,16 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices."""
 
 from sfms_robot.config.arig import Arig, Diffusion
-from sfms_robot.config.arig_training import ArigPhase, ArigTraining, Stage, load_training, parse_training
+from sfms_robot.config.arig_training import (
+    ArigPhase,
+    ArigTraining,
+    GroupWeights,
+    Stage,
+    load_training,
+    parse_training,
+)
 from sfms_robot.config.base import Model, load, parse
+from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.camera_mount import CameraMount
 from sfms_robot.config.drives import drives
 from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
@@ -29,6 +37,7 @@ __all__ = [
     "ArigTraining",
     "Baseline",
     "Bus",
+    "Calmness",
     "CameraMount",
     "ChannelGroup",
     "Coupling",
@@ -39,6 +48,7 @@ __all__ = [
     "FirmwareMap",
     "Fold",
     "Gaze",
+    "GroupWeights",
     "Grouped",
     "Head",
     "Idle",

@@ -11,6 +11,13 @@ from sfms_robot.config.listener import Count, Listener
 
 # Conversational states (3.3), in the order of the model's classes.
 STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
+# Those of a listener with events: feedback that is seen, by how, apart from that which is heard.
+EVENT_STATES: Final = (*STATES, "giving_feedback_nod", "giving_feedback_smile")
+
+
+def paper_state(state: int) -> int:
+    """A state of `EVENT_STATES` as one of the paper's seven."""
+    return min(state, len(STATES) - 1)
 
 
 def _both(value: Any) -> Any:
@@ -64,8 +71,10 @@ class Arig(Listener):
         state_guidance: false leaves the conversational states out; visual: false leaves motion out of the behaviours;
             interaction: `linear` puts plain layers in place of bidirectional-integrated learning;
             discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4).
-        draws: what the sampler draws of a frame: its `motion`, as in the paper, or the `step` from the frame before,
-            which is small where a face is still, and with it what the sampler gets wrong.
+        draws: what the sampler draws of a frame: its `motion`, as in the paper; the `step` from the frame before, which
+            is small where a face is still, and with it what the sampler gets wrong, but that stays; or the
+            `innovation` of a first-order autoregression fitted on the data, a step that is forgotten as fast as
+            people's motion returns to its mean.
         precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
     """
 
@@ -86,7 +95,7 @@ class Arig(Listener):
     interaction: Literal["bidirectional", "linear"] = "bidirectional"
     discrete: bool = False
     code_levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] = (8, 5, 5, 5)
-    draws: Literal["motion", "step"] = "motion"
+    draws: Literal["motion", "step", "innovation"] = "motion"
     diffusion: Diffusion = Diffusion()
     precision: Literal["auto", "fp32", "int8"] = "auto"
 
@@ -94,6 +103,17 @@ class Arig(Listener):
     def _heads_fit(self) -> Arig:
         if self.width % (2 * self.heads):
             raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        return self
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Conversational states it tells apart."""
+        return EVENT_STATES if self.events else STATES
+
+    @model_validator(mode="after")
+    def _events_fit(self) -> Arig:
+        if self.events and self.motion_space != "arkit58":
+            raise ValueError(f"events: true needs motion_space arkit58, not {self.motion_space}")
         return self
 
     @model_validator(mode="after")

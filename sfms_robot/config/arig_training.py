@@ -36,6 +36,21 @@ class Stage(Model):
         return self
 
 
+class GroupWeights(Model):
+    """What the mean loss of a group of channels weighs (`learning.arig.losses.GROUPS`), whatever their number."""
+
+    head: NonNegative = 1.0
+    lids: NonNegative = 1.0
+    brows: NonNegative = 1.0
+    mouth: NonNegative = 1.0
+
+    @model_validator(mode="after")
+    def _weighs(self) -> GroupWeights:
+        if not self.head + self.lids + self.brows + self.mouth:
+            raise ValueError("a group needs a weight above 0 (head, lids, brows, mouth)")
+        return self
+
+
 class ArigPhase(Phase):
     """The training of an ARIG listener.
 
@@ -46,7 +61,9 @@ class ArigPhase(Phase):
             equation (3) weighs 1. The paper gives no weights.
         history_noise: most that the past motion is off by, in standard deviations: in a stream it is the model's own.
         speaking_noise: likewise of jaw and mouth while the agent speaks: what it says decides them, not what they did.
-        state_noise: share of previous states that are drawn by lot: true ones would be copied, and a stream has none.
+        state_noise: share of previous states that are drawn by lot. A stream that goes on from its own best guess needs
+            it: true ones would be copied, and it has none. One that draws its states (events) is taught with true ones.
+        group_weights: of groups of channels in equation (3); None: every channel counts the same, which is the paper.
         drop_audio, drop_face: share of windows in which the user is not heard, not seen; drop_agent: of those in which
             the agent says nothing, that have no agent's track.
         gain_db: most that either track is louder or softer; colour_db: most that its bands are, smoothly from low to
@@ -61,6 +78,7 @@ class ArigPhase(Phase):
     history_noise: NonNegative = 0.3
     speaking_noise: NonNegative = 1.0
     state_noise: Share = 0.8
+    group_weights: GroupWeights | None = None
     drop_audio: Share = 0.1
     drop_face: Share = 0.3
     drop_agent: Share = 0.5

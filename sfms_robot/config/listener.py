@@ -14,14 +14,17 @@ from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS
 Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
-Placement = Literal["exact", "static", "static_paper", "learned_paper", "learned"]
+Placement = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
+GAZE_CHANNELS = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
 
 
 class ChannelGroup(Model):
     """Channels that share one keyframe track: at most one code per frame, from `levels[0] * levels[1] * ...`.
 
     Attributes:
-        keyframes: of a window; transition_bias: on the logit of class 0, more for fewer keyframes.
+        keyframes: of a window. keyframe_cost: in its place where placement is penalised, what a keyframe has to save in
+            squared error, summed over the group's channels in deviations.
+        transition_bias: on the logit of class 0, more for fewer keyframes.
         nucleus: in place of that of `sampling`.
         nucleus_in_silence: in place of nucleus once nobody has spoken for 3.2 s; needs a listener with `phase`.
         guidance: how much more than in training the speaker decides what is drawn (`listeners.sfms.draw`); 1: no more.
@@ -29,7 +32,8 @@ class ChannelGroup(Model):
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]
     levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
-    keyframes: Count
+    keyframes: Count | None = None
+    keyframe_cost: Positive | None = None
     transition_bias: Finite = 0.0
     nucleus: Annotated[float, Field(gt=0, le=1)] | None = None
     nucleus_in_silence: Annotated[float, Field(gt=0, le=1)] | None = None
@@ -78,6 +82,8 @@ class Listener(Model):
         neutral: face at rest in that space, one number per channel; None: the space's own.
         metres_per_unit: scale of the space's translation; None: it has none and is left out.
         flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
+        events: is it told of nods, smiles and blinks that were decided elsewhere (`signals.control`)? Then it draws
+            everything but gaze: not the eyes' direction, nor the head's part of it, which follow it by kinematics.
     """
 
     kind: str
@@ -86,10 +92,16 @@ class Listener(Model):
     neutral: tuple[Finite, ...] | None = None
     metres_per_unit: Positive | None = None
     flame_matrix: str | None = None
+    events: bool = False
 
     @property
     def channels(self) -> tuple[str, ...]:
         return SPACE_CHANNELS[self.motion_space]
+
+    @property
+    def drawn_channels(self) -> tuple[str, ...]:
+        """Those that the model draws; the others stay 0."""
+        return tuple(name for name in self.channels if not (self.events and name in GAZE_CHANNELS))
 
     @model_validator(mode="after")
     def _fits_space(self) -> Listener:
@@ -113,7 +125,10 @@ class Sfms(Listener):
         wav2vec2: folder of a model in the layout of transformers, beside config.yaml or absolute; only streams need it.
         phase: is the speaker's place in a phrase an input? Beyond the paper; it reaches back further than 40 frames.
         sequential: does each frame know the keyframes drawn before it? Beyond the paper, which draws 8 in parallel.
-        placement: where keyframes go (`listeners.sfms.placement`); max_gap_frames bounds `exact`.
+        placement: where keyframes go (`listeners.sfms.placement`); max_gap_frames bounds `exact` and `penalised`.
+        ramp_frames: motion toward a keyframe begins so many frames before it at most; the one before is held till then;
+            None: a straight line all the way, the paper's, which a stream cannot know beyond its plan.
+        sway: is slow motion of the head a process of its own (`listeners.sfms.sway`), not in the tokens? Needs events.
         quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq); either has a group's number of
             codes, the product of its levels.
         inpainter: added to straight lines (residual), or all by itself (paper).
@@ -130,6 +145,8 @@ class Sfms(Listener):
     sequential: bool = True
     placement: Placement = "exact"
     max_gap_frames: Count = 24
+    ramp_frames: Count | None = None
+    sway: bool = False
     groups: Annotated[dict[Name, ChannelGroup], Field(min_length=1)]
     scores: Scores = Scores()
     quantizer: Literal["fsq", "vq"] = "fsq"
@@ -155,12 +172,12 @@ class Sfms(Listener):
         owner: dict[str, str] = {}
         for name, group in self.groups.items():
             for channel in group.channels:
-                if channel not in self.channels:
-                    choices = ", ".join(self.channels)
+                if channel not in self.drawn_channels:
+                    choices = ", ".join(self.drawn_channels)
                     raise ValueError(f"groups.{name}.channels: {channel!r} is not a channel ({choices})")
                 if owner.setdefault(channel, name) != name:
                     raise ValueError(f"groups.{name}.channels: {channel!r} is already in group {owner[channel]}")
-        missing = [channel for channel in self.channels if channel not in owner]
+        missing = [channel for channel in self.drawn_channels if channel not in owner]
         if missing:
             raise ValueError(f"groups: no group holds {', '.join(missing)}")
         if len({len(group.levels) for group in self.groups.values()}) != 1:
@@ -168,6 +185,12 @@ class Sfms(Listener):
         for name, group in self.groups.items():
             if group.nucleus_in_silence is not None and not self.phase:
                 raise ValueError(f"groups.{name}.nucleus_in_silence: without phase silence is not known")
+            if self.placement == "penalised" and (group.keyframe_cost is None or group.keyframes is not None):
+                raise ValueError(f"groups.{name}: placement penalised takes keyframe_cost, not keyframes")
+            if self.placement != "penalised" and (group.keyframes is None or group.keyframe_cost is not None):
+                raise ValueError(f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost")
+        if self.sway and not self.events:
+            raise ValueError("sway: without events a nod cannot be told from it")
         if self.wav2vec2 is not None and self.audio != "wav2vec2":
             raise ValueError(f"wav2vec2: audio is {self.audio}, which needs no model")
         if self.hop_frames > self.future_frames:

@@ -76,8 +76,9 @@ class PredictorTraining(Phase):
         neutral_prefix: share of windows that begin as a stream does; drop_audio, drop_face: that lack a modality.
         history_noise: share of past keyframes that are one level off.
         group_weights: of each group's loss; 1 where it is not named.
+        event_windows: share of windows in whose future an event other than a blink is under way, for listeners that are
+            told; what is told decides it, so it changes no odds.
         calibration_rounds: roll-outs that bring keyframe rates to those of the data.
-        nod_nuclei: nuclei to choose from for the group that pitches the head, by how often it then nods; none: its own.
     """
 
     transition_weight: Positive = 0.5
@@ -89,8 +90,8 @@ class PredictorTraining(Phase):
     history_noise: Share = 0.05
     gain_db: NonNegative = 6.0
     group_weights: dict[Name, Positive] = {}
+    event_windows: Share = 0.0
     calibration_rounds: Annotated[int, Field(ge=0)] = 2
-    nod_nuclei: tuple[Annotated[float, Field(gt=0, le=1)], ...] = ()
 
 
 class Training(Model):

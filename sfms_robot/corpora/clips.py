@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, SPACE_CHANNELS, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, SPACE_CHANNELS, Floats, ListenerEvent
 from sfms_robot.signals import mel as log_mel
 
 # Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
@@ -30,6 +30,10 @@ UNREADABLE: Final = (
     tokenize.TokenError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 _FEATURE: Final = "feature."  # key prefix on disk
+_EVENT: Final = np.dtype(
+    [(name, "f8") for name in ("start_s", "duration_s", "size")]
+    + [("kind", "U16"), ("swings", "i4"), ("target_rad", "f8", 2)]
+)
 _Number = TypeVar("_Number", bound=np.generic)
 
 
@@ -49,6 +53,10 @@ class Dyad:
         features: more about each frame by name, (N, F): "hubert", "attributes", ...
         agent_audio: (samples_of(N, fps),) the listener's own voice, or None: the data ships none.
         states: (N,) int8, his conversational state (`corpora.states`), -1 where not known; None: nowhere.
+        events: what the listener did, as `frames.ListenerEvent`, times from the first frame; None: nobody knows.
+        head_of_gaze_rad: (N, 3) roll, pitch, yaw: the part of `listener`'s pose that goes with where he looks, which a
+            listener that draws events leaves to `signals.gaze_kinematics`; None: not known apart.
+        attention: (N,) 0..1, whether the speaker looks at the listener, NaN where not known; None: nowhere.
     """
 
     name: str
@@ -62,6 +70,9 @@ class Dyad:
     features: Mapping[str, Floats] = field(default_factory=dict)
     agent_audio: Floats | None = None
     states: NDArray[np.int8] | None = None
+    events: tuple[ListenerEvent, ...] | None = None
+    head_of_gaze_rad: Floats | None = None
+    attention: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.space not in WIDTHS:
@@ -77,6 +88,8 @@ class Dyad:
             "mel": (self.mel, (log_mel.ROWS_PER_FRAME * frames, log_mel.MEL_BINS)),
             "agent_audio": (self.agent_audio, (samples_of(frames, self.fps),)),
             "states": (self.states, (frames,)),
+            "head_of_gaze_rad": (self.head_of_gaze_rad, (frames, 3)),
+            "attention": (self.attention, (frames,)),
         }
         for key, (values, shape) in expected.items():
             if values is not None and values.shape != shape:
@@ -138,6 +151,12 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
             arrays["states"] = dyad.states
         if dyad.mel is not None:
             arrays["mel"] = dyad.mel
+        if dyad.head_of_gaze_rad is not None:
+            arrays["head_of_gaze_rad"] = dyad.head_of_gaze_rad.astype(np.float16)
+        if dyad.attention is not None:
+            arrays["attention"] = dyad.attention.astype(np.float16)
+        if dyad.events is not None:
+            arrays["events"] = _event_rows(dyad.events)
         if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
             arrays |= {"space": np.array(dyad.space), "fps": np.array(dyad.fps)}
         arrays |= {_FEATURE + name: rows for name, rows in dyad.features.items()}
@@ -168,9 +187,33 @@ def read(file: Path) -> Dyad:
                 {key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
                 _voice(arrays, "agent_audio"),
                 arrays["states"].astype(np.int8) if "states" in arrays else None,
+                _events(arrays["events"]) if "events" in arrays else None,
+                arrays["head_of_gaze_rad"].astype(np.float32) if "head_of_gaze_rad" in arrays else None,
+                arrays["attention"].astype(np.float32) if "attention" in arrays else None,
             )
     except UNREADABLE as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error
+
+
+def _event_rows(events: Sequence[ListenerEvent]) -> NDArray[np.void]:
+    """What happened and how large, one row each; what was drawn and why stays behind."""
+    none = (np.nan, np.nan)
+    rows = [(e.start_s, e.duration_s, e.size, e.kind, e.swings, e.target_rad or none) for e in events]
+    return np.array(rows, _EVENT)
+
+
+def _events(rows: NDArray[np.void]) -> tuple[ListenerEvent, ...]:
+    return tuple(
+        ListenerEvent(
+            str(row["kind"]),
+            float(row["start_s"]),
+            float(row["duration_s"]),
+            float(row["size"]),
+            int(row["swings"]),
+            None if np.isnan(row["target_rad"]).any() else (float(row["target_rad"][0]), float(row["target_rad"][1])),
+        )
+        for row in rows.astype(_EVENT)
+    )
 
 
 def _voice(arrays: Mapping[str, NDArray[Any]], key: str) -> Floats | None:

@@ -1,4 +1,4 @@
-"""Dyads as `clips.save` keeps them: `{train,validation}/NAME.npz`, among them all that `data compose` makes."""
+"""Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, among them all that `data compose` makes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from sfms_robot.corpora.clips import read
 from sfms_robot.corpora.collection import Clip, ClipError, Dataset, Layout, Order
 from sfms_robot.corpora.reading import collect, npz_shapes
+from sfms_robot.corpora.splits import SPLITS
 from sfms_robot.frames import FRAME_HZ, Floats
 
-SPLITS: Final = ("train", "validation", "test")
 _FEATURE: Final = "feature."
 
 
@@ -70,6 +70,6 @@ def _feature(file: Path, key: str) -> Floats:
 
 
 LAYOUT: Final = Layout(
-    "composed", "dyads of sfms-robot: {train,validation}/NAME.npz", "arkit58", float(FRAME_HZ), None,
+    "composed", "dyads of sfms-robot: {train,validation,test}/NAME.npz", "arkit58", float(FRAME_HZ), None,
     root, splits, scan,
 )  # fmt: skip

@@ -1,22 +1,18 @@
 """A plain table of nod rates by speech phase: the least that a listener's timing has to be compared with.
 
 A cell is where the others are in their talk: in a phrase, by how long it has lasted; or silent, by how long; either by
-the length of the phrase before. Its rate is nods over minutes, drawn toward the mean where minutes are few. Counts are
-kept by series of meetings, so that nobody is judged by a table that has seen him.
+the length of the phrase before. Its rate is nods over minutes, drawn toward the mean where minutes are few.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles
 
 SPEECH_S: Final = (1.0, 2.0, 4.0, 8.0)  # edges of the cells
@@ -66,52 +62,3 @@ class Counts:
         if not nods or not minutes:
             return np.zeros(CELLS)
         return np.asarray((self.nods + PRIOR_NODS) / (self.minutes + PRIOR_NODS * minutes / nods))
-
-
-@dataclass(frozen=True)
-class NodTable:
-    """Counts by series of meetings."""
-
-    series: Mapping[str, Counts]
-
-    def rates_for(self, series: str) -> Doubles:
-        """Nods a minute (CELLS,) for people of a series, from all the others; from all when there are no others."""
-        others = [counts for name, counts in self.series.items() if name != series]
-        return Counts.total(others or self.series.values()).rates()
-
-
-def save(file: Path, table: NodTable, comment: str) -> None:
-    """Write the table as YAML below a comment of any lines. Raises ConfigError when that fails."""
-    listed = {
-        name: {"nods": counts.nods.astype(int).tolist(), "minutes": np.round(counts.minutes, 3).tolist()}
-        for name, counts in sorted(table.series.items())
-    }
-    edges = {"speech_s": list(SPEECH_S), "silence_s": list(SILENCE_S), "last_phrase_s": list(LAST_S)}
-    text = yaml.safe_dump({"edges": edges, "series": listed}, sort_keys=False, width=110, default_flow_style=None)
-    head = "".join(f"# {line}\n" for line in comment.splitlines())
-    try:
-        file.write_text(head + text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
-
-
-def load(file: Path) -> NodTable:
-    """Read what `save` wrote. Raises ConfigError naming the file and what is wrong."""
-    try:
-        read = yaml.safe_load(file.read_text(encoding="utf-8"))
-        edges = tuple(tuple(read["edges"][key]) for key in ("speech_s", "silence_s", "last_phrase_s"))
-        series = {
-            str(name): Counts(np.array(row["nods"], np.float64), np.array(row["minutes"], np.float64))
-            for name, row in read["series"].items()
-        }
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(f"{file}: not a table of nod rates: {str(error).splitlines()[0]}") from error
-    if edges != (SPEECH_S, SILENCE_S, LAST_S):
-        raise ConfigError(f"{file}: edges = {edges} are not those of this version ({SPEECH_S}, {SILENCE_S}, {LAST_S})")
-    for name, counts in series.items():
-        for what, values in (("nods", counts.nods), ("minutes", counts.minutes)):
-            if values.shape != (CELLS,) or not np.isfinite(values).all() or (values < 0).any():
-                raise ConfigError(f"{file}: series.{name}.{what}: needs {CELLS} numbers of 0 or more")
-    if not series:
-        raise ConfigError(f"{file}: series: holds no meetings")
-    return NodTable(series)

@@ -4,6 +4,8 @@
 features of a dyad are worked out once and serve all streams, and speaker and plans stay in the model's motion space, so
 that data in DECA or FaceVerse coefficients, with mel in place of a waveform, are answered in their own terms. That both
 give the same motion is a law of the tests.
+
+A listener that is told of events is told those that are given, each `LEAD_FRAMES` before it begins, as when it runs.
 """
 
 from __future__ import annotations
@@ -18,14 +20,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from sfms_robot.config.arig import paper_state
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.conversational_states import UNKNOWN
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.learning.sfms.features import frames_of
 from sfms_robot.listeners.arig.stream import Memory as ArigMemory
 from sfms_robot.listeners.sfms.predictor import Context
-from sfms_robot.listeners.sfms.stream import SfmsListener, passed
+from sfms_robot.listeners.sfms.stream import SfmsListener, later, passed, revoked
 from sfms_robot.ports import Listener
+from sfms_robot.signals.control import control_track
+
+LEAD_FRAMES = 2  # an event decided with frame n begins behind frame n + 1 + LEAD_FRAMES
 
 
 @dataclass(frozen=True)
@@ -34,25 +40,30 @@ class Rollout:
 
     Attributes:
         motion: (S, N, 58) faces.
-        states: (S, N) int8 conversational states, -1 before the first and of listeners without.
+        states: (S, N) int8 of the paper's seven conversational states, -1 before the first and of listeners without.
+        events: of each stream, what it decided; nothing of listeners that decide none.
     """
 
     motion: Floats
     states: NDArray[np.int8]
+    events: tuple[tuple[ListenerEvent, ...], ...]
 
 
 @dataclass(frozen=True)
 class OfflineRollout:
-    """S streams that heard one dyad of N frames: motion (S, N, C) in the model's space, tokens (S, N', G) as drawn."""
+    """S streams that heard one dyad of N frames: motion (S, N, C) in the model's space, tokens (S, N, G) behind it."""
 
     motion: Tensor
     tokens: Tensor
 
 
-def speaker_frames(audio: Floats | None, face: Floats, agent_audio: Floats | None = None) -> list[SpeakerFrame]:
+def speaker_frames(
+    audio: Floats | None, face: Floats, agent_audio: Floats | None = None, attention: Floats | None = None
+) -> list[SpeakerFrame]:
     """Sound (N * 640,) and face (N, 58) as a source gives them, and the agent's own voice (N * 640,) one frame early.
 
-    A face of NaN is None; no sound at all is no microphone.
+    A face of NaN is None, and so is an attention (N,) of NaN, or of a face that is not seen; no sound at all is no
+    microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
     frames = []
@@ -63,64 +74,91 @@ def speaker_frames(audio: Floats | None, face: Floats, agent_audio: Floats | Non
         if said is not None and len(said) < FRAME_SAMPLES:
             said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
         seen = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
-        frames.append(SpeakerFrame(time_s, heard[now], seen, said))
+        looks = None if attention is None or seen is None or np.isnan(attention[index]) else float(attention[index])
+        frames.append(SpeakerFrame(time_s, heard[now], seen, said, looks))
     return frames
 
 
 def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
     """Both tracks of a dyad as a source gives them."""
-    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio)
+    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)
 
 
 @runtime_checkable
 class ManyStreams(Protocol):
     """A listener that steps several streams of one speaker at once."""
 
-    def step_many(self, speaker: SpeakerFrame, memories: Sequence[Any]) -> tuple[Sequence[Plan | None], Sequence[Any]]:
+    def step_many(
+        self, speaker: SpeakerFrame, memories: Sequence[Any], controls: Sequence[Floats] | None = None
+    ) -> tuple[Sequence[Plan | None], Sequence[Any]]:
         """`Listener.step` of streams that have heard the same from the start; no plans between hops."""
 
 
-def rollout(listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence[int]) -> Rollout:
-    """What the listener does while `speaker` is heard, once for every seed; side by side where the listener can."""
+def control_at(listener: Listener, events: Sequence[ListenerEvent], index: int) -> Floats | None:
+    """What `listener` is told with frame `index` of all the `events` of its life; None for one that is told nothing."""
+    past, ahead = getattr(listener, "control_frames", (0, 0))
+    if not past + ahead:
+        return None
+    decided_s = (index + 1 + LEAD_FRAMES) * FRAME_S + 1e-9
+    known = [event for event in events if event.start_s <= decided_s]
+    return control_track(known, index + 1 - past, past + ahead)
+
+
+def rollout(
+    listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence[int], events: Sequence[ListenerEvent] = ()
+) -> Rollout:
+    """What the listener does while `speaker` is heard, once for every seed; side by side where the listener can.
+
+    `events`: what a listener that is told of them shall do.
+    """
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
     states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
+    decided: list[list[ListenerEvent]] = [[] for _ in seeds]
     for index, frame in enumerate(speaker):
-        plans, memories = _step(listener, frame, memories)
+        plans, memories = _step(listener, frame, memories, control_at(listener, events, index))
         for row, plan in enumerate(plans):
             if plan is not None:
                 motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
+                decided[row] += plan.events
         for row, memory in enumerate(memories):
             if isinstance(memory, ArigMemory):
-                states[row, index + 1] = memory.state
-    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)])
+                states[row, index + 1] = paper_state(memory.state)
+    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
 
 
 def _step(
-    listener: Listener, frame: SpeakerFrame, memories: Sequence[Any]
+    listener: Any, frame: SpeakerFrame, memories: Sequence[Any], control: Floats | None
 ) -> tuple[Sequence[Plan | None], Sequence[Any]]:
+    told = () if control is None else (control,)
     if isinstance(listener, ManyStreams):
-        return listener.step_many(frame, memories)
-    stepped = [listener.step(frame, memory) for memory in memories]
+        return listener.step_many(frame, memories, *([one] * len(memories) for one in told))
+    stepped = [listener.step(frame, memory, *told) for memory in memories]
     return [plan for plan, _ in stepped], [memory for _, memory in stepped]
 
 
 def rollouts(
     listener: Listener, dyads: Sequence[Dyad], seed: int, each: Callable[[], object] = lambda: None
 ) -> list[Rollout]:
-    """One stream through every dyad from its beginning, each with a seed of its own; `each()` after every one."""
+    """One stream through every dyad from its beginning, each with a seed of its own; `each()` after every one.
+
+    A listener that is told of events is told those of the dyad's own listener.
+    """
     found = []
     for number, dyad in enumerate(dyads):
-        found.append(rollout(listener, frames_of_dyad(dyad), [seed + number]))
+        found.append(rollout(listener, frames_of_dyad(dyad), [seed + number], dyad.events or ()))
         each()
     return found
 
 
 @torch.inference_mode()
 def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) -> OfflineRollout:
-    """`rollout` from arrays. Raises ConfigError when the dyad is in a space that cannot become the listener's."""
+    """`rollout` from arrays, told of the dyad's own events where the listener is told of any.
+
+    Raises ConfigError when the dyad is in a space that cannot become the listener's, or has no events.
+    """
     model, past, ahead = listener.model, listener.settings.past_frames, listener.horizon
-    heard = frames_of(dyad, listener.space, listener.frontend)
+    heard = frames_of(dyad, listener.space, listener.frontend, listener.settings)
     frames = len(heard.motion)
     sound = model.standardise_sound(torch.cat([torch.zeros_like(heard.sound[:1]), heard.sound]).float())
     sound = torch.where(pad(heard.heard, (1, 0))[:, None, None], sound, 0.0)
@@ -129,10 +167,17 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
     known, audible = (pad(part, (past, 0)) for part in (heard.face_known, heard.heard))  # frame t at index past + t
     tokens, path = (part.expand(len(seeds), *part.shape) for part in listener.at_rest())
     generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-    drawn = []
+    sway = torch.stack([listener.draw_sway(generator) for generator in generators])
+    control = torch.zeros(1, past + ahead, heard.control.shape[1])
+    drawn = tokens[:, -1:].expand(-1, frames + ahead + 1, -1).clamp(min=0)
     shown = path[:, :1].expand(-1, frames + ahead + 1, -1).clone()
     for now in range(0, frames, listener.hop):  # the newest frame heard
-        tokens, path = passed(tokens, path, listener.hop if now else 1)
+        frames_passed = listener.hop if now else 1
+        tokens, path = passed(tokens, path, frames_passed, listener.holds)
+        told = control_at(listener, dyad.events or (), now)
+        if told is not None:
+            control, before = torch.from_numpy(told)[None], later(control, frames_passed)
+            tokens = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
         seen = Context(
             face=face[None, window],
@@ -141,8 +186,9 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             heard=audible[None, window],
             phase=phase[None, window],
             tokens=tokens,
+            control=control.expand(len(seeds), -1, -1),
         )
         tokens, path = listener.plan(seen, path, generators)
         shown[:, now + 1 : now + 1 + ahead] = listener.shown(path)
-        drawn.append(tokens[:, -listener.hop :])
-    return OfflineRollout(model.restore(shown[:, :frames]), torch.cat(drawn, dim=1))
+        drawn[:, now + 1 : now + 1 + ahead] = tokens[:, -ahead:]
+    return OfflineRollout(listener.with_sway(shown[:, :frames], sway, 0), drawn[:, :frames])

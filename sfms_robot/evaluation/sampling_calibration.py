@@ -1,10 +1,7 @@
-"""The roll-out, brought to the data by what both can be counted on: keyframes by a bias, nods by a nucleus.
+"""The roll-out, brought to the data by what both can be counted on: keyframes.
 
 Teacher forcing never shows the model its own mistakes, so left to itself it places keyframes somewhat too often or
-too rarely, and looks restless or frozen. A bias on class 0 per group moves that rate. Nods are rarer than keyframes and
-end up too many or too few at the same rate of keyframes: how much of the tail the group that pitches the head may draw
-from decides that, so of several nuclei the one that nods as often as the people did is taken. Guidance and the nucleus
-in silence are the recipe's: a few dyads hold far too few nods to tell when they come.
+too rarely, and looks restless or frozen. A bias on class 0 per group moves that rate.
 """
 
 from __future__ import annotations
@@ -13,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,8 +18,6 @@ from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Dataset, Order, usable
 from sfms_robot.corpora.formats import open_for
 from sfms_robot.evaluation.rollout import OfflineRollout, offline_rollout
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Floats
-from sfms_robot.learning.corpus import in_space
 from sfms_robot.learning.sfms.features import gather
 from sfms_robot.learning.sfms.predictor_trainer import corrected
 from sfms_robot.learning.sfms.tokens import tokenise
@@ -31,12 +25,10 @@ from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals import events
 
 DYADS = 8  # that are listened to
 LARGEST_STEP = 1.0  # of a bias, per round
 STREAMS = 4  # of every dyad, side by side
-PITCH = ("pitch", "rotation_x", "head_x")  # what a nod moves, in any motion space
 
 Progress = Callable[[], object]
 
@@ -57,7 +49,7 @@ def calibrate(
 
 def rounds(training: config.Training) -> int:
     """Rounds of roll-outs that `calibrate` takes."""
-    return training.predictor.calibration_rounds + len(training.predictor.nod_nuclei)
+    return training.predictor.calibration_rounds
 
 
 def _some(dyads: Dataset, window: int) -> list[Dyad]:
@@ -75,17 +67,17 @@ def calibrated(
     seed: int = 1,
     each: Progress = lambda: None,
 ) -> config.Sfms:
-    """`settings` with biases and nucleus fitted on `dyads`. The model is left in evaluation mode."""
+    """`settings` with biases fitted on `dyads`. The model is left in evaluation mode."""
     for _ in range(training.calibration_rounds):
         settings = placing(settings, model, dyads, seed)
         each()
-    return nodding(settings, model, dyads, training.nod_nuclei, seed, each) if training.nod_nuclei else settings
+    return settings
 
 
 def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: int) -> config.Sfms:
     """One round: biases that would have brought the keyframe rates of a roll-out to those of the data."""
     listener = SfmsListener(settings, model)
-    wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space)))
+    wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space, None, settings)))
     rates = _rates(torch.cat([one.tokens.flatten(0, 1) for one in _rolled_out(listener, dyads, seed)]))
     groups = {}
     for (name, group), has, wants in zip(settings.groups.items(), rates, wanted, strict=True):
@@ -95,59 +87,11 @@ def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed
     return settings.model_copy(update={"groups": groups})
 
 
-def nodding(
-    settings: config.Sfms,
-    model: SfmsModel,
-    dyads: Sequence[Dyad],
-    nuclei: Sequence[float],
-    seed: int,
-    each: Progress = lambda: None,
-) -> config.Sfms:
-    """The nucleus of `nuclei`, for the group that pitches the head, with which nods are as many as in the data."""
-    people = SfmsListener(settings, model)
-    theirs = [_shown(people, in_space(dyad, dyad.listener, people.space)[None]) for dyad in dyads]
-    wanted = nods_per_minute(theirs, dyads)
-    tried = [_with_nucleus(settings, nucleus) for nucleus in nuclei]
-    away = []
-    for attempt in tried:
-        listener = SfmsListener(attempt, model)
-        shown = [_shown(listener, one.motion) for one in _rolled_out(listener, dyads, seed)]
-        away.append(abs(math.log((nods_per_minute(shown, dyads) + 0.1) / (wanted + 0.1))))
-        each()
-    return tried[int(np.argmin(away))]
-
-
-def nods_per_minute(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
-    """Nods of (S, N, 58) motions, each beside its dyad, per minute of listening."""
-    onsets, minutes = 0, 0.0
-    for motion, dyad in zip(motions, dyads, strict=True):
-        for one in motion:
-            starts = [
-                int(start * FRAME_HZ) for start, _, _ in events.find_nods(one[:, CHANNEL_INDEX["pitch"]], FRAME_HZ)
-            ]
-            onsets += int(dyad.listening[starts].sum())
-            minutes += float(dyad.listening.sum()) / FRAME_HZ / 60
-    return onsets / minutes if minutes else 0.0
-
-
-def _with_nucleus(settings: config.Sfms, nucleus: float) -> config.Sfms:
-    groups = {
-        name: group.model_copy(update={"nucleus": nucleus}) if set(PITCH) & set(group.channels) else group
-        for name, group in settings.groups.items()
-    }
-    return settings.model_copy(update={"groups": groups})
-
-
 def _rolled_out(listener: SfmsListener, dyads: Sequence[Dyad], seed: int) -> list[OfflineRollout]:
     return [
         offline_rollout(listener, dyad, range(seed + STREAMS * index, seed + STREAMS * (index + 1)))
         for index, dyad in enumerate(dyads)
     ]
-
-
-def _shown(listener: SfmsListener, motion: Tensor) -> Floats:
-    """(S, N, D) in the model's space -> (S, N, 58)."""
-    return np.stack([listener.space.decode(one)[0] for one in motion.numpy()])
 
 
 def _rates(tokens: Tensor) -> list[float]:

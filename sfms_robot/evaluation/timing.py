@@ -1,328 +1,260 @@
-"""When a listener nods, against when people did: meetings are played to it, its nods laid beside the annotated ones.
+"""When a listener nods, against when people did: meetings are heard by it, its nods laid beside the annotated ones.
 
-Of a meeting participant everything but himself is kept: what the others said, and when, becomes a voice and a face as
-in composed dyads. The listener hears it several times, once for each seed. Everything is counted the same way for both:
-nod onsets per minute of time of a kind (`kinds_of_time`), and how well a score ranks the instants of his nods above
-the listening instants without one (`NodRanks`).
+Three things are told apart: what people did (`people_`), what a listener decides (`decided_`), and what is to be seen
+in its motion (no prefix). All are counted alike: onsets a minute of time of a kind (`times_of`), intervals in listening
+time, and how well a score ranks the instants at which he began above the other instants at which he might have
+(`ranked`). Every count is a sum over one meeting, to be added up to people (`per_person`) and made into figures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
 
-from sfms_robot.corpora.compose.acting import EYE_PAN_RAD, EYE_TILT_RAD
-from sfms_robot.corpora.compose.ami import Person, series
-from sfms_robot.corpora.compose.composed import Stretch, active, cast, speaker_of
-from sfms_robot.corpora.compose.motions import Motions
-from sfms_robot.corpora.compose.voices import Voice
-from sfms_robot.evaluation.nod_table import Counts, Ints, NodTable, cells
-from sfms_robot.evaluation.rollout import speaker_frames
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, SpeakerFrame
+from sfms_robot.corpora.compose.ami import Person
+from sfms_robot.corpora.compose.composed import Stretch, active
+from sfms_robot.evaluation.bootstrap import Figure, Sums, added, distance, median, quotient, ratio
+from sfms_robot.evaluation.deciding import spans_of
+from sfms_robot.evaluation.detection import Calibration, gaze_shifts, seen
+from sfms_robot.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
+from sfms_robot.evaluation.nod_table import Counts, cells
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.signals import events, phase
-from sfms_robot.signals.events import Bools
+from sfms_robot.signals.events import MOTION_EVENTS, Bools
 
-WITHIN_S: Final = 0.5  # a generated nod this close counts for an instant
-LEAST_NODS: Final = 3  # of a person, to be ranked
-_NOD_S: Final = 0.8  # length of the nods that the sampled table makes
+WITHIN_S: Final = 0.5  # a nod this close counts for an instant
+LEAST: Final = 3  # events of a person in a meeting, to be ranked
+INTERVALS_S: Final = np.geomspace(0.2, 1200, 400)  # edges of the histogram of intervals
+SIZES_DEG: Final = np.arange(0, 40.1, 0.1)  # edges of the histogram of nods by size
+LONG_SILENCE_S: Final = 2.0
+WHO: Final = ("", "decided_", "people_")
+ANNOTATED: Final = ("mm_hm", "laugh", "gaze_shift")  # beside nods
+AUC: Final = "_auc"  # in the names of figures that are means over people
 
-Rates = dict[str, tuple[float, float]]  # kind of time -> onsets, minutes
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A stretch of a meeting around one listener: N frames of what he hears and sees, and what he did.
-
-    Attributes:
-        nods_s: (K, 2) his nods, seconds of the stretch.
-        others, own, unseen: (N,) others speak, he speaks, his head is off camera.
-        laughs, gaze_shifts: how often; gaze_shifts None where nobody annotated his gaze.
-    """
-
-    name: str
-    series: str
-    speaker: tuple[SpeakerFrame, ...]
-    nods_s: Doubles
-    others: Bools
-    own: Bools
-    unseen: Bools
-    laughs: int
-    gaze_shifts: int | None
-
-    @property
-    def minutes(self) -> float:
-        return len(self.others) / FRAME_HZ / 60
-
-    @property
-    def listening(self) -> Bools:
-        """(N,) others spoke in the last 2 s, he is silent and in view."""
-        return events.listening_mask(self.others, FRAME_HZ, self.own) & ~self.unseen
-
-    @property
-    def cell(self) -> Ints:
-        """(N,) cell of the nod table, counted from the beginning of the stretch."""
-        return cells(phase.times(self.others.tolist()))
-
-    @property
-    def onsets(self) -> Ints:
-        """(K,) frames at which he begins to nod."""
-        return np.round(self.nods_s[:, 0] * FRAME_HZ).astype(np.int64).clip(0, len(self.others) - 1)
+Runs = Sequence[Doubles]  # spans (K, 2) [s] of what was done, once for each seed
 
 
-def choose_people(people: Sequence[Person], most: int | None) -> list[Person]:
-    """At most that many people, spread evenly over the meetings."""
-    if most is None or most >= len(people):
-        return list(people)
-    return [people[int(index)] for index in np.linspace(0, len(people) - 1, most).round()]
+# --- how often --------------------------------------------------------------------------------------------------
 
 
-def scene(
-    person: Person, minutes: float | None, voices: Sequence[Voice], motions: Motions, rng: np.random.Generator
-) -> Scene:
-    """The middle `minutes` of the time in which his head was annotated (all of it if None), voiced."""
-    length = person.until_s if minutes is None else min(person.until_s, 60 * minutes)
-    begin = round((person.until_s - length) / 2 * FRAME_HZ) / FRAME_HZ
-    stretch = Stretch(person, begin, begin + length)
-    audio, face = speaker_of(stretch, cast(voices, rng), motions, rng)
-    shifts = None
-    if person.gaze is not None:
-        shifts = sum(begin <= start < begin + length for start, _, _ in person.gaze)
-    return Scene(
-        f"{person.meeting}_{person.agent}",
-        series(person.meeting),
-        tuple(speaker_frames(audio, face)),
-        _starting_in(person.nods, stretch),
-        active(person.others, stretch),
-        active(person.talk, stretch),
-        active(person.unseen, stretch),
-        len(_starting_in(person.laughs, stretch)),
-        shifts,
-    )
-
-
-def _starting_in(spans: Doubles, stretch: Stretch) -> Doubles:
-    return spans[(spans[:, 0] >= stretch.start_s) & (spans[:, 0] < stretch.end_s)] - stretch.start_s
-
-
-# --- rates ------------------------------------------------------------------------------------------------------
-
-
-def kinds_of_time(one: Scene) -> dict[str, Bools]:
-    """Masks (N,) of the times that nods are counted in; all within listening but the last.
-
-    `after_phrase` and `later` are the two windows of the phrase-end ratio; the others are where people nod most and
-    least: right after a phrase of over 3 s, in the first second of one, eight seconds into one, and in long silence.
-    """
-    frames, listening = len(one.others), one.listening
-    spoken = events.runs(one.others)
+def times_of(one: ListenerMeeting) -> dict[str, Bools]:
+    """Masks (N,) of the times that nods are counted in; `after_phrase` and `later` make the phrase-end ratio."""
+    frames, listening = one.frames, one.listening
     ends = events.phrase_ends(one.others, FRAME_HZ)
-    long_ends = [end / FRAME_HZ for start, end in spoken if end - start > 3 * FRAME_HZ and end < frames]
-    speech_s, silence_s, _ = phase.times(one.others.tolist()).T
+    silence_s = phase.times(one.others.tolist())[:, 1]
     return {
-        "listening": listening,
-        "after_phrase": events.window_after(ends, events.AFTER_S, frames, FRAME_HZ) & listening,
-        "later": events.window_after(ends, events.LATER_S, frames, FRAME_HZ) & listening,
-        "after_long_phrase": events.window_after(long_ends, (0.0, 0.4), frames, FRAME_HZ) & listening,
-        "first_second": (speech_s > 0) & (speech_s <= 1) & listening,
-        "late_in_phrase": (speech_s > 8) & listening,
-        "long_silence": (silence_s > 2) & ~one.own & ~one.unseen,
+        "nods_per_minute": listening,
+        "addressed_nods_per_minute": one.addressed,
+        "bystander_nods_per_minute": one.bystander,
+        "nods_after_phrase": events.window_after(ends, events.AFTER_S, frames, FRAME_HZ) & listening,
+        "nods_later": events.window_after(ends, events.LATER_S, frames, FRAME_HZ) & listening,
+        "nods_long_silence": (silence_s > LONG_SILENCE_S) & ~one.own & ~one.unseen,
     }
 
 
-def count(one: Scene, onsets: Ints, times: int = 1) -> Rates:
-    """Onsets and minutes of every kind of time, for onsets of `times` runs."""
-    return {
-        kind: (float(mask[onsets].sum()), times * float(mask.sum()) / FRAME_HZ / 60)
-        for kind, mask in kinds_of_time(one).items()
-    }
+def nod_sums(who: str, one: ListenerMeeting, runs: Runs, within: Bools | None = None, per_seen: float = 1.0) -> Sums:
+    """Nods and minutes of every kind of time, and the histogram of intervals, in the part of it that is played.
 
-
-def add(parts: Iterable[Rates]) -> Rates:
-    """The sum over scenes."""
-    total: Rates = {}
-    for part in parts:
-        for kind, (nods, minutes) in part.items():
-            before = total.get(kind, (0.0, 0.0))
-            total[kind] = (before[0] + nods, before[1] + minutes)
-    return total
-
-
-def per_minute(counted: Rates, kind: str) -> float:
-    """Nods a minute; NaN where there was no such time."""
-    nods, minutes = counted.get(kind, (0.0, 0.0))
-    return nods / minutes if minutes else float("nan")
-
-
-def phrase_end_ratio(counted: Rates) -> float:
-    return events.ratio_of((*counted["after_phrase"], *counted["later"]))
-
-
-# --- what the listener did --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What a listener did in a scene, over S seeds.
-
-    Attributes:
-        nods_s: per seed (K, 2); nod_sizes_rad: of all, peak to peak.
-        blinks, smiles, gaze_shifts: of all seeds together.
+    `per_seen`: how many nods there are for each that is told (`detection.Calibration`).
     """
-
-    nods_s: tuple[Doubles, ...]
-    nod_sizes_rad: tuple[float, ...]
-    blinks: int
-    smiles: int
-    gaze_shifts: int
-
-    @property
-    def onsets(self) -> Ints:
-        """Frames at which a nod begins, of all seeds."""
-        starts = np.concatenate([nods[:, 0] for nods in self.nods_s])
-        return np.round(starts * FRAME_HZ).astype(np.int64)
+    played = np.ones(one.frames, bool) if within is None else within
+    onsets = [np.round(nods[:, 0] * FRAME_HZ).astype(np.int64).clip(0, one.frames - 1) for nods in runs]
+    every = np.concatenate([np.zeros(0, np.int64), *onsets])
+    sums = {}
+    for name, mask in times_of(one).items():
+        counted = mask & played
+        sums[who + name] = np.array([per_seen * counted[every].sum(), len(runs) * _minutes(counted)])
+    found = [intervals_s(begun, one.listening & played) for begun in onsets]
+    sums[who + "intervals"] = histogram(np.concatenate([np.zeros(0), *found]))
+    return sums
 
 
-def observe(motions: Floats) -> Answer:
-    """What is to be seen in motion (S, N, 58)."""
-    nods = [events.find_nods(motion[:, CHANNEL_INDEX["pitch"]], FRAME_HZ) for motion in motions]
-    return Answer(
-        tuple(np.array([event[:2] for event in found], np.float64).reshape(-1, 2) for found in nods),
-        tuple(size for found in nods for _, _, size in found),
-        sum(len(events.find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ)) for motion in motions),
-        sum(len(events.find_smiles(motion[:, CHANNEL_INDEX["mouthSmileLeft"]], FRAME_HZ)) for motion in motions),
-        sum(len(events.find_gaze_shifts(*gaze_rad(motion), FRAME_HZ)) for motion in motions),
-    )
+def intervals_s(onsets: Ints, listening: Bools) -> Doubles:
+    """From onset to onset (frames), as much of it as was listened in; onsets outside of it do not count."""
+    clock_s = np.cumsum(listening) / FRAME_HZ
+    return np.diff(clock_s[np.sort(onsets[listening[onsets]])])
 
 
-def gaze_rad(motion: Floats) -> tuple[Doubles, Doubles]:
-    """Yaw and pitch (N,) of the gaze of motion (N, 58), head and eyes together."""
+def histogram(values: Doubles) -> Doubles:
+    """Counts between the edges `INTERVALS_S`, and beyond both ends."""
+    return np.bincount(np.digitize(values, INTERVALS_S), minlength=len(INTERVALS_S) + 1).astype(np.float64)
 
-    def shape(name: str) -> Floats:
-        return motion[:, CHANNEL_INDEX[name]]
 
-    left = (shape("eyeLookOutLeft") + shape("eyeLookInRight") - shape("eyeLookInLeft") - shape("eyeLookOutRight")) / 2
-    down = (shape("eyeLookDownLeft") + shape("eyeLookDownRight") - shape("eyeLookUpLeft") - shape("eyeLookUpRight")) / 2
-    yaw = motion[:, CHANNEL_INDEX["yaw"]] + EYE_PAN_RAD * left
-    pitch = motion[:, CHANNEL_INDEX["pitch"]] + EYE_TILT_RAD * down
-    return np.asarray(yaw, np.float64), np.asarray(pitch, np.float64)
+def other_sums(who: str, one: ListenerMeeting, kind: str, runs: Runs) -> Sums:
+    """Events of another kind than nods, a minute of listening; an own voice begins where listening ends."""
+    begun = np.concatenate([np.zeros(0, np.int64), *(frames_before(spans[:, 0], one.frames) for spans in runs)])
+    listening = one.listening
+    return {f"{who}{kind}s_per_minute": np.array([listening[begun].sum(), len(runs) * _minutes(listening)], np.float64)}
+
+
+def people_sums(one: ListenerMeeting, within: Bools) -> Sums:
+    """What he did himself; his intervals also of the part that is played alone."""
+    sums = nod_sums("people_", one, [one.spans_s["nod"]])
+    sums["played_intervals"] = nod_sums("", one, [one.spans_s["nod"]], within)["intervals"]
+    for kind in ANNOTATED:
+        known = [one.spans_s[kind]] if kind in one.spans_s else []
+        sums |= other_sums("people_", one, kind, known)
+    return sums
+
+
+def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]]) -> Sums:
+    """What a listener decided, left to itself, once for each seed."""
+    nods = [spans_of(decided, "nod") for decided in streams]
+    sums = nod_sums("decided_", one, nods)
+    sums |= nod_contingency("decided_nod_auc", nods, one, np.ones(one.frames, bool))
+    for kind in (*ANNOTATED, "smile", "blink"):
+        sums |= other_sums("decided_", one, kind, [spans_of(decided, kind) for decided in streams])
+    return sums
+
+
+def motion_sums(one: ListenerMeeting, motions: Floats, first: int, calibration: Calibration) -> Sums:
+    """What is to be seen in motion (S, N', 58) that was made of the meeting's frames from `first` on.
+
+    Nods are set right by what their finder makes of known ones: it is late or early by so much, and misses so many.
+    """
+    runs, frames = motions.shape[:2]
+    played = np.zeros(one.frames, bool)
+    played[first : first + frames] = True
+    found = {kind: [seen(motion, kind) for motion in motions] for kind in MOTION_EVENTS}
+    begin_s = first * FRAME_S - calibration.lag_s.get("nod", 0.0)
+    nods = [begin_s + np.array([nod[:2] for nod in each], np.float64).reshape(-1, 2) for each in found["nod"]]
+    sizes = [np.degrees(size) for each in found["nod"] for _, _, size in each]
+    minutes = runs * frames * FRAME_S / 60
+    return {
+        **nod_sums("", one, nods, played, calibration.nods_per_seen_nod),
+        **nod_contingency("nod_auc", nods, one, played),
+        "nod_deg_sizes": np.histogram(sizes, SIZES_DEG)[0].astype(np.float64),
+        "blinks_per_minute": np.array([sum(map(len, found["blink"])), minutes]),
+        "smiles_per_minute": np.array([sum(map(len, found["smile"])), minutes]),
+        "gaze_shifts_per_minute": np.array([sum(len(gaze_shifts(motion)) for motion in motions), minutes]),
+    }
+
+
+def _minutes(mask: Bools) -> float:
+    return float(mask.sum()) / FRAME_HZ / 60
 
 
 # --- ranking ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class NodRanks:
-    """AUCs of one person: how a score ranks the onsets of his nods above listening instants without a nod.
+def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Bools | None = None) -> Doubles:
+    """[AUC * K, K]: how scores (N,) rank the instants before his K events above the others at which he might begin.
 
-    Attributes:
-        listener: share of seeds with a nod within 0.5 s of the instant.
-        table: rate of the nod table, fitted on other people.
-        sampled_table: what the table would get if it, too, nodded by lot, as often and with as many seeds as the
-            listener: so much of the distance to `table` is due to so few seeds, not to timing.
-        phase: rate by speech phase of the listener's own nods, all seeds and scenes together: timing without the lot.
+    He might where he listens and is not in the middle of one. Nothing of fewer than three events, or of a kind that
+    was not annotated.
     """
-
-    listener: float
-    table: float
-    sampled_table: float
-    phase: float
-
-
-def nod_ranks(
-    one: Scene, answer: Answer, rates: Doubles, own_rates: Doubles, rng: np.random.Generator
-) -> NodRanks | None:
-    """`rates` (CELLS,) are the table's, `own_rates` those of the listener's nods; None for a person of few nods."""
-    frames, listening, cell = len(one.others), one.listening, one.cell
-    onsets = one.onsets[listening[one.onsets]]
-    if len(onsets) < LEAST_NODS:
-        return None
-    without = listening & ~events.near(one.nods_s, frames, FRAME_HZ, WITHIN_S)
-
-    def auc(scores: Doubles) -> float:
-        return events.rank_auc(scores, onsets, without)
-
-    seeds = len(answer.nods_s)
-    chance = rates[cell] / 60 / FRAME_HZ
-    if chance.any():
-        chance = chance * len(answer.onsets) / (seeds * chance.sum())
-    sampled = [np.flatnonzero(rng.random(frames) < chance) / FRAME_HZ for _ in range(seeds)]
-    return NodRanks(
-        auc(nod_share(answer.nods_s, frames)),
-        auc(rates[cell]),
-        auc(nod_share([np.stack([at, at + _NOD_S], axis=1) for at in sampled], frames)),
-        auc(own_rates[cell]),
-    )
+    if kind not in one.spans_s:
+        return np.zeros(2)
+    might = one.listening & ~one.inside(kind)
+    if within is not None:
+        might &= within
+    onsets = one.instants(kind)
+    onsets = onsets[might[onsets]]
+    others = might.copy()
+    others[onsets] = False
+    if len(onsets) < LEAST or not others.any():
+        return np.zeros(2)
+    return np.array([events.rank_auc(scores, onsets, others) * len(onsets), len(onsets)], np.float64)
 
 
-def nod_share(nods_s: Sequence[Doubles], frames: int) -> Doubles:
+def contingent(
+    name: str, matched: Doubles, shifted: Sequence[Doubles], one: ListenerMeeting, within: Bools | None = None
+) -> Sums:
+    """How scores (N,) rank his nods; likewise those that belong to other minutes, in the mean; and by how much less."""
+    own = ranked(matched, one, "nod", within)
+    other = np.zeros(2)
+    if shifted:
+        other = np.mean([ranked(scores, one, "nod", within) for scores in shifted], axis=0)
+    difference = np.array([own[0] - other[0], own[1]]) if other[1] else np.zeros(2)
+    return {name: own, f"shifted_{name}": other, f"{name}_matched_minus_shifted": difference}
+
+
+def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubles, other: Doubles) -> Sums:
+    """How hazards (N,) rank his nods: given his own speech, without it, and without it while the others are shifted."""
+    ranks = contingent("nod_hazard_auc", silent, [other], one)
+    return {
+        f"{who}nod_hazard_auc": ranked(speaking, one),
+        f"{who}nod_hazard_auc_without_own_speech": ranks["nod_hazard_auc"],
+        f"{who}shifted_nod_hazard_auc": ranks["shifted_nod_hazard_auc"],
+        f"{who}nod_hazard_auc_matched_minus_shifted": ranks["nod_hazard_auc_matched_minus_shifted"],
+    }
+
+
+def nod_share(runs: Runs, frames: int) -> Doubles:
     """(frames,) share of the runs with a nod within 0.5 s: the nod probability of every instant."""
-    runs = [events.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in nods_s]
-    return np.asarray(np.mean(runs, axis=0), np.float64)
+    return np.asarray(np.mean([events.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in runs], axis=0), np.float64)
 
 
-def fit_table(people: Sequence[Person]) -> NodTable:
-    """The nod table of everybody's whole annotated time."""
-    parts: dict[str, list[Counts]] = {}
+def nod_contingency(name: str, runs: Runs, one: ListenerMeeting, within: Bools) -> Sums:
+    """`contingent` of nods that a listener made itself.
+
+    Its history is its own, so what it did while it heard another minute is what it did then: its nods are moved, by
+    every whole minute that the part played allows.
+    """
+    played = np.flatnonzero(within)
+    share = nod_share(runs, one.frames)
+    step = round(SHIFT_S * FRAME_HZ)
+    moved = []
+    for shift in range(step, len(played) - step + 1, step):
+        other = share.copy()
+        other[played] = np.roll(share[played], shift)
+        moved.append(other)
+    return contingent(name, share, moved, one, within)
+
+
+def table_rates(people: Sequence[Person]) -> Doubles:
+    """Nods a minute by cell of the nod table, over everybody's whole annotated time."""
+    parts = []
     for person in people:
         whole = Stretch(person, 0.0, person.until_s)
         others, own, unseen = (active(spans, whole) for spans in (person.others, person.talk, person.unseen))
         listening = events.listening_mask(others, FRAME_HZ, own) & ~unseen
-        onsets = np.round(person.nods[:, 0] * FRAME_HZ).astype(np.int64)
-        counts = Counts.of(cells(phase.times(others.tolist())), onsets, listening)
-        parts.setdefault(series(person.meeting), []).append(counts)
-    return NodTable({name: Counts.total(found) for name, found in parts.items()})
+        onsets = frames_before(person.nods[:, 0], len(others))
+        parts.append(Counts.of(cells(phase.times(others.tolist())), onsets, listening))
+    return Counts.total(parts).rates()
 
 
-# --- all together -----------------------------------------------------------------------------------------------
+def table_sums(one: ListenerMeeting, rates: Doubles) -> Sums:
+    """How the nod table with these rates (`table_rates`) ranks his nods."""
+    return {"table_nod_auc": ranked(rates[cells(phase.times(one.others.tolist()))], one)}
 
 
-def summary(
-    scenes: Sequence[Scene], answers: Sequence[Answer], table: NodTable, seed: int
-) -> tuple[dict[str, float | None], list[NodRanks]]:
-    """Figures of the listener and, with the prefix people_, of the people; None where nothing could be counted."""
-    runs = len(answers[0].nods_s)
-    ours = add(count(one, answer.onsets, runs) for one, answer in zip(scenes, answers, strict=True))
-    theirs = add(count(one, one.onsets) for one in scenes)
-    pairs = list(zip(scenes, answers, strict=True))
-    own_rates = Counts.total(Counts.of(one.cell, answer.onsets, one.listening) for one, answer in pairs).rates()
-    rng = np.random.default_rng(seed)
-    ranked = [nod_ranks(one, answer, table.rates_for(one.series), own_rates, rng) for one, answer in pairs]
-    ranks = [rank for rank in ranked if rank is not None]
-    minutes = sum(one.minutes for one in scenes)
-    watched = [one for one in scenes if one.gaze_shifts is not None]
-    sizes = [size for answer in answers for size in answer.nod_sizes_rad]
-
-    def mean(pick: Callable[[NodRanks], float]) -> float:
-        return float(np.mean([pick(rank) for rank in ranks])) if ranks else float("nan")
-
-    found = {
-        **_nod_rates(ours, ""),
-        "nod_deg": float(np.degrees(np.median(sizes))) if sizes else float("nan"),
-        "nod_auc": mean(lambda rank: rank.listener),
-        "table_nod_auc": mean(lambda rank: rank.table),
-        "sampled_table_nod_auc": mean(lambda rank: rank.sampled_table),
-        "phase_nod_auc": mean(lambda rank: rank.phase),
-        "blinks_per_minute": sum(answer.blinks for answer in answers) / runs / minutes,
-        "smiles_per_minute": sum(answer.smiles for answer in answers) / runs / minutes,
-        "gaze_shifts_per_minute": sum(answer.gaze_shifts for answer in answers) / runs / minutes,
-        **_nod_rates(theirs, "people_"),
-        "people_laughs_per_minute": sum(one.laughs for one in scenes) / minutes,
-        "people_gaze_shifts_per_minute": sum(one.gaze_shifts or 0 for one in watched)
-        / (sum(one.minutes for one in watched) or float("nan")),
-    }
-    return {key: round(value, 4) if np.isfinite(value) else None for key, value in found.items()}, ranks
+# --- people and figures -----------------------------------------------------------------------------------------
 
 
-def _nod_rates(counted: Mapping[str, tuple[float, float]], prefix: str) -> dict[str, float]:
-    rates = dict(counted)
-    return {
-        f"{prefix}nods_per_minute": per_minute(rates, "listening"),
-        f"{prefix}phrase_end_ratio": phrase_end_ratio(rates),
-        f"{prefix}nods_after_long_phrase": per_minute(rates, "after_long_phrase"),
-        f"{prefix}nods_first_second": per_minute(rates, "first_second"),
-        f"{prefix}nods_late_in_phrase": per_minute(rates, "late_in_phrase"),
-        f"{prefix}nods_long_silence": per_minute(rates, "long_silence"),
-    }
+def per_person(meetings: Iterable[tuple[str, Sums]]) -> list[Sums]:
+    """Sums of (participant, sums of a meeting) -> one of each participant; of an AUC the mean over his events, once."""
+    by_name: dict[str, list[Sums]] = {}
+    for participant, sums in meetings:
+        by_name.setdefault(participant, []).append(sums)
+    return [
+        {name: _once(numbers) if AUC in name else numbers for name, numbers in added(parts).items()}
+        for _, parts in sorted(by_name.items())
+    ]
+
+
+def _once(numbers: Doubles) -> Doubles:
+    return np.array([numbers[0] / numbers[1], 1.0]) if numbers[1] else np.zeros(2)
+
+
+def figures_of(sums: Sums) -> dict[str, Figure]:
+    """Every figure that these sums can be made into."""
+    pairs = [name for name in sums if not name.endswith(("intervals", "sizes"))]
+    figures: dict[str, Figure] = {name: quotient(name) for name in pairs}
+    for who in WHO:
+        if f"{who}nods_later" in sums:
+            figures[f"{who}phrase_end_ratio"] = ratio(f"{who}nods_after_phrase", f"{who}nods_later")
+            figures[f"{who}addressed_over_bystander"] = ratio(
+                f"{who}addressed_nods_per_minute", f"{who}bystander_nods_per_minute"
+            )
+    if "intervals" in sums:
+        figures["interval_ks"] = distance("intervals", "played_intervals")
+        figures["nod_deg"] = median("nod_deg_sizes", (SIZES_DEG[1:] + SIZES_DEG[:-1]) / 2)
+    if "decided_intervals" in sums:
+        figures["decided_interval_ks"] = distance("decided_intervals", "people_intervals")
+    if "nod_hazard_auc" in sums and "r2_nod_hazard_auc" in sums:
+        gained = "nod_hazard_auc_matched_minus_shifted"
+        figures[f"{gained}_of_r2"] = ratio(gained, f"r2_{gained}")
+    return figures

@@ -18,10 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sfms_robot.config.listener import GAZE_CHANNELS
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import usable
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, Floats
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, Floats
 from sfms_robot.listeners.space import MotionSpace
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
+GAZE = [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]
 SOUND_SAMPLE = 20_000  # frames whose sound gives means and deviations
 LEAST_SOUND_SPREAD = 1e-3
 
@@ -144,6 +146,21 @@ def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
     out = np.full((len(motion), space.dim), np.nan, dtype=np.float32)
     out[known] = space.encode(motion[known])
     return torch.from_numpy(out)
+
+
+def without_gaze(dyad: Dyad) -> Dyad:
+    """The dyad with what a listener that is told of events has to draw (`config.Listener.events`): eyeLook* are 0, and
+    the head's part of a gaze shift is taken out of its pose, where that is known.
+
+    Raises ConfigError for motion that is not ours.
+    """
+    if dyad.space != "arkit58":
+        raise ConfigError(f"dyad {dyad.name} is in {dyad.space}: gaze can be taken out of arkit58 alone")
+    motion = dyad.listener.copy()
+    motion[:, GAZE] = 0.0
+    if dyad.head_of_gaze_rad is not None:
+        motion[:, :3] -= dyad.head_of_gaze_rad
+    return replace(dyad, listener=motion, head_of_gaze_rad=None)
 
 
 def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tensor]:

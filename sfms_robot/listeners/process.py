@@ -13,9 +13,11 @@ listener goes on at the newest frame. What it did not hear is counted, and said 
 
 A listener that is loaded is not yet fast: it builds its graphs while the head eases in, and measures what a plan takes
 on this machine. By that, and by how late the source has been for half a second, its hop is chosen. What it did not hear
-meanwhile it hears then, as fast as it can.
+meanwhile it hears then, as fast as it can. Every ten seconds the choice is held against what has been measured since: a
+hop that does not fit any more gives way to a shorter one, and never to a longer one, so that it settles.
 
-    parent -> child    pickle: (name, seed), then SpeakerFrame after SpeakerFrame; between them, once, an int: the hop
+    parent -> child    pickle: (name, seed, calmness), then SpeakerFrame after SpeakerFrame; between them an int: the
+                       hop, which it waits for and which may change; whenever somebody asks for it, another Calmness
     child -> parent    pickle: (kind, value, number)
         loaded         nothing is wrong with it
         probed         value is a `Probe`; it waits for its hop
@@ -28,6 +30,7 @@ meanwhile it hears then, as fast as it can.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import pickle
 import queue
@@ -35,12 +38,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import IO, Any, Final
 
 import numpy as np
 
 from sfms_robot.child_process import end_child, start_child, take_pipes
+from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.hop import HopChoice, Latencies, choose_hop
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
@@ -55,7 +59,8 @@ HUNG_S: Final = 1.0
 RESTART_S: Final = 3.0
 RESTARTS: Final = 5  # in a minute; more than that is no accident
 PROBE_S: Final = 0.5
-PROBE_PLANS: Final = 100
+PROBE_PLANS: Final = 12
+REVIEW_S: Final = 10.0
 SETTLED_FRAMES: Final = FRAME_HZ // 2  # after so many a source has measured how late it is
 _MINUTE_S: Final = 60.0
 
@@ -79,10 +84,11 @@ class ListenerProcess:
     Args:
         name: what `registry.load_listener` takes: a shipped listener, a folder, or a kind of another package.
         seed: of the stream.
+        calmness: how often a listener that decides events does what.
     """
 
-    def __init__(self, name: str, seed: int) -> None:
-        self._name, self._seed = name, seed
+    def __init__(self, name: str, seed: int, calmness: Calmness | None = None) -> None:
+        self._name, self._seed, self._calmness = name, seed, calmness
         self._step_ms = Quantiles()
         self._skipped = 0
         self._restarted_s: list[float] = []
@@ -93,8 +99,15 @@ class ListenerProcess:
         self._latencies: Callable[[Probe], Latencies] | None = None
         self._probe: Probe | None = None  # that is to be answered with a hop
         self._choice: HopChoice | None = None
+        self._probed: Probe | None = None  # what the choice in force was made by
+        self._review_s = math.inf
         self._pushed = 0
-        self._child = _Child(name, seed)
+        self._child = _Child(name, seed, calmness)
+
+    def calm(self, calmness: Calmness) -> None:
+        """From the next frames on. Never blocks; a listener that decides nothing takes no notice."""
+        self._calmness = calmness
+        self._child.tell(calmness)
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
         """Block until the listener is loaded. Raises ModelError with its own message when it cannot be."""
@@ -133,6 +146,7 @@ class ListenerProcess:
             if plan is not None:
                 plans.append(plan)
         self._supervise(now_s)
+        self._review(now_s)
         return plans
 
     @property
@@ -174,6 +188,7 @@ class ListenerProcess:
             if self._restarts:
                 log.warning("the listener is back")
             self._state, self._waits_since_s = "listening", now_s if self._unanswered else None
+            self._review_s = now_s + REVIEW_S
         else:
             self._answered(1, now_s)
             if self._state == "hung":
@@ -191,12 +206,29 @@ class ListenerProcess:
             return
         self._probe = None
         if self._latencies is None:
-            self._child.tell_hop(probe.hop)
+            self._child.tell(probe.hop)
             return
         before, self._choice = self._choice, choose_hop(probe.hops, self._latencies(probe))
-        self._child.tell_hop(self._choice.hop)
+        self._probed = probe
+        self._child.tell(self._choice.hop)
         if self._choice.given_up and (before is None or before.given_up is None):
             log.warning("a plan every %d frames: %s", self._choice.hop, self._choice.given_up)
+
+    def _review(self, now_s: float) -> None:
+        """A shorter hop, where the one in force does not fit what is measured by now."""
+        if now_s < self._review_s or self._state != "listening":
+            return
+        self._review_s = now_s + REVIEW_S
+        if self._choice is None or self._probed is None or self._latencies is None or not len(self._step_ms):
+            return
+        hop, steps_s = self._choice.hop, [self._step_ms.at(percent) * 1e-3 for percent in (50, 99)]
+        measured = self._latencies(replace(self._probed, step_p50_s=steps_s[0], step_p99_s=steps_s[1]))
+        if not measured.fits(hop):
+            choice = choose_hop([each for each in self._probed.hops if each <= hop], measured)
+            if choice.hop != hop:
+                log.info("a plan every %d frames, %d before, by what is measured", choice.hop, hop)
+                self._choice = choice
+                self._child.tell(choice.hop)
 
     def _answered(self, frames: int, now_s: float) -> None:
         self._unanswered = max(0, self._unanswered - frames)
@@ -226,20 +258,21 @@ class ListenerProcess:
         self._restarted_s.append(now_s)
         self._restarts += 1
         self._state, self._waits_since_s, self._unanswered, self._probe = "starting", None, 0, None
-        self._child = _Child(self._name, self._seed + self._restarts)
+        self._child = _Child(self._name, self._seed + self._restarts, self._calmness)
 
 
 class _Child:
     """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
 
-    def __init__(self, name: str, seed: int) -> None:
+    def __init__(self, name: str, seed: int, calmness: Calmness | None) -> None:
         self._process = start_child("sfms_robot.listeners.process:main")
-        self._frames: deque[Any] = deque([(name, seed)])
-        self._hop: int | None = None
+        self._frames: deque[Any] = deque([(name, seed, calmness)])
+        self._urgent: deque[int | Calmness] = deque()
         self._changed = threading.Condition()
         self._messages: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
         self.ended = False
         self._closing = False
+        self._named = False  # what to load was sent: it goes before all
         for work in (self._write, self._read):
             threading.Thread(target=work, name=f"listener {work.__name__}", daemon=True).start()
 
@@ -253,10 +286,10 @@ class _Child:
             self._changed.notify()
         return dropped
 
-    def tell_hop(self, hop: int) -> None:
+    def tell(self, value: int | Calmness) -> None:
         """It goes before all frames that wait, and is never dropped."""
         with self._changed:
-            self._hop = hop
+            self._urgent.append(value)
             self._changed.notify()
 
     def message(self) -> tuple[str, Any, float] | None:
@@ -292,13 +325,11 @@ class _Child:
         try:
             while True:
                 with self._changed:
-                    self._changed.wait_for(lambda: self._closing or self._frames or self._hop)
+                    self._changed.wait_for(lambda: self._closing or self._frames or (self._urgent and self._named))
                     if self._closing:
                         break
-                    if self._hop:
-                        item, self._hop = self._hop, None
-                    else:
-                        item = self._frames.popleft()
+                    item = (self._urgent if self._urgent and self._named else self._frames).popleft()
+                    self._named = True
                 pickle.dump(item, pipe, protocol=5)
                 pipe.flush()
             pipe.close()
@@ -331,7 +362,7 @@ def main() -> None:
     frames, plans = take_pipes()
     inbox, hops = Inbox(), queue.SimpleQueue[int]()
     try:
-        name, seed = pickle.load(frames)
+        name, seed, calmness = pickle.load(frames)
     except (EOFError, pickle.UnpicklingError):
         return  # the parent ended before it said what to load
     threading.Thread(target=_receive, args=(frames, inbox, hops), daemon=True).start()
@@ -343,7 +374,7 @@ def main() -> None:
         from sfms_robot.listeners.registry import at_hop, build_graphs, hops_of, load_listener
 
         torch.set_num_threads(threads())
-        listener = load_listener(name, graphs=False)
+        listener = load_listener(name, graphs=False, calmness=calmness)
         _say(plans, "loaded")
         build_graphs(listener)
         choices = hops_of(listener)
@@ -352,13 +383,16 @@ def main() -> None:
     except RobotError as error:
         _say(plans, "error", str(error))
         return
-    listen(at_hop(listener, hops.get()), seed, inbox, plans)
+    listen(at_hop(listener, hops.get()), seed, inbox, plans, hops)
 
 
-def plan_times_s(listener: Listener, limit_s: float = PROBE_S) -> tuple[float, float]:
+def plan_times_s(
+    listener: Listener, limit_s: float = PROBE_S, wait: Callable[[float], object] = time.sleep
+) -> tuple[float, float]:
     """Median and 99th percentile of what a plan takes, on silence; a step without one counts where no plan was made.
 
-    Blocks for `limit_s`, or `PROBE_PLANS` plans, and one step more.
+    At the pace of a run: between two frames caches cool, and a plan takes half as long again. Blocks for `limit_s`, or
+    `PROBE_PLANS` plans, and one step more.
     """
     silence = np.zeros(FRAME_SAMPLES, np.float32)
     memory = listener.start(0)
@@ -368,7 +402,9 @@ def plan_times_s(listener: Listener, limit_s: float = PROBE_S) -> tuple[float, f
     while len(planned_s) < PROBE_PLANS and (not other_s + planned_s or time.perf_counter() - began_s < limit_s):
         step_s = time.perf_counter()
         plan, memory = listener.step(SpeakerFrame((len(planned_s) + len(other_s) + 1) * FRAME_S, silence), memory)
-        (other_s if plan is None else planned_s).append(time.perf_counter() - step_s)
+        taken_s = time.perf_counter() - step_s
+        (other_s if plan is None else planned_s).append(taken_s)
+        wait(max(0.0, FRAME_S - taken_s))
     p50_s, p99_s = np.percentile(planned_s or other_s, [50, 99])
     return float(p50_s), float(p99_s)
 
@@ -380,19 +416,28 @@ def _receive(frames: IO[bytes], inbox: Inbox, hops: queue.SimpleQueue[int]) -> N
             item = pickle.load(frames)
             if isinstance(item, int):
                 hops.put(item)
+            elif isinstance(item, Calmness):
+                inbox.calmness = item
             else:
                 inbox.put(item)
     except (EOFError, OSError, pickle.UnpicklingError):
         os._exit(0)
 
 
-def listen(listener: Listener, seed: int, inbox: Inbox, plans: IO[bytes]) -> None:
+def listen(
+    listener: Listener, seed: int, inbox: Inbox, plans: IO[bytes], hops: queue.SimpleQueue[int] | None = None
+) -> None:
     """One step per frame until None comes; tells when it is ready, what it answers, and what it left out."""
+    from sfms_robot.listeners.registry import at_hop
+
     memory = listener.start(seed)
     _say(plans, "ready")
     while (frame := inbox.next()) is not None:
         if inbox.skipped:
             _say(plans, "skipped", None, inbox.skipped)
+        memory = calmed(listener, memory, inbox)
+        while hops is not None and not hops.empty():
+            listener = at_hop(listener, hops.get())
         began_s = time.perf_counter()
         plan, memory = listener.step(frame, memory)
         taken_ms = (time.perf_counter() - began_s) * 1e3
@@ -404,6 +449,13 @@ def _say(plans: IO[bytes], kind: str, value: Any = None, number: float = 0.0) ->
     plans.flush()
 
 
+def calmed(listener: Listener, memory: Any, inbox: Inbox) -> Any:
+    """The memory after what was asked for since the last frame; a listener that decides nothing takes no notice."""
+    calmness, inbox.calmness = inbox.calmness, None
+    change = getattr(listener, "calmed", None)
+    return memory if calmness is None or change is None else change(memory, calmness)
+
+
 class Inbox:
     """Frames in the order in which they came, until None does; the newest alone when too many are waiting.
 
@@ -411,6 +463,7 @@ class Inbox:
 
     Attributes:
         skipped: frames left out before the last one given.
+        calmness: asked for since `calmed` looked; None: none.
     """
 
     def __init__(self, most: int = MOST_WAITING) -> None:
@@ -419,6 +472,7 @@ class Inbox:
         self._waiting: deque[SpeakerFrame | None] = deque()
         self._kept_up = False  # at least once
         self.skipped = 0
+        self.calmness: Calmness | None = None
 
     def put(self, frame: SpeakerFrame | None) -> None:
         self._queue.put(frame)

@@ -6,22 +6,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.listener_kinds import LISTENER_KINDS
 from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.listeners.eventful import EventfulListener, MotionModel
+from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
 
-def load_listener(name: str | Path, graphs: bool = True) -> Listener:
+def load_listener(name: str | Path, graphs: bool = True, calmness: Calmness | None = None) -> Listener:
     """A listener by shipped name, of a folder with config.yaml and weights, or of another package.
 
     `graphs`: ready to run at full speed, which takes another second or two; else `build_graphs` is still to be called.
-    Raises ConfigError or ModelError.
+    `calmness`: how often a listener that decides events does what. Raises ConfigError or ModelError.
     """
     folder = listener_folder(str(name))
     if folder is None:
         return load_plugin(str(name))
-    listener = cast(Listener, LISTENER_KINDS[load_config(folder).kind].load_folder(folder))
+    settings = load_config(folder)
+    listener = cast(Listener, LISTENER_KINDS[settings.kind].load_folder(folder))
+    if settings.events:
+        listener = EventfulListener(cast(MotionModel, listener), EventModel.load(), calmness)
     if graphs:
         build_graphs(listener)
     return listener

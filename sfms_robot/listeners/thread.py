@@ -13,8 +13,9 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from sfms_robot.config.calmness import Calmness
 from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.listeners.process import HUNG_S, MOST_WAITING, Inbox
+from sfms_robot.listeners.process import HUNG_S, MOST_WAITING, Inbox, calmed
 from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -48,6 +49,10 @@ class ListenerThread:
             self._since_s = now_s
         self._pushed += 1
         self._inbox.put(frame)
+
+    def calm(self, calmness: Calmness) -> None:
+        """As of `ListenerProcess`."""
+        self._inbox.calmness = calmness
 
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Plans that came. Never blocks."""
@@ -91,6 +96,7 @@ class ListenerThread:
             memory = self._listener.start(self._seed)
             while (frame := self._inbox.next()) is not None:
                 self._skipped += self._inbox.skipped
+                memory = calmed(self._listener, memory, self._inbox)
                 began_s = time.perf_counter()
                 plan, memory = self._listener.step(frame, memory)
                 if plan is not None:

@@ -153,14 +153,18 @@ def drive(
                     state, command = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
                 log.commanded(tick, command.goals_rad, command.asked_rad, command.motion)
                 parts.bus.write(command.goals_rad, tick.time_s)
-                log.wrote(clock.now_s() - start_s, command.reach_s)
+                written_s = clock.now_s() - start_s
+                log.wrote(written_s, command.reach_s)
                 readings = parts.bus.poll(tick.time_s)
                 state = _rejoined(parts, log, readings, state, tick.time_s)
                 state = _noticed(parts, readings, state, tick.time_s, 1.0 / rate_hz)
                 parts.source.moves(float(np.abs(command.goals_rad - before_rad).sum() * rate_hz))
                 observers.tick(
-                    Tick(tick.time_s, command.motion, command.goals_rad, readings, state.run.name, state.run.why)
-                )
+                    Tick(
+                        tick.time_s, command.motion, command.goals_rad, readings, state.run.name, state.run.why,
+                        written_s,
+                    )
+                )  # fmt: skip
         finally:
             state = _ending(log, clock.now_s() - start_s, state)
             if parts.halt.by is None:  # a head that was halted moves no more

@@ -1,8 +1,9 @@
-"""Nods, blinks and smiles in the plans of a listener, found before the servos do them.
+"""What a listener is about to do: the events it has decided, or nods, blinks and smiles found in its plans.
 
-The planned frames, newest over oldest, are one motion at 25 Hz; the detectors of `signals.events` look at its last
-seconds after every plan. A nod or a blink is told when a plan holds it whole, a smile when it has lasted 0.4 s;
-each once.
+A listener that decides tells each event in a plan, with what spoke for it, before it begins (`frames.Plan.events`). Of
+one that does not, the planned frames, newest over oldest, are one motion at 25 Hz, and the detectors of
+`signals.events` look at its last seconds: a nod or a blink is told when a plan holds it whole, a smile when it has
+lasted 0.4 s; each once.
 """
 
 from __future__ import annotations
@@ -11,13 +12,12 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from sfms_robot.errors import InputError
-from sfms_robot.frames import FRAME_HZ, Doubles, Plan, SpeakerFrame
+from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, Doubles, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
 from sfms_robot.signals.events import MOTION_EVENTS
 
@@ -28,22 +28,6 @@ NEWS: Final = 2 * FRAME_HZ  # what ended longer ago than this many frames is no 
 MOST_WAITING: Final = 10 * FRAME_HZ  # plans
 
 
-@dataclass(frozen=True)
-class MotionEvent:
-    """Something that the listener's plans hold.
-
-    Attributes:
-        kind: "nod", "blink" or "smile".
-        start_s, end_s: when the face does it, in the run's time; a smile goes on for longer.
-        size: peak to peak [rad] of a nod, else 0..1.
-    """
-
-    kind: str
-    start_s: float
-    end_s: float
-    size: float
-
-
 class PlannedEvents:
     """Plans in, events out. Remembers `WINDOW` frames."""
 
@@ -51,14 +35,26 @@ class PlannedEvents:
         self._signals = np.zeros((len(MOTION_EVENTS), 0))
         self._first = 0  # index, in frames of 40 ms, of the first column
         self._told_until_s: dict[str, float] = {}
+        self._decided: list[ListenerEvent] | None = None  # None: a listener that decides none
 
-    def add(self, plan: Plan) -> list[MotionEvent]:
+    def add(self, plan: Plan) -> list[ListenerEvent]:
         """Events that this plan completes, in the order in which they begin."""
-        self._join(plan)
+        self.join(plan)
+        return self.news()
+
+    def news(self) -> list[ListenerEvent]:
+        """Events of the plans so far that were not told yet; ask within `NEWS` frames of each other."""
+        if self._decided is not None:
+            decided, self._decided = self._decided, []
+            return decided
         found = [event for row, kind in enumerate(MOTION_EVENTS) for event in self._new(kind, self._signals[row])]
         return sorted(found, key=lambda event: event.start_s)
 
-    def _join(self, plan: Plan) -> None:
+    def join(self, plan: Plan) -> None:
+        """Take a plan, look at nothing."""
+        if plan.hazards_hz or plan.events:
+            self._decided = [*(self._decided or ()), *plan.events]
+            return
         columns = np.array([kind.signal(plan.frames) for kind in MOTION_EVENTS.values()], np.float64)
         begins = round(float(plan.times_s[0]) * FRAME_HZ)
         known = self._signals.shape[1]
@@ -72,14 +68,14 @@ class PlannedEvents:
         self._first += max(0, joined.shape[1] - WINDOW)
         self._signals = joined[:, -WINDOW:]
 
-    def _new(self, name: str, signal: Doubles) -> list[MotionEvent]:
+    def _new(self, name: str, signal: Doubles) -> list[ListenerEvent]:
         kind, begins_s, last_s = MOTION_EVENTS[name], self._first / FRAME_HZ, (len(signal) - 1) / FRAME_HZ
         news = []
         for start, end, size in kind.find(signal, FRAME_HZ):
             if end < last_s - NEWS / FRAME_HZ or (kind.whole and end > last_s - 0.5 / FRAME_HZ):
                 continue
             if begins_s + start > self._told_until_s[name]:
-                news.append(MotionEvent(name, float(begins_s + start), float(begins_s + end), float(size)))
+                news.append(ListenerEvent(name, float(begins_s + start), float(end - start), float(size)))
             self._told_until_s[name] = max(self._told_until_s[name], begins_s + end)
         return news
 
@@ -95,17 +91,17 @@ class EventWatch:
     """
 
     def __init__(self) -> None:
-        self._callbacks: list[tuple[str, Callable[[MotionEvent], object]]] = []
+        self._callbacks: list[tuple[str, Callable[[ListenerEvent], object]]] = []
         self._plans: deque[Plan] = deque(maxlen=MOST_WAITING)
         self._changed = threading.Condition()
         self._closing = False
         self._thread: threading.Thread | None = None
         self.detached: dict[str, str] = {}
 
-    def on(self, kind: str, callback: Callable[[MotionEvent], object]) -> None:
-        """Call `callback` with every `MotionEvent` of a kind. Raises InputError for an unknown kind."""
-        if kind not in MOTION_EVENTS:
-            raise InputError(f"on({kind!r}): no such event ({', '.join(MOTION_EVENTS)})")
+    def on(self, kind: str, callback: Callable[[ListenerEvent], object]) -> None:
+        """Call `callback` with every event of one of `EVENT_KINDS`. Raises InputError for an unknown kind."""
+        if kind not in EVENT_KINDS:
+            raise InputError(f"on({kind!r}): no such event ({', '.join(EVENT_KINDS)})")
         with self._changed:
             self._callbacks.append((kind, callback))
             if self._thread is None and not self._closing:
@@ -146,7 +142,7 @@ class EventWatch:
             for event in events.add(plan):
                 self._tell(event)
 
-    def _tell(self, event: MotionEvent) -> None:
+    def _tell(self, event: ListenerEvent) -> None:
         for entry in tuple(self._callbacks):
             kind, callback = entry
             if kind != event.kind:

@@ -5,9 +5,10 @@ value is dropped and counted, never waited for - except in virtual time, where w
 be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
 goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
-Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /event (nods, blinks and smiles that
-plans hold), /face (per tick: the 58 channels asked for), /joints (per tick and joint: goal, present, age, fault),
-/servos (once a second: what else they tell), /state (when it changes).
+Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /event (what was decided, and why; of
+a listener that decides nothing, nods, blinks and smiles found in its plans), /face (per tick: the 58 channels asked
+for), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: what else they tell), /state
+(when it changes).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal
 
 import numpy as np
+import orjson
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
@@ -44,6 +46,7 @@ _QUEUE_LENGTH: Final = 2000  # ten seconds of a 100 Hz loop
 _CHUNK_BYTES: Final = 64 * 1024  # short stalls, and little is lost when a run is killed
 PART_MESSAGES: Final = 100_000  # about seven minutes of a 100 Hz loop
 SERVOS_S: Final = 1.0
+EVENTS_S: Final = 1.0
 _DIGITS: Final = 5
 _log = logging.getLogger(__name__)
 
@@ -73,8 +76,19 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "made_at_s": _NUMBER,
         "times_s": {"type": "array", "items": _NUMBER},
         "frames": {"type": "array", "items": {"type": "array", "items": _NUMBER}},
+        "hazards_hz": {"type": "object", "additionalProperties": _NUMBER},
     },
-    "/event": {"kind": {"type": "string"}, "start_s": _NUMBER, "end_s": _NUMBER, "size": _NUMBER},
+    "/event": {
+        "kind": {"type": "string"},
+        "start_s": _NUMBER,
+        "duration_s": _NUMBER,
+        "size": _NUMBER,
+        "swings": _NUMBER,
+        "target_rad": {"type": ["array", "null"], "items": _NUMBER},
+        "probability": _NUMBER_OR_NULL,
+        "draw": _NUMBER_OR_NULL,
+        "evidence": {"type": "object", "additionalProperties": _NUMBER},
+    },
     "/face": {"time_s": _NUMBER, **_CHANNELS},
     "/joints": {"time_s": _NUMBER, "joints": {"type": "object", "additionalProperties": _JOINT}},
     "/servos": {"time_s": _NUMBER, "servos": {"type": "object"}},
@@ -110,7 +124,7 @@ class Recorder:
         self._in_part = 0
         self._events = PlannedEvents()
         self._state: tuple[str, tuple[str, ...]] | None = None
-        self._servos_s = -math.inf
+        self._servos_s = self._looked_s = -math.inf
         self._begin()
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -174,7 +188,9 @@ class Recorder:
         """The thread: runs till close. After trouble with the file it goes on emptying the queue."""
         while (value := self._queue.get()) is not None:
             if self._trouble is None:
-                self._attempt(partial(self._write, value))
+                self._attempt(partial(self._take, value))
+        if self._trouble is None:
+            self._attempt(lambda: self._write(self._news(math.inf)))
 
     def _attempt(self, action: Callable[[], Any]) -> None:
         """Whatever goes wrong with the file ends the recording, not the run, and is told in the report."""
@@ -184,11 +200,13 @@ class Recorder:
             self._trouble = self._trouble or f"{type(error).__name__}: {error}"
             _log.error("the recording ends here: %s", self._trouble)
 
-    def _write(self, value: Tick | SpeakerFrame | Plan) -> None:
-        for topic, time_s, body in self._messages(value):
+    def _take(self, value: Tick | SpeakerFrame | Plan) -> None:
+        self._write(self._messages(value))
+
+    def _write(self, messages: Sequence[Message]) -> None:
+        for topic, time_s, body in messages:
             time_ns = max(0, round(time_s * 1e9))
-            data = json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
-            self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
+            self._writer.add_message(self._channels[topic], time_ns, orjson.dumps(body), time_ns)
             self._written += 1
             self._in_part += 1
         if self._in_part >= PART_MESSAGES:
@@ -200,8 +218,8 @@ class Recorder:
         if isinstance(value, SpeakerFrame):
             return [("/speaker", value.time_s, _speaker_body(value))]
         if isinstance(value, Plan):
-            events = [("/event", event.start_s, asdict(event)) for event in self._events.add(value)]
-            return [("/plan", value.made_at_s, _plan_body(value)), *events]
+            self._events.join(value)
+            return [("/plan", value.made_at_s, _plan_body(value)), *self._news(value.made_at_s)]
         messages: list[Message] = [
             ("/face", value.time_s, {"time_s": value.time_s, **_by_channel(value.motion)}),
             ("/joints", value.time_s, _joints_body(value, self._joints)),
@@ -214,6 +232,13 @@ class Recorder:
             self._servos_s = value.time_s
             messages.append(("/servos", value.time_s, _servos_body(value)))
         return messages
+
+    def _news(self, now_s: float) -> list[Message]:
+        """What plans hold, once a second: looking takes a millisecond that the loop's thread may have to wait for."""
+        if 0 <= now_s - self._looked_s < EVENTS_S:
+            return []
+        self._looked_s = now_s
+        return [("/event", event.start_s, asdict(event)) for event in self._events.news()]
 
 
 def check_folder(folder: Path, overwrite: bool = False) -> None:
@@ -264,6 +289,7 @@ def _plan_body(plan: Plan) -> dict[str, Any]:
         "made_at_s": plan.made_at_s,
         "times_s": _numbers(plan.times_s),
         "frames": [_numbers(frame) for frame in plan.frames],
+        "hazards_hz": {kind: _number(hazard) for kind, hazard in plan.hazards_hz.items()},
     }
 
 
@@ -301,14 +327,15 @@ def _servos_body(seen: Tick) -> dict[str, Any]:
     return {"time_s": seen.time_s, "servos": servos}
 
 
-def _by_channel(motion: Floats) -> dict[str, float | None]:
+def _by_channel(motion: Floats) -> dict[str, float]:
     return dict(zip(CHANNELS, _numbers(motion), strict=True))
 
 
-def _number(value: float) -> float | None:
-    """JSON has no inf and no NaN: null."""
-    return round(float(value), _DIGITS) if math.isfinite(value) else None
+def _number(value: float) -> float:
+    """What is not finite becomes null on disk: JSON has no inf and no NaN."""
+    return round(float(value), _DIGITS)
 
 
-def _numbers(values: NDArray[np.floating]) -> list[float | None]:
-    return [_number(value) for value in values.tolist()]
+def _numbers(values: NDArray[np.floating]) -> list[float]:
+    rounded: list[float] = values.astype(np.float64).round(_DIGITS).tolist()
+    return rounded

@@ -24,7 +24,7 @@ ARRIVED_RAD: Final = 1e-4  # of a goal
 STANDS_RAD: Final = 0.01  # of a servo: its gear and its load leave it a little short
 FOLLOW_S: Final = 0.3  # that servos are given after their goals have arrived
 FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
-SWITCH_S: Final = 0.0005  # Python's own 5 ms is half a tick
+SWITCH_S: Final = 0.0001  # a tick waits that long for another thread; Python's own 5 ms is half a tick
 
 T = TypeVar("T", float, Doubles)
 Seen = Callable[[float, float, Doubles, Mapping[str, Reading]], None]  # time, share of the way ahead, goals, readings

@@ -1,7 +1,7 @@
 """Where the other person is in a phrase: how long it has lasted, how long it is silent, how long the last one was.
 
 This is what nods depend on, and it reaches back further than the 1.6 s that a predictor sees. `step` takes the samples
-of one frame and gives features for a predictor; the three times alone serve the table of nod rates (`learning`).
+of one frame and gives features for a predictor; the three times alone serve the table of nod rates (`evaluation`).
 
 A phrase goes on across silences under 0.2 s. Features are hat functions of each time on a logarithmic grid, so that a
 linear layer can already draw any curve over it, and are all 0 for a phase that has not been yet.
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats
 from sfms_robot.signals import voice_activity
@@ -103,13 +104,18 @@ def hear(levels_db: Doubles) -> list[bool]:
     return heard
 
 
-def times(active: Sequence[bool]) -> Doubles:
-    """Speech (N,) -> seconds (N, 3): speech so far, silence so far, length of the last phrase."""
-    phase, rows = SpeechPhase(), []
-    for frame in active:
-        phase = phase.after(bool(frame))
-        rows.append(phase.times_s)
-    return np.array(rows, np.float64).reshape(-1, 3)
+def times(active: Sequence[bool] | NDArray[np.bool_]) -> Doubles:
+    """Speech (N,) -> seconds (N, 3): speech so far, silence so far, length of the last phrase, as `after` counts."""
+    heard = np.asarray(active, bool)
+    index = np.arange(len(heard))
+    newest = np.maximum.accumulate(np.where(heard, index, -1))
+    silence = index - newest
+    runs = (newest >= 0) & (silence < GAP_FRAMES)
+    ran = np.concatenate([[False], runs])[:-1]
+    began = np.maximum.accumulate(np.where(heard & ~ran, index, -1))
+    ended = np.maximum.accumulate(np.where(ran & ~runs, index, -1))
+    last = np.where(ended >= 0, (newest - began + 1)[ended], 0)
+    return np.stack([np.where(runs, index - began + 1, 0), silence, last], axis=1) * FRAME_S
 
 
 def features(times_s: Doubles) -> Floats:

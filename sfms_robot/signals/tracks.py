@@ -196,9 +196,11 @@ def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
 
 
 def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_column: int) -> list[list[str]]:
-    """Rows as long as the header: one that ends with its time has lost the face, a last one cut off is left out."""
+    """Rows as long as the header: one that ends with its time, or a count of 0 after it, has lost the face (Live Link
+    writes such rows), a last one cut off is left out."""
     lost = [""] * (len(header) - time_column - 1)
-    rows = [[*row, *lost] if len(row) == time_column + 1 else row for row in rows]
+    ends = time_column + 1
+    rows = [[*row[:ends], *lost] if len(row) == ends or row[ends:] == ["0"] else row for row in rows]
     if len(rows) > 1 and len(rows[-1]) < len(header):
         logger.warning("%s: its last row is cut off and left out", file)
         rows = rows[:-1]

@@ -4,7 +4,9 @@
 2. A frame is given as soon as its voice is whole. When that takes `ALLOWANCE_S` longer than the voice's latency it is
    given without (an overrun: empty audio), and what comes of it after that is discarded. No frame waits for longer than
    `LONGEST_WAIT_S`, for a plan looks only a third of a second ahead.
-3. The face is the newest one at or before the end of the frame, and none when that is older than `FACE_S`.
+3. The face is the newest one, and none when that is older than `FACE_S` at the end of the frame. Of a recording it is
+   no newer than that; of something live up to one frame newer, when the frame is given later: a face does not wait for
+   the voice beside it, which comes some tens of milliseconds late.
 4. What the robot says is told one frame early, as a program that speaks knows it: frame i carries the samples of frame
    i + 1, for which a listener plans its lips while it hears frame i.
 5. Where a sighting does not tell the person's attention, their face does (`signals.attention`).
@@ -22,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
+from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
 from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
@@ -87,7 +89,7 @@ class PairedSource:
             heard = self._heard(self._given, now_s)
             if heard is None:
                 break
-            frames.append(self._frame(self._given, heard))
+            frames.append(self._frame(self._given, heard, now_s))
             self._given += 1
         self.missing = tuple(name for name, part in self._parts().items() if part.lost)
         return frames
@@ -138,9 +140,11 @@ class PairedSource:
             return _NONE
         return heard
 
-    def _frame(self, index: int, heard: Floats) -> SpeakerFrame:
-        time_s = (index + 1) / FRAME_HZ
-        sighting = None if self._sight is None else self._sight.at(time_s)
+    def _frame(self, index: int, heard: Floats, now_s: float) -> SpeakerFrame:
+        time_s = seen_s = (index + 1) / FRAME_HZ
+        if self._sight is not None and self._sight.duration_s is None:
+            seen_s = min(max(now_s, time_s), time_s + FRAME_S)
+        sighting = None if self._sight is None else self._sight.at(seen_s)
         if sighting is not None:
             age_s = time_s - sighting.face.time_s
             if age_s > FACE_S + _EPS_S:
@@ -242,7 +246,7 @@ class FrameJudge:
             self._leave_out(index, "face", "values that are not finite")
             return None
         end_s = (index + 1) / FRAME_HZ
-        time_s = face.time_s if end_s - FACE_S - _EPS_S <= face.time_s <= end_s else end_s
+        time_s = face.time_s if -FACE_S - _EPS_S <= face.time_s - end_s <= FRAME_S + _EPS_S else end_s
         return FaceFrame(time_s, pose, np.clip(shapes, 0.0, 1.0), jaw)
 
     def _attention(self, index: int, attention: float | None) -> float | None:

@@ -11,7 +11,7 @@ from sfms_robot import config
 from sfms_robot.app.replay import read_recording
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.cli.main import main
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.arig import STATES, paper_state
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.listeners import checkpoint
@@ -81,7 +81,7 @@ def test_a_robot_that_stops_speaking_while_somebody_talks_listens_within_a_secon
     memory, states = listener.start(3), []
     for frame in open_source(duration_s=6.0, agent_audio=voice(tmp_path / "said.wav", 4.0)).read(6.0):
         _, memory = listener.step(frame, memory)
-        states.append(STATES[memory.state])
+        states.append(STATES[paper_state(memory.state)])
     assert "listening" not in states[75:99] and set(states[75:99]) <= {"speaking", "interrupted", "giving_feedback"}
     assert set(states[125:]) <= {"listening", "giving_feedback"}
 

@@ -11,6 +11,7 @@ from sfms_robot.corpora import clips
 from sfms_robot.corpora.clips import WIDTHS, Dyad, samples_of
 from sfms_robot.corpora.collection import Clip, ClipError, Dataset, usable
 from sfms_robot.errors import ConfigError
+from sfms_robot.frames import ListenerEvent
 from sfms_robot.signals import mel
 
 RNG = np.random.default_rng(0)
@@ -40,6 +41,7 @@ def test_dyads_of_before_are_still_read(tmp_path):
              listener=np.zeros((2, 58), np.float16), listening=np.ones(2, bool))  # fmt: skip
     (read,) = clips.load(tmp_path)
     assert (read.space, read.fps, read.mel, dict(read.features)) == ("arkit58", 25.0, None, {})
+    assert (read.events, read.head_of_gaze_rad, read.attention) == (None, None, None)
 
 
 def test_a_dyad_without_sound_survives_the_disk(tmp_path):
@@ -145,3 +147,17 @@ def test_usable_dyads_are_all_but_the_broken_ones_which_are_named(caplog):
     dataset, _ = lazy(dyad(), OSError("gone"), dyad())
     assert len(list(usable(dataset))) == 2
     assert "1 of 3 clips cannot be used: clip1: gone" in caplog.text
+
+
+def test_what_happened_survives_the_disk(tmp_path):
+    events = (
+        ListenerEvent("nod", 0.12, 0.8, 0.09, 2),
+        ListenerEvent("gaze_shift", 0.2, 0.4, 0.3, target_rad=(-0.3, 0.05)),
+    )
+    attention = np.array([1, 0, np.nan, *[1] * 17], np.float32)
+    made = dyad(events=events, head_of_gaze_rad=np.full((20, 3), 0.25, np.float32), attention=attention)
+    clips.save(tmp_path, [made])
+    (read,) = clips.load(tmp_path)
+    assert read.events == events
+    np.testing.assert_array_equal(read.head_of_gaze_rad, made.head_of_gaze_rad)
+    np.testing.assert_array_equal(read.attention, attention)

@@ -5,7 +5,6 @@ import pytest
 
 from sfms_robot.corpora.compose.motions import (
     KINDS,
-    SPLITS,
     cycles,
     facegood_mouth,
     load,
@@ -14,10 +13,11 @@ from sfms_robot.corpora.compose.motions import (
     slow,
     table,
 )
+from sfms_robot.corpora.splits import SPLITS
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ
 
-TAKE = {"train": "yes1", "validation": "apfel"}
+TAKE = {"train": "yes1", "validation": "apfel", "test": "facial"}
 
 
 def test_every_swing_of_a_nodding_head_is_cut_and_normalised():

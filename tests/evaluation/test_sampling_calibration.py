@@ -4,7 +4,7 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.evaluation.sampling_calibration import nodding, nods_per_minute, placing
+from sfms_robot.evaluation.sampling_calibration import placing
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.listeners.sfms.model import SfmsModel
 
@@ -37,12 +37,6 @@ def model() -> SfmsModel:
         return SfmsModel(settings()).eval()
 
 
-def test_nods_are_counted_per_minute_of_listening():
-    one = dyad(nods=4)
-    assert nods_per_minute([one.listener[None]], [one]) == pytest.approx(4 / (200 / 25 / 60))
-    assert nods_per_minute([np.stack([one.listener, one.listener * 0])], [one]) == pytest.approx(2 / (200 / 25 / 60))
-
-
 def test_a_group_that_places_too_many_keyframes_gets_a_bias_against_them(model):
     """Untrained, a keyframe is as likely as 15 of 16 classes: far above the data's 8 in 48."""
     after = placing(settings(), model, [dyad()], seed=1)
@@ -55,8 +49,3 @@ def test_rounds_come_to_rest(model):
         rounds.append(placing(rounds[-1], model, [dyad(120, 2)], seed=1))
     bias = np.array([[group.transition_bias for group in one.groups.values()] for one in rounds])
     assert (abs(np.diff(bias, axis=0))[-1] < 0.5).all()
-
-
-def test_the_group_that_pitches_the_head_gets_one_of_the_nuclei_and_the_others_keep_theirs(model):
-    after = nodding(settings(), model, [dyad(100, 1)], (0.3, 0.9), seed=1)
-    assert after.groups["neck"].nucleus in (0.3, 0.9) and after.groups["face"].nucleus is None

@@ -1,165 +1,288 @@
-"""A listener that nods where people do scores as they do, at random it does not; scenes hold what was."""
+"""Who nods as people do has their figures, at random none; what follows others is lost when they are shifted."""
 
 import numpy as np
 import pytest
 
-from sfms_robot.corpora.compose.ami import Person, phrases
-from sfms_robot.corpora.compose.motions import load as load_motions
-from sfms_robot.corpora.compose.voices import read_voice
-from sfms_robot.data import data_dir
+from sfms_robot.app.evaluate.meetings import middle, people_of, spread
+from sfms_robot.corpora.compose.ami import Person
+from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import timing
-from sfms_robot.evaluation.nod_table import Counts, NodTable
+from sfms_robot.evaluation.bootstrap import estimates
+from sfms_robot.evaluation.detection import Calibration, Sightings
+from sfms_robot.evaluation.listener_meetings import ListenerMeeting
 from sfms_robot.evaluation.rollout import rollout, speaker_frames
-from sfms_robot.evaluation.timing import Answer, Scene
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
-from sfms_robot.signals.events import voice_activity
+from sfms_robot.signals.phase import times
 
 NONE = np.zeros((0, 2))
 MINUTES = 40
+FRAMES = MINUTES * 60 * FRAME_HZ
 
 
-def spans(starts_s, length_s=0.8):
+def spans(starts_s, length_s=0.6):
     starts = np.asarray(starts_s, float)
     return np.stack([starts, starts + length_s], axis=1)
 
 
-def talk(minutes=MINUTES, seed=0):
+def talk(seed=0):
     """(N,) talk in phrases of 1 to 8 s with pauses of 0.4 to 3 s."""
     rng = np.random.default_rng(seed)
     pieces, total = [], 0
-    while total < minutes * 60 * FRAME_HZ:
+    while total < FRAMES:
         piece = np.r_[np.ones(rng.integers(25, 200), bool), np.zeros(rng.integers(10, 75), bool)]
         pieces.append(piece)
         total += len(piece)
-    return np.concatenate(pieces)[: minutes * 60 * FRAME_HZ]
+    return np.concatenate(pieces)[:FRAMES]
 
 
-def scene(nods_s, others=None, name="M1a_A", series="M1"):
+def meeting(nods_s, others=None, participant="A", **changed):
     others = talk() if others is None else others
     silent = np.zeros(len(others), bool)
-    return Scene(name, series, (), spans(nods_s), others, silent, silent, laughs=0, gaze_shifts=None)
+    whole = {
+        "name": f"M1a_{participant}", "participant": participant, "speaker": (), "spans_s": {"nod": spans(nods_s)},
+        "aside": np.zeros(0, bool), "others": others, "own": silent, "unseen": silent, "alone": others,
+        "attention": np.full(len(others), np.nan),
+    }  # fmt: skip
+    return ListenerMeeting(**whole | changed)
 
 
-def ends_of(others, least_s=3.0):
-    bounds = np.flatnonzero(np.diff(np.r_[0, others.astype(int), 0]))
-    return np.array(
-        [b / FRAME_HZ for a, b in zip(bounds[::2], bounds[1::2], strict=True) if b - a > least_s * FRAME_HZ]
+def ends_of(others):
+    """Seconds at which talk ends."""
+    return np.flatnonzero(np.diff(others.astype(int)) == -1) / FRAME_HZ + FRAME_S
+
+
+def answering(others, share=0.4, seed=0):
+    """Nods of somebody who answers a share of the phrases 0.2 to 0.7 s after their end."""
+    rng = np.random.default_rng(seed)
+    ends = ends_of(others)
+    return (ends + rng.uniform(0.2, 0.7, len(ends)))[rng.random(len(ends)) < share]
+
+
+def anywhere(count, seed=0):
+    return np.sort(np.random.default_rng(seed).uniform(0, MINUTES * 60 - 2, count))
+
+
+def figures(*meetings):
+    """Of (meeting, sums of a listener in it)."""
+    everything = np.ones(FRAMES, bool)
+    rows = timing.per_person((one.participant, timing.people_sums(one, everything) | sums) for one, sums in meetings)
+    return {name: one.value for name, one in estimates(timing.figures_of(rows[0]), rows, seed=1, draws=50).items()}
+
+
+# --- how often --------------------------------------------------------------------------------------------------
+
+
+def test_people_judged_against_themselves_are_themselves():
+    one = meeting(answering(talk()))
+    runs = [one.spans_s["nod"]] * 3
+    found = figures((one, timing.nod_sums("", one, runs) | timing.nod_sums("decided_", one, runs)
+                     | {"nod_deg_sizes": np.zeros(400)}))  # fmt: skip
+    assert found["interval_ks"] == found["decided_interval_ks"] == 0.0
+    for key in ("nods_per_minute", "phrase_end_ratio", "nods_long_silence"):
+        assert found[key] == found[f"decided_{key}"] == found[f"people_{key}"]
+    assert found["phrase_end_ratio"] > 3
+
+
+def test_nods_at_random_know_no_phrase_ends_and_rank_nothing():
+    one = meeting(answering(talk()))
+    runs = [spans(anywhere(4000, seed)) for seed in range(8)]
+    everything = np.ones(FRAMES, bool)
+    found = figures(
+        (one, timing.nod_sums("decided_", one, runs) | timing.nod_contingency("decided_nod_auc", runs, one, everything))
     )
-
-
-def answer(*runs):
-    return Answer(tuple(spans(run) for run in runs), (0.1,), blinks=0, smiles=0, gaze_shifts=0)
-
-
-def anywhere(count, seed=0, minutes=MINUTES):
-    return np.sort(np.random.default_rng(seed).uniform(0, minutes * 60 - 2, count))
-
-
-def tables():
-    """A table that has seen people who nod right behind long phrases."""
-    one = scene(ends_of(talk(seed=5)) + 0.3, talk(seed=5))
-    return NodTable({"other": Counts.of(one.cell, one.onsets, one.listening)})
-
-
-def figures(nods_s, *runs, others=None):
-    one = scene(nods_s, others)
-    return timing.summary([one], [answer(*runs)], tables(), seed=1)[0]
-
-
-def test_a_listener_who_nods_as_the_people_do_has_their_figures():
-    nods = ends_of(talk())[::3] + 0.3
-    found = figures(nods, nods, nods)
-    for key in ("nods_per_minute", "nods_after_long_phrase", "nods_first_second", "nods_late_in_phrase"):
-        assert found[key] == found[f"people_{key}"]
-    assert found["nod_auc"] == 1.0
-    assert found["nods_per_minute"] == pytest.approx(len(nods) / 40, rel=0.1)
-
-
-def test_random_nods_rank_nothing_and_know_no_phrase_ends():
-    runs = [anywhere(4000, seed) for seed in range(8)]
-    found = figures(ends_of(talk())[::2] + 0.3, *runs)
-    assert found["nod_auc"] == pytest.approx(0.5, abs=0.06)
-    assert found["phrase_end_ratio"] == pytest.approx(1.0, abs=0.15)
-    assert found["table_nod_auc"] > 0.8
-
-
-def test_the_table_ranks_random_people_at_a_half():
-    found = figures(anywhere(1500, 3), anywhere(80))
-    assert found["table_nod_auc"] == pytest.approx(0.5, abs=0.04)
-
-
-def test_few_seeds_cost_the_table_itself_most_of_its_auc():
-    """At two nods a minute 8 runs leave three quarters of the instants without any nod to rank them by."""
-    nods = ends_of(talk())[::2] + 0.3
-    found = figures(nods, *[anywhere(80, seed) for seed in range(8)])
-    assert 0.5 < found["sampled_table_nod_auc"] < found["table_nod_auc"] - 0.05
-
-
-def test_the_phase_of_own_nods_is_told_without_the_lot():
-    nods = ends_of(talk())
-    found = figures(nods[::2] + 0.3, *(nods[start::40] + 0.3 for start in range(8)))
-    assert found["phase_nod_auc"] > 0.8 > found["nod_auc"]
-
-
-def test_somebody_who_never_nods_has_no_auc():
-    found = figures([], anywhere(10))
-    assert found["nod_auc"] is None and found["people_phrase_end_ratio"] is None
-    assert found["people_nods_per_minute"] == 0
-
-
-def test_a_listener_who_never_nods_scores_a_half():
-    found = figures(ends_of(talk())[::2] + 0.3, [], [])
-    assert found["nod_auc"] == 0.5 and found["nods_per_minute"] == 0 and found["phrase_end_ratio"] is None
+    assert found["decided_phrase_end_ratio"] == pytest.approx(1.0, abs=0.05)
+    assert found["decided_nod_auc"] == pytest.approx(0.5, abs=0.05)
 
 
 def test_rates_are_means_over_seeds():
-    once, twice = figures([], anywhere(100)), figures([], anywhere(100), anywhere(100))
-    assert once["nods_per_minute"] == twice["nods_per_minute"]
+    one = meeting([])
+    once, twice = ([spans(anywhere(100))] * count for count in (1, 2))
+    assert figures((one, timing.nod_sums("decided_", one, once))) == figures(
+        (one, timing.nod_sums("decided_", one, twice))
+    )
+
+
+def test_who_is_spoken_to_is_told_from_who_only_hears():
+    half = np.arange(FRAMES) < FRAMES // 2
+    one = meeting(anywhere(400), attention=np.where(half, 1.0, 0.0))
+    counted = timing.nod_sums("", one, [one.spans_s["nod"]])
+    addressed, bystander = counted["addressed_nods_per_minute"], counted["bystander_nods_per_minute"]
+    assert addressed[1] + bystander[1] == pytest.approx((one.listening & one.alone).sum() / FRAME_HZ / 60)
+    assert 0 < addressed[0] and 0 < bystander[0]
+    for changed in (np.full(FRAMES, np.nan), one.attention):
+        busy = meeting(anywhere(400), attention=changed, alone=one.alone & np.isnan(changed))
+        assert not busy.addressed.any() and not busy.bystander.any()
+
+
+def test_who_has_just_spoken_is_not_spoken_to():
+    own = np.zeros(FRAMES, bool)
+    own[FRAME_HZ : 2 * FRAME_HZ] = True
+    one = meeting([], others=np.ones(FRAMES, bool), own=own, attention=np.ones(FRAMES))
+    assert not one.addressed[FRAME_HZ : 3 * FRAME_HZ].any() and one.addressed[3 * FRAME_HZ :].all()
 
 
 def test_time_off_camera_and_own_talk_are_no_listening():
-    one = scene([])
-    hidden = np.zeros(len(one.others), bool)
-    hidden[: len(hidden) // 2] = True
+    hidden = np.arange(FRAMES) < FRAMES // 2
     for changed in ({"unseen": hidden}, {"own": hidden}):
-        half = Scene(**{**vars(one), **changed})
-        assert not half.listening[: len(hidden) // 2].any()
-        assert not timing.kinds_of_time(half)["long_silence"][: len(hidden) // 2].any()
+        one = meeting([], **changed)
+        assert not one.listening[: FRAMES // 2].any()
+        assert not timing.times_of(one)["nods_long_silence"][: FRAMES // 2].any()
 
 
-def test_people_are_spread_evenly_over_the_meetings():
+def test_intervals_leave_out_what_was_not_listened_in():
+    listening = np.ones(1000, bool)
+    listening[100:350] = False
+    np.testing.assert_allclose(timing.intervals_s(np.array([50, 200, 400]), listening), [4.0])
+
+
+def test_what_a_finder_misses_is_made_up_for():
+    one, motion = meeting([]), np.zeros((1, 3000, 58), np.float32)
+    when_s = np.arange(3000) / FRAME_HZ
+    for start in range(5, 115, 10):
+        inside = (when_s >= start) & (when_s < start + 0.5)
+        motion[0, inside, 1] = np.radians(5) * np.sin(np.pi * (when_s[inside] - start) / 0.5) ** 2
+    half = Calibration({"nod": Sightings(np.ones(4), np.array([1.0, 1, 0, 0]), 2, np.full(2, 0.08))})
+    plain, made_up = (timing.motion_sums(one, motion, 0, known) for known in (Calibration({}), half))
+    assert plain["nods_per_minute"][0] > 0
+    assert made_up["nods_per_minute"][0] == 2 * plain["nods_per_minute"][0]
+    assert plain["blinks_per_minute"].tolist() == [0, pytest.approx(2.0)]
+
+
+# --- ranking ----------------------------------------------------------------------------------------------------
+
+
+def phase_hazard(others):
+    """High in the first second of a pause."""
+    silence_s = times(others.tolist())[:, 1]
+    return np.where((silence_s > 0) & (silence_s <= 1), 1.0, 0.1)
+
+
+def history_hazard(one):
+    """High for three seconds after his last nod."""
+    last = np.full(one.frames, -1e9)
+    starts = one.instants("nod")
+    last[starts + 1] = starts
+    since = np.arange(one.frames) - np.maximum.accumulate(last)
+    return np.where((since > 0) & (since < 3 * FRAME_HZ), 1.0, 0.1)
+
+
+def shift(values):
+    return np.roll(values, round(timing.SHIFT_S * FRAME_HZ))
+
+
+def test_shifting_the_others_takes_all_from_a_listener_that_copies_their_phase():
+    one = meeting(answering(talk()))
+    found = timing.contingent("x", phase_hazard(one.others), [phase_hazard(shift(one.others))], one)
+    matched, shifted, difference = (numbers[0] / numbers[1] for numbers in found.values())
+    assert matched > 0.9 and shifted == pytest.approx(0.5, abs=0.05)
+    assert difference == pytest.approx(matched - shifted)
+
+
+def test_shifting_the_others_takes_nothing_from_a_listener_that_follows_its_own_history():
+    first = anywhere(60)
+    one = meeting(np.sort(np.r_[first, first + 1.5]))
+    hazard = history_hazard(one)
+    found = timing.contingent("x", hazard, [hazard], one)
+    assert found["x"][0] / found["x"][1] > 0.65
+    assert found["x_matched_minus_shifted"][0] == 0
+
+
+def test_moving_a_listeners_own_nods_tells_the_same():
+    one = meeting(answering(talk()))
+    everything = np.ones(FRAMES, bool)
+    runs = [spans(answering(talk(), seed=seed)) for seed in range(1, 9)]
+    found = timing.nod_contingency("x", runs, one, everything)
+    assert found["x"][0] / found["x"][1] > 0.8
+    assert found["shifted_x"][0] / found["shifted_x"][1] == pytest.approx(0.5, abs=0.03)
+    own = timing.nod_contingency("x", [spans(anywhere(80, seed)) for seed in range(8)], one, everything)
+    assert own["x_matched_minus_shifted"][0] / own["x"][1] == pytest.approx(0, abs=0.05)
+
+
+def test_too_short_a_part_cannot_be_shifted():
+    one = meeting(answering(talk()))
+    found = timing.nod_contingency("x", [one.spans_s["nod"]], one, np.arange(FRAMES) < 90 * FRAME_HZ)
+    assert found["x"][1] > 0 and not found["shifted_x"].any() and not found["x_matched_minus_shifted"].any()
+
+
+def test_an_instant_is_ranked_by_what_is_known_before_it():
+    """A score that is high only once a nod has begun knows nothing of when it begins."""
+    one = meeting(anywhere(200))
+    assert timing.ranked(one.inside("nod").astype(float), one)[0] / timing.ranked(np.zeros(FRAMES), one)[
+        1
+    ] == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_array_equal(meeting([10.0, 10.06]).instants("nod"), [249, 250])
+
+
+def test_nothing_is_ranked_of_few_nods_or_of_what_nobody_annotated():
+    assert not timing.ranked(np.zeros(FRAMES), meeting([5.0, 9.0])).any()
+    assert not timing.ranked(np.zeros(FRAMES), meeting(anywhere(99)), "gaze_shift").any()
+
+
+def test_the_nod_table_ranks_those_it_was_counted_on_and_not_random_people():
+    others = talk(5)
+    person = someone(others=spans_of(others), nods=spans(answering(others)), until_s=float(MINUTES * 60))
+    rates = timing.table_rates([person])
+    phase, random = (
+        timing.table_sums(meeting(nods), rates)["table_nod_auc"] for nods in (answering(talk()), anywhere(1500))
+    )
+    assert phase[0] / phase[1] > 0.8
+    assert random[0] / random[1] == pytest.approx(0.5, abs=0.04)
+
+
+# --- people -----------------------------------------------------------------------------------------------------
+
+
+def test_a_persons_auc_is_the_mean_over_his_nods_and_counts_once():
+    def sums(auc, nods):
+        return {"x_auc": np.array([auc * nods, nods]), "nods_per_minute": np.array([nods, 10.0])}
+
+    rows = timing.per_person([("A", sums(0.6, 30)), ("A", sums(0.9, 10)), ("B", sums(0.5, 400)), ("C", sums(0, 0))])
+    assert [row["x_auc"].tolist() for row in rows] == [[pytest.approx(0.675), 1], [0.5, 1], [0, 0]]
+    found = {name: one.value for name, one in estimates(timing.figures_of(rows[0]), rows, seed=1).items()}
+    assert found["x_auc"] == pytest.approx((0.675 + 0.5) / 2)
+    assert found["nods_per_minute"] == pytest.approx(440 / 40)
+
+
+def spans_of(mask):
+    edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(int), 0])) / FRAME_HZ
+    return edges.reshape(-1, 2)
+
+
+def someone(meeting="TS3003a", participant="P1", **changed):
+    whole = {
+        "meeting": meeting, "agent": "B", "participant": participant, "until_s": 300.0, "nods": NONE, "shakes": NONE,
+        "tilts": NONE, "unseen": NONE, "gaze": None, "laughs": NONE, "talk": NONE, "backchannels": NONE, "others": NONE,
+        "floor": (), "others_laughs": NONE, "asked": np.zeros(0),
+    }  # fmt: skip
+    return Person(**whole | changed)
+
+
+def test_people_who_were_trained_on_are_refused_unless_asked_for():
+    everybody = [someone("TS3003a", "P1"), someone("ES2003a", "P2"), someone("ES2003b", "P1")]
+    with pytest.raises(ConfigError, match="--split train: .*--allow-training"):
+        people_of(everybody, "train", False)
+    assert [person.meeting for person in people_of(everybody, "train", True)] == ["TS3003a"]
+    assert [person.meeting for person in people_of(everybody, "test", False)] == ["ES2003a"]  # P1 was trained on
+
+
+def test_a_part_without_people_says_who_is_there():
+    with pytest.raises(ConfigError, match=r"--split validation: the tables hold nobody of it \(train 1\)"):
+        people_of([someone()], "validation", False)
+
+
+def test_meetings_are_spread_evenly():
     people = list(range(134))
-    assert timing.choose_people(people, 3) == [0, 66, 133]
-    assert timing.choose_people(people, None) == timing.choose_people(people, 500) == people
+    assert spread(people, 3) == [0, 66, 133]
+    assert spread(people, None) == spread(people, 500) == people
 
 
-@pytest.fixture(scope="module")
-def person():
-    others = phrases([(start, start + 3.0) for start in np.arange(1, 295, 5.0)])
-    nods = np.array([(start + 3.2, start + 4.0) for start in np.arange(1, 290, 10.0)])
-    return Person(
-        "M1a", "B", "MEE1", 300.0, nods=nods, shakes=NONE, tilts=NONE, unseen=NONE,
-        gaze=((0.0, 140.0, "A"), (140.0, 150.0, "table"), (150.0, 300.0, "A")), laughs=np.array([[150.0, 151.0]]),
-        talk=NONE, backchannels=NONE, others=others, floor=(), others_laughs=NONE, asked=np.zeros(0),
-    )  # fmt: skip
+def test_the_middle_of_a_meeting():
+    assert middle(30_000, 5.0) == (11_250, 7_500)
+    assert middle(100, 5.0) == (0, 100)
+    assert middle(100, 0.0)[1] == 0
 
 
-def test_a_scene_is_the_middle_of_the_meeting_as_it_was(person):
-    voice = read_voice(data_dir("sim") / "speakers" / "katie" / "speech.wav")
-    motions = load_motions(data_dir("sim") / "listeners" / "motions.npz")["validation"]
-    one = timing.scene(person, 2.0, [voice], motions, np.random.default_rng(0))
-    assert one.minutes == 2 and len(one.speaker) == 3000 and one.series == "M1"
-    np.testing.assert_allclose(one.nods_s[0], person.nods[person.nods[:, 0] >= 90][0] - 90)
-    assert one.laughs == 1 and one.gaze_shifts == 2
-    heard = voice_activity(np.concatenate([frame.audio for frame in one.speaker]))
-    assert (heard == one.others).mean() > 0.8
-
-
-def test_a_table_is_fitted_by_series(person):
-    table = timing.fit_table([person])
-    assert set(table.series) == {"M1"}
-    assert table.series["M1"].nods.sum() == pytest.approx(len(person.nods), abs=1)
-    assert table.series["M1"].minutes.sum() == pytest.approx(5, abs=0.5)
+# --- rolling out ------------------------------------------------------------------------------------------------
 
 
 class Metronome:

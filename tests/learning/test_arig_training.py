@@ -11,15 +11,31 @@ from tiny_arig_training import HZ, dyad, settings, write
 
 from sfms_robot import config
 from sfms_robot.config import parse_training
+from sfms_robot.config.arig import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, SpeakerFrame
-from sfms_robot.learning.arig.features import SCENES, cut, fit_scales, gather, open_scenes
-from sfms_robot.learning.arig.losses import Student, augment, loss_parts, previous_states
+from sfms_robot.learning.arig.features import (
+    LARGEST_RHO,
+    SCENES,
+    autocorrelation,
+    cut,
+    fit_scales,
+    gather,
+    open_scenes,
+)
+from sfms_robot.learning.arig.losses import (
+    Student,
+    augment,
+    channel_weights,
+    group_of,
+    loss_parts,
+    previous_states,
+)
 from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
 from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS
-from sfms_robot.listeners.arig.csu import FIRST
+from sfms_robot.listeners.arig.csu import FIRST, NODDING
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import LN_PER_DB
@@ -53,7 +69,7 @@ def quiet(**changes) -> config.ArigPhase:
 @pytest.mark.parametrize(
     "changes",
     [{}, {"state_guidance": False}, {"visual": False}, {"discrete": True}, {"interaction": "linear"},
-     {"context_chunks": 4}, {"draws": "step"}],
+     {"context_chunks": 4}, {"draws": "step"}, {"events": True, "draws": "innovation"}],
     ids=lambda changes: "-".join(changes) or "full",
 )  # fmt: skip
 def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, changes):
@@ -218,7 +234,7 @@ def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_onc
     assert not torch.equal(truth[:, WINDOW // 2 :, ~lips], told.agent_motion[:, WINDOW // 2 :, ~lips])
 
 
-@pytest.mark.parametrize("draws", ["motion", "step"])
+@pytest.mark.parametrize("draws", ["motion", "step", "innovation"])
 def test_what_is_drawn_is_the_inverse_of_what_is_learned(corpus, draws):
     model = a_student(draws=draws).model
     fit_scales(model, corpus, settings().listener.channels)
@@ -290,3 +306,96 @@ def test_what_is_wrong_in_a_training_file_is_said(raw, said):
     with pytest.raises(ConfigError) as caught:
         parse_training(raw, "tiny")
     assert said in str(caught.value)
+
+
+# --- events -----------------------------------------------------------------------------------------------------
+
+
+def test_a_dyad_whose_events_nobody_knows_cannot_teach_a_listener_with_events(data):
+    blank = replace(dyad("blank", "listening", 0), events=None)
+    with pytest.raises(ConfigError, match="blank: what the listener did is not known"):
+        gather({"listening": [blank]}, WINDOW, ARKIT, WIDTHS["mel"], events=True)
+    assert gather({"listening": [blank]}, WINDOW, ARKIT, WIDTHS["mel"]).frames.control.shape[-1] == 0
+
+
+def test_gaze_is_not_among_what_is_learned_with_events():
+    looks = np.zeros((HZ * 12, 3), np.float32)
+    looks[:, 2] = np.linspace(-0.3, 0.3, len(looks))
+    one = dyad("a", "listening", 0)
+    motion = one.listener.copy()
+    motion[:, :3] += looks
+    motion[:, [CHANNELS.index("eyeLookInLeft"), CHANNELS.index("eyeLookUpRight")]] = 0.4
+    seen = gather({"a": [replace(one, listener=motion, head_of_gaze_rad=looks)]}, WINDOW, ARKIT, WIDTHS["mel"], True)
+    still = gather({"a": [one]}, WINDOW, ARKIT, WIDTHS["mel"], True)
+    assert torch.allclose(seen.frames.agent_motion, still.frames.agent_motion, atol=1e-6)
+    assert torch.equal(seen.frames.control, still.frames.control) and seen.frames.control.any()
+
+
+def test_feedback_that_is_seen_has_states_of_its_own():
+    one = dyad("a", "listening", 1)
+    found = gather({"a": [one]}, WINDOW, ARKIT, WIDTHS["mel"], True).frames
+    nods = found.control[:, 0] > 0
+    listening = torch.from_numpy(one.states == STATES.index("listening"))
+    assert torch.equal(found.states == NODDING, nods & listening) and bool((nods & listening).any())
+
+
+def test_a_group_of_channels_counts_by_its_weight_not_by_its_number():
+    listener = settings(listener={"events": True}).listener
+    weights = channel_weights(listener, config.GroupWeights(head=2.0, brows=0.5))
+    assert float(weights.sum()) == pytest.approx(1)
+    groups = [group_of(name) for name in CHANNELS]
+    of = {group: float(weights[[one == group for one in groups]].sum()) for group in set(groups)}
+    assert of == pytest.approx({"head": 2 / 4.5, "lids": 1 / 4.5, "brows": 0.5 / 4.5, "mouth": 1 / 4.5})
+    assert not weights[[name.startswith("eyeLook") for name in CHANNELS]].any()
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_the_loss_is_the_mean_of_its_groups(corpus, discrete: bool):
+    """Equal weights of channels are no weights."""
+    student = a_student(discrete=discrete)
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["listening"][:2], WINDOW)
+    z = student.model.condition(told, told.states.clamp(min=0)).z.flatten(0, 1)
+    motion = student.model.standardise(told.agent_motion[:, 1:]).flatten(0, 1)
+    one, all_alike = (
+        student.model.head.loss(z, motion, torch.Generator().manual_seed(0), weights)
+        for weights in (None, torch.full((58,), 1 / 58))
+    )
+    assert torch.allclose(one, all_alike, atol=1e-5)
+
+
+def test_the_fitted_autoregression_is_that_of_the_motion():
+    rng, rho = np.random.default_rng(0), 0.9
+    place = [np.zeros(58)]
+    for draw_ in rng.normal(0, 0.02, (4000, 58)):
+        place.append(rho * place[-1] + draw_)
+    motion = torch.tensor(np.stack(place), dtype=torch.float32)
+    assert torch.allclose(autocorrelation(motion[:-1], motion[1:]), torch.full((58,), rho), atol=0.03)
+    assert float(autocorrelation(torch.ones(9, 1), torch.ones(9, 1))) == pytest.approx(LARGEST_RHO)
+    assert float(autocorrelation(torch.zeros(9, 1), torch.zeros(9, 1))) == 0
+
+
+def test_where_the_head_is_held_says_nothing_of_what_is_drawn_next(corpus):
+    """Innovations of a past whose head is off are those of the true one: a stream cannot learn to undo `rho`."""
+    model = a_student(draws="innovation").model
+    fit_scales(model, corpus, settings().listener.channels)
+    model.step_std.clamp_(min=0.05)
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(50), WINDOW)
+    told = replace(told, voiced=torch.zeros_like(told.voiced))
+    quick, model.step_std = model.step_std, torch.zeros_like(model.step_std)  # the slow part alone
+    found, truth = augment(told, model, quiet(history_noise=1.0), torch.Generator().manual_seed(0))
+    model.step_std = quick
+    off = (found.agent_motion - told.agent_motion)[:, :-1, :6] / model.motion_std[:6]
+    last, now = model.standardise(found.agent_motion[:, :-1]), model.standardise(truth[:, 1:])
+    true_last, true_now = model.standardise(told.agent_motion[:, :-1]), model.standardise(told.agent_motion[:, 1:])
+    assert float(off.abs().max()) > 0.5
+    assert torch.allclose(model.target(now, last)[..., :6], model.target(true_now, true_last)[..., :6], atol=1e-3)
+
+
+def test_states_are_known_by_how_long_they_last_and_by_the_voices_they_go_with(corpus):
+    model = a_student(events=True).model
+    fit_scales(model, corpus, settings().listener.channels)
+    speaking, listening = STATES.index("speaking"), STATES.index("listening")
+    assert model.states.durations[speaking].max() == HZ and model.states.durations[speaking].min() >= 1
+    assert model.states.possible[1, 0, speaking] and not model.states.possible[1, 0, listening]
+    assert model.states.possible[0, 1, listening] and not model.states.possible[0, 1, speaking]
+    assert model.states.possible.any(-1).all()

@@ -6,6 +6,7 @@ import pickle
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from sfms_robot.listeners import process
 from sfms_robot.listeners.process import (
     MOST_WAITING,
     RESTARTS,
+    REVIEW_S,
     SETTLED_FRAMES,
     Inbox,
     ListenerProcess,
@@ -109,10 +111,12 @@ class Planner:
 
 
 def test_a_probe_measures_plans_and_ends_even_without_time():
-    p50_s, p99_s = plan_times_s(Planner(), limit_s=0.0)
+    waits_s = []
+    p50_s, p99_s = plan_times_s(Planner(), limit_s=0.0, wait=waits_s.append)
     assert 0 < p50_s == p99_s
-    p50_s, p99_s = plan_times_s(Planner())
+    p50_s, p99_s = plan_times_s(Planner(), wait=waits_s.append)
     assert 0 < p50_s <= p99_s
+    assert max(waits_s) <= FRAME_S  # at the pace of a run
 
 
 # --- the parent and a real child -----------------------------------------------------------------------------------
@@ -159,7 +163,7 @@ def test_the_hop_is_chosen_when_the_source_has_settled_and_a_new_child_is_told_o
     child.choose_hop_by(lambda: 0.06, 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take(*child._child.next(60.0), 0.0)  # probed
+        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
         for frame in frames(SETTLED_FRAMES):
             assert child.statistics()["hop"] is None
             child.push(frame, 0.0)
@@ -169,6 +173,32 @@ def test_the_hop_is_chosen_when_the_source_has_settled_and_a_new_child_is_told_o
             plan = child._take(*child._child.next(60.0), 0.0)
             plans += [plan] if plan is not None else []
         assert [round(plan.made_at_s / FRAME_S) for plan in plans] == list(range(1, SETTLED_FRAMES + 1))
+    finally:
+        child.close()
+
+
+def test_a_hop_gives_way_when_the_source_turns_out_later_than_it_was_and_never_goes_back():
+    late_s = [0.0]
+    child = ListenerProcess("sfms-small", 3)
+    child.choose_hop_by(lambda: late_s[0], 0.047, 0.01)
+    try:
+        child.wait_loaded()
+        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
+        for frame in frames(SETTLED_FRAMES):
+            child.push(frame, 0.0)
+        assert child.statistics()["hop"] == 3
+        while child.statistics()["state"] != "listening":
+            child._take(*child._child.next(60.0), 0.0)
+        for _ in range(SETTLED_FRAMES):
+            kind, value, _ = child._child.next(60.0)
+            child._take(kind, value, 5.0, 0.0)  # whatever a plan takes on this machine
+        for now_s, source_s, hop in ((REVIEW_S - 0.1, 0.06, 3), (REVIEW_S, 0.06, 1), (3 * REVIEW_S, 0.0, 1)):
+            late_s[0] = source_s
+            child._review(now_s)
+            assert child.statistics()["hop"] == hop
+        for frame in frames(3):
+            child.push(frame, 0.0)
+        assert [child._child.next(60.0)[0] for _ in range(3)] == ["plan"] * 3
     finally:
         child.close()
 

@@ -7,6 +7,7 @@ from sfms_robot import config
 from sfms_robot.frames import BLENDSHAPES, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.signals.control import control_track
 
 
 def tiny_settings(**changes) -> config.Sfms:
@@ -38,6 +39,26 @@ def guided_listener(guidance: float, **changes) -> SfmsListener:
     return tiny_listener(groups=groups, **changes)
 
 
+def told_listener(**changes) -> SfmsListener:
+    """One that is told of events and sways by itself."""
+    face = [name for name in BLENDSHAPES if not name.startswith("eyeLook")]
+    raw = {
+        "events": True,
+        "sway": True,
+        "placement": "penalised",
+        "ramp_frames": 5,
+        "groups": {
+            "neck": {"channels": POSE_CHANNELS, "levels": (3, 2), "keyframe_cost": 1.0},
+            "face": {"channels": face, "levels": (2, 4), "keyframe_cost": 1.0},
+        },
+    }
+    listener = tiny_listener(**raw | changes)
+    if listener.model.head:
+        listener.model.sway_amplitude.fill_(0.003)
+        listener.model.sway_spread.fill_(0.3)
+    return listener
+
+
 def speech(frames: int, seed: int = 0, face: bool = True, audio: bool = True) -> list[SpeakerFrame]:
     rng = np.random.default_rng(seed)
     out = []
@@ -49,11 +70,14 @@ def speech(frames: int, seed: int = 0, face: bool = True, audio: bool = True) ->
     return out
 
 
-def plans_of(listener, speaker, seed=1):
-    """Every plan of a stream, by the index of the frame it was made at."""
+def plans_of(listener, speaker, seed=1, events=()):
+    """Every plan of a stream, by the index of the frame it was made at; of `events` each is told 3 frames ahead."""
     memory, plans = listener.start(seed), {}
+    past, ahead = listener.control_frames
     for index, frame in enumerate(speaker):
-        plan, memory = listener.step(frame, memory)
+        told = [event for event in events if event.start_s <= (index + 3) * FRAME_S + 1e-9]
+        control = control_track(told, index + 1 - past, past + ahead) if past else None
+        plan, memory = listener.step(frame, memory, control)
         if plan is not None:
             plans[index] = plan
     return plans

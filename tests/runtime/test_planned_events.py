@@ -1,12 +1,13 @@
 """Events in plans: each is told once, before it is over on the servos, and in bounded memory."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sfms_robot.errors import InputError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Plan
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, ListenerEvent, Plan
 from sfms_robot.runtime.planned_events import WINDOW, EventWatch, PlannedEvents
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 
@@ -96,5 +97,14 @@ def test_callbacks_are_told_and_one_that_raises_is_detached_and_named():
 
 
 def test_an_unknown_event_is_refused_with_those_there_are():
-    with pytest.raises(InputError, match=r"on\('wink'\): no such event \(nod, blink, smile\)"):
+    with pytest.raises(InputError, match=r"on\('wink'\): no such event \(nod, shake, tilt, laugh"):
         EventWatch().on("wink", print)
+
+
+def test_what_a_listener_decides_is_told_as_it_is_and_motion_is_not_looked_at():
+    nod = ListenerEvent("nod", 0.2, 0.6, 0.1, swings=2, probability=0.1, draw=0.05, evidence={"silence": 0.4})
+    found, motion = PlannedEvents(), np.zeros((8, MOTION_DIM), np.float32)
+    motion[2:5, CHANNEL_INDEX["eyeBlinkLeft"]] = 1.0
+    plan = Plan(0.04, 0.04 * np.arange(2, 10), motion, events=(nod,), hazards_hz={"nod": 0.1})
+    assert found.add(plan) == [nod]
+    assert found.add(replace(plan, made_at_s=0.12, events=())) == []

@@ -88,10 +88,10 @@ def test_a_log_of_hours_is_as_large_as_one_of_minutes():
     tracemalloc.start()
     hear_and_move(20_000, 24_000)
     before = tracemalloc.get_traced_memory()[0]
-    hear_and_move(24_000, 36_000)
+    hear_and_move(24_000, 60_000)
     grown = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
-    assert grown < 100_000
+    assert grown < 400_000  # a number kept for every tick would be 1.1 MB; a block may still be being counted
     assert log.frame_to_wire_ms.report(p50=50)["p50"] == pytest.approx(10.0, rel=0.02)
 
 

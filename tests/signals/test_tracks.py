@@ -85,6 +85,11 @@ def test_gzip_is_known_by_its_content(tmp_path):
     assert read_track(file).motion[0, JAW] == 0.25
 
 
+def test_a_live_link_row_that_counts_no_shapes_is_a_lost_face(tmp_path):
+    file = written(tmp_path / "a.csv", ["t_s", "BlendshapeCount", "jawOpen"], [0, 61, 0.1], [0.1, 0], [0.2, 61, 0.1])
+    assert np.isnan(read_track(file).motion).all(axis=1).tolist() == [False, True, False]
+
+
 @pytest.mark.parametrize("name", ["track.csv", "track.csv.gz"])
 def test_write_then_read_gives_the_track_back(tmp_path, name):
     motion = np.random.default_rng(1).uniform(0, 1, (5, 58)).astype(np.float32)

@@ -223,3 +223,30 @@ def test_a_face_keeps_the_time_that_it_was_seen_where_that_can_be(seen_s: float,
     face = FaceFrame.of(seen_s, np.full(58, 0.01))
     frame = FrameJudge().frame(24, np.zeros(0, np.float32), Sighting(face), None)
     assert frame.face is not None and frame.face.time_s == pytest.approx(kept_s)
+
+
+def test_a_live_face_does_not_wait_for_the_voice_beside_it():
+    """A frame that is given late, since its voice was, shows the newest face, up to a frame newer than itself."""
+
+    class Filmed:
+        duration_s: float | None = None
+        lost, latency_s = False, 0.0
+
+        def start(self, origin_s):
+            pass
+
+        def at(self, time_s):
+            return Sighting(FaceFrame.of(np.floor(time_s * 100 + 1e-6) / 100, np.ones(58)))
+
+        def statistics(self):
+            return {}
+
+        def close(self):
+            pass
+
+    live, recorded = Filmed(), Filmed()
+    recorded.duration_s = 10.0
+    for sight, ages_s in ((live, (0.0, 0.03, 0.04)), (recorded, (0.0, 0.0, 0.0))):
+        for late_s, newer_s in zip((0.0, 0.03, 0.5), ages_s, strict=True):
+            frame = PairedSource(None, sight).read(0.04 + late_s)[0]
+            assert frame.face.time_s - frame.time_s == pytest.approx(newer_s, abs=1e-6)

@@ -2,7 +2,8 @@
 
 person  ->  hear, see, say      what a program hears and sees; or a source that a run has
 face    ->  show, look_at       laid over what the listener planned, under the same limits
-plans   ->  on                  nods, blinks and smiles before the servos do them
+plans   ->  on                  nods, smiles, "mm-hm" and so on before the servos do them
+rates   ->  calm                how often it does them
 """
 
 from __future__ import annotations
@@ -17,18 +18,19 @@ from typing import Any, Final, Self
 
 from sfms_robot.app.api.background import Background, Report
 from sfms_robot.app.api.named_head import head_name
-from sfms_robot.app.listen.live_knobs import LiveKnobs
+from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.session import RunOptions, prepare_head, run
 from sfms_robot.app.wiring import SIM
-from sfms_robot.config import Head, load_head
+from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError, RobotError
-from sfms_robot.frames import FaceFrame, Floats
+from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
+from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.thread import ListenerThread
 from sfms_robot.ports import Listener, Observer, Source
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
+from sfms_robot.runtime.planned_events import EventWatch
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.paired import JudgedSource, PairedSource
 from sfms_robot.sources.playback import open_playback
@@ -80,6 +82,7 @@ class Robot:
         yes: hobby servos may jump when they come on.
         without: joints that are left alone.
         intensity, style: of regions, as in `knobs`.
+        calmness, addressed: as in `calm`.
 
     Raises ConfigError, PortError, InputError for what cannot be right, before anything is opened.
     """
@@ -104,6 +107,8 @@ class Robot:
         without: Sequence[str] = (),
         intensity: Mapping[str, float] | None = None,
         style: Mapping[str, float] | None = None,
+        calmness: Mapping[str, float] | None = None,
+        addressed: str = "sense",
     ) -> None:
         pushed = source is None and audio == PUSH
         if pushed and (face, agent_audio) != ("auto", "none"):
@@ -118,10 +123,13 @@ class Robot:
             audio="none" if pushed else audio, face=face, agent_audio=agent_audio, duration_s=duration_s, fast=fast,
             seed=seed, record=None if record is None else Path(record), overwrite=overwrite, yes=yes,
             without=tuple(without), play=play,
+            calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
         )  # fmt: skip
         prepare_head(self._options.servos)
         config = load_head(self._options.head)
         self._listener = own
+        self._calmness = self._options.calmness or Calmness()
+        self._feed: ListenerThread | ListenerProcess | None = None
         self._person = _PushedPerson() if pushed else None
         self._speech = self._person.speech if self._person is not None else None
         if source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none":
@@ -255,13 +263,26 @@ class Robot:
         """Regions of the head: `robot.knobs["neck"].intensity = 0.5`, `.style`, 0..2."""
         return self._knobs
 
+    def calm(self, addressed: str | None = None, **per_minute: float | None) -> None:
+        """How often it does what, from now on: `robot.calm(nod=2.2, addressed="assume")`; None: as people do.
+
+        What is not named stays as it is. A listener that decides no events takes no notice, and none does in virtual
+        time once it runs. Raises ConfigError for an unknown kind and a rate that cannot be.
+        """
+        asked = {**(self._calmness.model_dump()), **per_minute}
+        self._calmness = parse(Calmness, asked if addressed is None else asked | {"addressed": addressed}, "calm")
+        if self._feed is not None:
+            self._feed.calm(self._calmness)
+
     # --- what it does ---
 
-    def on(self, kind: str, callback: Callable[[MotionEvent], object]) -> None:
-        """Call `callback` when a plan holds a "nod", a "blink" or a "smile", before the servos do it.
+    def on(self, kind: str, callback: Callable[[ListenerEvent], object]) -> None:
+        """Call `callback` with a `ListenerEvent` before the servos do it.
 
-        It is called in a thread of its own, one event after the other; one that raises is detached and named in the
-        log. Raises InputError for another kind.
+        `kind` is one of `frames.EVENT_KINDS`: "nod", "mm_hm", "smile" and so on. A listener that decides events tells
+        all of them; of another one nods, blinks and smiles are found in its plans. The callback runs in a thread of its
+        own, one event after the other; one that raises is detached and named in the log. Raises InputError for another
+        kind.
         """
         self._events.on(kind, callback)
 
@@ -285,12 +306,19 @@ class Robot:
             "callbacks_detached": dict(self._events.detached),
         }  # fmt: skip
 
+    def _begin_listening(self) -> ListenerThread | ListenerProcess | None:
+        """What listens in real time; in virtual time the run steps a listener inline."""
+        if self._listener is not None:
+            return ListenerThread(self._listener, self._options.seed)
+        if self._options.fast:
+            return None
+        return ListenerProcess(self._options.listener, self._options.seed, self._calmness)
+
     def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
         with ExitStack() as stack:
-            feed = None
-            if self._listener is not None:
-                feed = ListenerThread(self._listener, self._options.seed)
-                stack.callback(feed.close)
+            self._feed = self._begin_listening()
+            if self._feed is not None:
+                stack.callback(self._feed.close)
             source: Source | None = self._source
             asked = self._options
             if self._person is not None:
@@ -302,7 +330,7 @@ class Robot:
             return run(
                 self._options,
                 source=source,
-                feed=feed,
+                feed=self._feed,
                 observers=[progress, self._events],
                 knobs=self._knobs,
                 overlay=self._puppet.overlay,

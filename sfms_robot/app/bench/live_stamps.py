@@ -4,7 +4,7 @@
     block    until the source had that frame (its own stated latency)
     grid     until a tick gave it to the listener
     plan     until a tick had the listener's plan
-    write    until that tick's goals were written, and servos were read
+    write    until that tick's goals were written
 
 The sum is from a sample at the microphone to the first goal of a plan that knows of it. It is taken for four samples of
 each frame, ten milliseconds apart. A face counts from its packet's arrival.
@@ -92,7 +92,7 @@ class Stamps:
         self._first_s = seen.time_s if self._first_s is None else self._first_s
         self._last_s, self._ticks = seen.time_s, self._ticks + 1
         if self._plans:
-            written_s = self._loop_s()
+            written_s = self._loop_s() if seen.written_s is None else seen.written_s
             for made_at_s, taken_s in self._plans:
                 self._followed(made_at_s, taken_s, written_s)
             self._plans = []

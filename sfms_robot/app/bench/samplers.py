@@ -49,7 +49,7 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
     def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         plain = {"temperature": (1.0, 1.0), "temperatures": {}}
         settings = head.settings.model_copy(update={"sampler": sampler, "steps": steps} | plain)
-        other = Denoiser(listener.settings.channels, listener.settings.width, settings)
+        other = Denoiser(listener.settings.channels, head.condition.in_features, settings)
         other.load_state_dict(head.state_dict())
         generator = torch.Generator().manual_seed(seed)
         noise = torch.randn(len(told), steps, listener.model.channels, generator=generator)

@@ -19,7 +19,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.ports import Listener
 
-PLACEMENTS: tuple[Strategy, ...] = ("exact", "static", "static_paper", "learned")
+PLACEMENTS: tuple[Strategy, ...] = ("exact", "penalised", "static", "static_paper", "learned")
 
 
 def _stderr() -> Console:
@@ -36,8 +36,12 @@ def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dic
     listener = load_sfms(find("listeners", name, "config.yaml"))
     model = listener.model
     window = model.tokenizer.window
-    corpus = gather(open_for(listener.space.name, data, "validation", order), window, listener.space)
-    usable = [p for p in PLACEMENTS if p != "learned" or model.tokenizer.score is not None]
+    dyads = open_for(listener.space.name, data, "validation", order)
+    corpus = gather(dyads, window, listener.space, None, listener.settings)
+    usable = [
+        p for p in PLACEMENTS if (p == "penalised") == (listener.settings.placement == "penalised")
+        and (p != "learned" or model.tokenizer.score is not None)
+    ]  # fmt: skip
     return {
         "listener": name,
         "window": window,
@@ -86,7 +90,7 @@ def _keyframe_scores(listener: Listener, dyads: Sequence[clips.Dyad]) -> dict[st
 
     if not isinstance(listener, SfmsListener):
         return {}
-    corpus = gather(dyads, listener.settings.window_frames, listener.space, listener.frontend)
+    corpus = gather(dyads, listener.settings.window_frames, listener.space, listener.frontend, listener.settings)
     return keyframe_scores(listener.model, corpus, listener.settings)
 
 

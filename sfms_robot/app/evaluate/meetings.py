@@ -1,112 +1,149 @@
-"""`evaluate timing`: meetings are played to a listener, and its nods compared with those of the people.
+"""`evaluate timing`: meetings are heard by a listener, and what it does is laid beside what the people did.
 
-Processes take one participant each; what is random about a participant hangs on the seed and on his place in the tables
-alone, so that the figures do not depend on how many processes there are.
+Of every meeting the whole is asked for hazards, where a listener has any, and some minutes for motion. Processes take
+one person's meeting each; what is random about it hangs on the seed and on its place in the tables alone, so that the
+figures do not depend on how many processes there are.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from sfms_robot.app.evaluate.hop_choice import load_at_hop
+from sfms_robot.app.evaluate.task_pool import done_in_processes
 from sfms_robot.config import find
-from sfms_robot.corpora.compose.ami import Person, read_people, series
+from sfms_robot.corpora.compose.ami import Person, read_people, split_series
 from sfms_robot.corpora.compose.motions import Motions
 from sfms_robot.corpora.compose.motions import load as load_motions
-from sfms_robot.corpora.compose.voices import Voice, find_voices
+from sfms_robot.corpora.compose.voices import Voice, find_laughter, find_voices, split_voices
+from sfms_robot.corpora.splits import Split
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation import nod_table
-from sfms_robot.evaluation import timing as evaluation
+from sfms_robot.evaluation import timing
+from sfms_robot.evaluation.bootstrap import LEVEL, Estimate, Sums, estimates
+from sfms_robot.evaluation.deciding import decisions, forced_hazards, sensed
+from sfms_robot.evaluation.detection import SIZES, Calibration, Sightings, added_up, asked_and_seen, figures
+from sfms_robot.evaluation.listener_meetings import ListenerMeeting, listener_meeting, part, shifted, without_own_voice
+from sfms_robot.evaluation.reference_hazard import ReferenceHazard
 from sfms_robot.evaluation.rollout import rollout
-from sfms_robot.listeners.registry import one_thread
+from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame
+from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.ports import Listener
 
-TABLE: Final = "nod_table.yaml"  # in sim/listeners
-_COMMENT: Final = """Nods and minutes of listening by speech phase, per series of meetings (`evaluation.nod_table`).
-Counted in: The AMI Meeting Corpus, AMI project consortium (Carletta et al. 2005), manual annotations 1.7, CC BY 4.0,
-http://groups.inf.ed.ac.uk/ami/corpus/; annotations taken from github Hasetomo2142/ami-corpus-preprocessing, commit
-6d845bc07b21c8862afbf38f1b1f9ab3bf40c437. Made by
-  sfms-robot evaluate timing --data DIR --fit-table sim/listeners/nod_table.yaml"""
+_PREFIXES: Final = {"decided": "decided_", "people": "people_", "R2": "r2_"}
 
 
 @dataclass(frozen=True)
-class _Part:
-    """One participant's turn."""
+class TimingOptions:
+    """What to play.
 
+    Attributes:
+        split: of the people; `allow_training` has to be said for those who were trained on.
+        meetings: at most so many, spread over them all; None: all.
+        minutes: of motion from the middle of each meeting; 0: none, which takes minutes instead of hours.
+        seeds: how often a listener is left to itself in each.
+        jobs: processes; None: as many as there are cores.
+        hop: see `load_at_hop`.
+    """
+
+    listener: str
+    data: Path
+    split: Split = "test"
+    allow_training: bool = False
+    meetings: int | None = None
+    minutes: float = 5.0
+    seeds: int = 8
+    seed: int = 1
+    jobs: int | None = None
+    hop: int | None = None
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One person's meeting, and what he is judged by.
+
+    Attributes:
+        number: place in the tables.
+        table: (CELLS,) nods a minute by speech phase, and `reference`: of training people; None without any.
+    """
+
+    options: TimingOptions
+    folder: Path
     person: Person
     number: int
-    minutes: float | None
-    seeds: int
-    seed: int
-    hop: int | None
+    table: Doubles | None
+    reference: ReferenceHazard | None
+    calibration: Calibration
 
 
-def evaluate_timing(
-    name: str,
-    data: Path,
-    seeds: int,
-    people: int | None,
-    minutes: float | None,
-    seed: int,
-    jobs: int | None,
-    hop: int | None = None,
-) -> dict[str, Any]:
-    """Figures of design section 4 and more; None where the meetings hold too little to tell.
+@dataclass(frozen=True)
+class _Played:
+    participant: str
+    minutes: float
+    sums: Sums
+    sightings: Mapping[str, Sightings]
 
-    `people` and `minutes` (of each) bound what is played; `hop`: see `load_at_hop`. Raises ConfigError or ModelError.
+
+def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
+    """Figures with their intervals over people; None where the meetings, or the listener, hold too little to tell.
+
+    Raises ConfigError or ModelError.
     """
-    folder = find("listeners", name, "config.yaml")
-    everybody = read_people(tables(data))
-    chosen = evaluation.choose_people(everybody, people)
-    parts = [_Part(person, everybody.index(person), minutes, seeds, seed, hop) for person in chosen]
-    table = nod_table.load(data_dir("sim") / "listeners" / TABLE)
-    heard_by = load_at_hop(folder, hop)  # what is wrong with it is said here, not by a process
-    played = dict(_play_all(folder, parts, jobs or os.cpu_count() or 1))
-    pairs = [played[number] for number in sorted(played)]
-    scenes, answers = [scene for scene, _ in pairs], [answer for _, answer in pairs]
-    found, ranks = evaluation.summary(scenes, answers, table, seed)
-    known = sorted({one.series for one in scenes} & set(table.series))
+    folder = find("listeners", options.listener, "config.yaml")
+    heard_by = load_at_hop(folder, options.hop)  # what is wrong with it is said here, not by a process
+    everybody = read_people(tables(options.data))
+    chosen = spread(people_of(everybody, options.split, options.allow_training), options.meetings)
+    tasks = list(_tasks(options, folder, everybody, chosen))
+    played = done_in_processes(_play, tasks, options.jobs, "people listening")
+    people = timing.per_person((one.participant, one.sums) for one in played)
+    found = estimates(timing.figures_of(people[0]), people, options.seed)
+    calibration = _calibration(options.split)
     return {
-        "listener": name,
-        "people": len(scenes),
-        "minutes": round(sum(scene.minutes for scene in scenes), 2),
-        "seeds": seeds,
-        "hop": heard_by.hop,
-        **found,
-        "nod_auc_people": len(ranks),
-        "table": f"bundled, without the series of each person ({', '.join(known)})" if known else "bundled",
-        "rows": _rows(name, found),
-    }
-
-
-def fit_table(data: Path, out: Path) -> dict[str, Any]:
-    """Write the nod table of all people of `data`. Returns what went into it."""
-    people = read_people(tables(data))
-    table = evaluation.fit_table(people)
-    nod_table.save(out, table, _COMMENT)
-    total = nod_table.Counts.total(table.series.values())
-    return {
-        "table": str(out),
+        "listener": options.listener,
+        "split": options.split,
         "people": len(people),
-        "series": sorted(table.series),
-        "nods": int(total.nods.sum()),
-        "listening_minutes": round(float(total.minutes.sum()), 1),
-        "rows": [
-            {"series": key, "people": sum(series(p.meeting) == key for p in people)} for key in sorted(table.series)
-        ],
+        "meetings": len(played),
+        "minutes": round(sum(one.minutes for one in played), 2),
+        "minutes_of_motion_each": options.minutes,
+        "seeds": options.seeds,
+        "hop": heard_by.hop,
+        **{name: _rounded(one.value) for name, one in found.items()},
+        "people_smiles_per_minute": None,
+        "people_blinks_per_minute": None,
+        "interval": {name: one.interval and [_rounded(end) for end in one.interval] for name, one in found.items()},
+        "interval_level": LEVEL,
+        "detector": calibration.report(),
+        "asked_and_seen": _asked(added_up(one.sightings for one in played), calibration),
+        "notes": list(_notes(found)),
+        "rows": _rows(options.listener, found),
     }
+
+
+def people_of(everybody: Sequence[Person], split: Split, allow_training: bool) -> list[Person]:
+    """The people of a part of the meetings. Raises ConfigError where they were trained on, or there are none."""
+    if split == "train" and not allow_training:
+        raise ConfigError(
+            "--split train: listeners were trained on these people; --split validation and test are others, "
+            "--allow-training plays them all the same"
+        )
+    parts = split_series(everybody)
+    if not parts[split]:
+        there = ", ".join(f"{name} {len(people)}" for name, people in parts.items() if people)
+        raise ConfigError(f"--split {split}: the tables hold nobody of it ({there})")
+    return parts[split]
+
+
+def spread(people: Sequence[Person], most: int | None) -> list[Person]:
+    """At most that many, spread evenly over the meetings."""
+    if most is None or most >= len(people):
+        return list(people)
+    return [people[int(index)] for index in np.linspace(0, len(people) - 1, most).round()]
 
 
 def tables(data: Path) -> Path:
@@ -117,38 +154,64 @@ def tables(data: Path) -> Path:
     return inside if inside.is_dir() else data
 
 
-def _play_all(
-    folder: Path, parts: Sequence[_Part], jobs: int
-) -> Iterator[tuple[int, tuple[evaluation.Scene, evaluation.Answer]]]:
-    console = Console(stderr=True)
-    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("people listening", total=len(parts))
-        workers = min(jobs, len(parts))
-        if workers == 1:
-            for part in parts:
-                yield part.number, _play(folder, part)
-                progress.advance(task)
-            return
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=one_thread)
-        try:
-            waiting = {pool.submit(_play, folder, part): part.number for part in parts}
-            for done in as_completed(waiting):
-                yield waiting[done], done.result()
-                progress.advance(task)
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+# --- playing ----------------------------------------------------------------------------------------------------
 
 
-def _play(folder: Path, part: _Part) -> tuple[evaluation.Scene, evaluation.Answer]:
-    """One participant's stretch through the listener, once per seed; the scene comes back without its frames."""
-    voices, motions = _bundled()
-    rng = np.random.default_rng([part.seed, part.number])
-    scene = evaluation.scene(part.person, part.minutes, voices, motions, rng)
-    first = 1000 * (part.seed + part.number)
-    played = rollout(_listener(folder, part.hop), scene.speaker, range(first, first + part.seeds)).motion
-    return replace(scene, speaker=()), evaluation.observe(played)
+def _tasks(
+    options: TimingOptions, folder: Path, everybody: Sequence[Person], chosen: Sequence[Person]
+) -> Iterator[_Task]:
+    training = split_series(everybody)["train"]
+    table = timing.table_rates(training) if training else None
+    reference = ReferenceHazard.of(training) if training else None
+    calibration = _calibration(options.split)
+    for person in chosen:
+        yield _Task(options, folder, person, everybody.index(person), table, reference, calibration)
+
+
+def _play(task: _Task) -> _Played:
+    """One meeting: what he did, what the listener would have done, and what it did."""
+    options, (voices, laughter, motions) = task.options, _bundled(task.options.split)
+    rng = np.random.default_rng([options.seed, task.number])
+    one = listener_meeting(task.person, voices, laughter, motions, rng)
+    listener, alone = _listener(task.folder, options.hop), without_own_voice(one.speaker)
+    first, frames = middle(one.frames, options.minutes)
+    played = np.zeros(one.frames, bool)
+    played[first : first + frames] = True
+    sums = timing.people_sums(one, played)
+    if task.table is not None and task.reference is not None:
+        sums |= timing.table_sums(one, task.table)
+        sums |= timing.hazard_sums("r2_", one, *task.reference.scores(task.person, one.frames))
+    seeds = range(1000 * (options.seed + task.number), 1000 * (options.seed + task.number) + options.seeds)
+    if isinstance(listener, EventfulListener):
+        sums |= _by_events(listener, one, alone, seeds)
+    sightings: Mapping[str, Sightings] = {}
+    if frames:
+        rolled = rollout(listener, part(alone, first, frames), seeds)
+        sums |= timing.motion_sums(one, rolled.motion, first, task.calibration)
+        streams = zip(rolled.events, rolled.motion, strict=True)
+        sightings = added_up(asked_and_seen(events, motion, task.calibration.lag_s) for events, motion in streams)
+    return _Played(one.participant, one.frames / FRAME_HZ / 60, sums, sightings)
+
+
+def middle(frames: int, minutes: float) -> tuple[int, int]:
+    """First frame and number of frames of the middle `minutes`, of all if there are fewer."""
+    wanted = min(frames, round(60 * minutes * FRAME_HZ))
+    return (frames - wanted) // 2, wanted
+
+
+def _by_events(
+    listener: EventfulListener, one: ListenerMeeting, alone: Sequence[SpeakerFrame], seeds: Sequence[int]
+) -> Sums:
+    """How its hazards, given his own history, rank what he did; and what it decides, left to itself."""
+    model, calmness, history = listener.when, listener.calmness, one.history
+    heard = sensed(model, alone, calmness)
+    speaking = forced_hazards(model, sensed(model, one.speaker, calmness), history, calmness)
+    silent = forced_hazards(model, heard, history, calmness)
+    other = forced_hazards(model, sensed(model, shifted(alone), calmness), history, calmness)
+    sums = timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
+    for kind in timing.ANNOTATED:
+        sums[f"{kind}_hazard_auc"] = timing.ranked(speaking[kind], one, kind)
+    return sums | timing.decided_sums(one, decisions(model, heard, seeds, calmness))
 
 
 @cache
@@ -157,16 +220,76 @@ def _listener(folder: Path, hop: int | None) -> Listener:
 
 
 @cache
-def _bundled() -> tuple[tuple[Voice, ...], Motions]:
+def _bundled(split: Split) -> tuple[tuple[Voice, ...], tuple[Floats, ...], Motions]:
+    """Voices, laughter and motions that belong to that part."""
     sim = data_dir("sim")
-    return tuple(find_voices([sim / "speakers"])), load_motions(sim / "listeners" / "motions.npz")["validation"]
+    voices = split_voices(find_voices([sim / "speakers"]))[split]
+    motions = load_motions(sim / "listeners" / "motions.npz")[split]
+    return tuple(voices), tuple(find_laughter([sim / "speakers"])[split]), motions
 
 
-def _rows(name: str, found: dict[str, float | None]) -> list[dict[str, Any]]:
-    """One row per figure: the listener's (or the table's), and the people's where they have one."""
-    beside = {"smiles_per_minute": "people_laughs_per_minute"}  # nobody annotated smiles
+@cache
+def _calibration(split: Split) -> Calibration:
+    return Calibration.of(_bundled(split)[2])
+
+
+# --- telling ----------------------------------------------------------------------------------------------------
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
+
+
+def _asked(told: Mapping[str, Sightings], calibration: Calibration) -> dict[str, Any]:
+    """Events that the listener asked for, in its motion; beside them recorded ones of the same sizes."""
+    found = {}
+    for kind, one in told.items():
+        if not len(one.sizes):
+            continue
+        known = calibration.known[kind]
+        recorded = {
+            "recall": known.recall_at(one.sizes, SIZES[kind]),
+            "precision": known.precision,
+            "offset_s": known.offset_s,
+        }
+        found[kind] = {
+            **figures(one, SIZES[kind]),
+            "recorded": {name: _rounded(value) if np.isfinite(value) else None for name, value in recorded.items()},
+        }
+    return found
+
+
+def _notes(found: Mapping[str, Estimate]) -> Iterator[str]:
+    """What the figures do not say by themselves."""
+    yield "people's smiles and blinks were not annotated; laughs are only laid beside laughs"
+    if "nod_hazard_auc" not in found:
+        yield "this listener has no hazards that could be asked: nod_hazard_auc and its kin cannot be told"
+    if "nods_per_minute" not in found:
+        yield "no motion was played (--minutes 0)"
+    if "r2_nod_hazard_auc" not in found:
+        yield "the tables hold nobody to fit the reference on"
+
+
+def _rows(name: str, found: Mapping[str, Estimate]) -> list[dict[str, Any]]:
+    """One row per figure: what is seen in the motion, or asked of the hazards; beside it whatever else has it."""
+    keys = dict.fromkeys(_bare(key) for key in found)
     return [
-        {"figure": key.replace("_", " "), name: value, "people": found.get(beside.get(key, f"people_{key}"))}
-        for key, value in found.items()
-        if not key.startswith("people_")
+        {
+            "figure": key.replace("_", " "),
+            name: _cell(found.get(key)),
+            **{who: _cell(found.get(prefix + key)) for who, prefix in _PREFIXES.items()},
+        }
+        for key in keys
     ]
+
+
+def _bare(key: str) -> str:
+    return next((key.removeprefix(prefix) for prefix in _PREFIXES.values() if key.startswith(prefix)), key)
+
+
+def _cell(one: Estimate | None) -> str | None:
+    if one is None or one.value is None:
+        return None
+    if one.interval is None:
+        return f"{one.value:.3g}"
+    return f"{one.value:.3g} [{one.interval[0]:.3g}, {one.interval[1]:.3g}]"

@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sfms_robot.app.listen.keys import ESCAPE, Keyboard, in_background, keyboard, reading_keys
-from sfms_robot.app.listen.live_knobs import STEP
+from sfms_robot.app.listen.knobs import STEP
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 

@@ -15,6 +15,7 @@ from sfms_robot.servo.discovery import access_problem
 from sfms_robot.sources.registry import check_source
 
 if TYPE_CHECKING:
+    from sfms_robot.config import Calmness
     from sfms_robot.listeners.process import ListenerProcess
 
 
@@ -42,8 +43,8 @@ def check_names(
             raise PortError(f"{device}: {problem}")
 
 
-def begin_listening(listener: str, seed: int) -> ListenerProcess:
+def begin_listening(listener: str, seed: int, calmness: Calmness | None = None) -> ListenerProcess:
     """The listener's own process, which loads from now on. For `session.run(feed=...)`; closed by the caller."""
     from sfms_robot.listeners.process import ListenerProcess  # numpy: not for who only mistyped a name
 
-    return ListenerProcess(listener, seed)
+    return ListenerProcess(listener, seed, calmness)

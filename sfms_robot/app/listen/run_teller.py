@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from sfms_robot.frames import Plan, SpeakerFrame
+from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.ports import Outlet, Tick
-from sfms_robot.runtime.planned_events import EventWatch, MotionEvent
-from sfms_robot.signals.events import MOTION_EVENTS
+from sfms_robot.runtime.planned_events import EventWatch
 
 
 class RunTeller:
-    """`ports.Observer`: sound as it is heard, nods, blinks and smiles as they are planned, states as they change."""
+    """`ports.Observer`: sound as it is heard, events as they are decided or planned, states as they change."""
 
     def __init__(self, outlet: Outlet) -> None:
         self._outlet = outlet
         self._state: tuple[str, tuple[str, ...]] | None = None
         self._events = EventWatch()
-        for kind in MOTION_EVENTS:
+        for kind in EVENT_KINDS:
             self._events.on(kind, self._event)
 
     def tick(self, seen: Tick) -> None:
@@ -34,6 +33,8 @@ class RunTeller:
     def close(self) -> None:
         self._events.close()
 
-    def _event(self, event: MotionEvent) -> None:
-        lasts_s = round(event.end_s - event.start_s, 3)
-        self._outlet.tells("event", event.start_s, event=event.kind, lasts_s=lasts_s, size=round(event.size, 4))
+    def _event(self, event: ListenerEvent) -> None:
+        told = {"lasts_s": round(event.duration_s, 3), "size": round(event.size, 4), "swings": event.swings}
+        if event.probability is not None:
+            told["probability"] = round(event.probability, 5)
+        self._outlet.tells("event", event.start_s, event=event.kind, **told)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.live_knobs import turned
+from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.report import figures_so_far
 from sfms_robot.app.replay.run_file import RunRecording, read_recording
 from sfms_robot.app.session import HeadOptions, Panel, Programme, drive_head, open_head, run_log

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from sfms_robot.corpora import formats
 from sfms_robot.corpora.clips import Dyad
@@ -170,8 +170,16 @@ def _report(dataset: Dataset, tally: _Tally, features: dict[str, int]) -> dict[s
 
 
 def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str, Any]:
-    """Compose into out/train and out/validation. Returns the minutes written per split."""
+    """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
-    with Console(stderr=True).status(f"composing {minutes:g} minutes of dyads"):
-        return dict(compose_folder(data, out, seed, minutes))
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def told(name: str, done: float, wanted: float) -> None:
+            if name not in tasks:
+                tasks[name] = progress.add_task(f"composing {name}", total=wanted)
+            progress.update(tasks[name], completed=done)
+
+        return dict(compose_folder(data, out, seed, minutes, told=told))

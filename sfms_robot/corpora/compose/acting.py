@@ -1,25 +1,39 @@
 """From a score of events to a listener's motion: recorded primitives, stretched and laid where things happened.
 
 Everything is added to a head and a face that never stand still. Layers are joined so that neither value nor speed
-jumps: primitives start and end at rest, gaze steps go through smooth kernels, loops are crossfaded.
+jumps: primitives start and end at rest, looks go by `signals.gaze_kinematics`, loops are crossfaded. What was laid, when
+and how large, comes back as events: they are in the motion, and nothing else of their kind is put there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
 from sfms_robot.corpora.compose.motions import SHAPE, Motions, edges, slow
-from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import (
+    BLENDSHAPES,
+    FRAME_HZ,
+    FRAME_S,
+    MOTION_DIM,
+    POSE,
+    SHAPES,
+    Doubles,
+    Floats,
+    ListenerEvent,
+)
+from sfms_robot.signals import gaze_kinematics
+from sfms_robot.signals.events import runs
 
-EYE_PAN_RAD: Final = np.deg2rad(30)  # full eyeLook curve, sideways
-EYE_TILT_RAD: Final = np.deg2rad(20)
 NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay below 1800 deg/s^2
 _FADE: Final = FRAME_HZ
-_GLANCE_S: Final = 1.5
+_SMILE_S: Final = (2.0, 0.4, 1.0, 6.0)  # how long one is seen: median, deviation of its logarithm, least, most
+_CORNERS: Final = [SHAPE["mouthSmileLeft"], SHAPE["mouthSmileRight"]]
+_LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
 _MIRROR: Final = [
     BLENDSHAPES.index(
         name.replace("Left", "\0").replace("Right", "Left").replace("\0", "Right")
@@ -30,12 +44,20 @@ _MIRROR: Final = [
 ]
 
 
+def _nothing(*shape: int) -> Doubles:
+    return np.zeros(shape)
+
+
+def _spans() -> Doubles:
+    return _nothing(0, 2)
+
+
 @dataclass(frozen=True)
 class Score:
     """What happens in `frames` frames, in seconds from their beginning; spans are (K, 2) start, end.
 
     Attributes:
-        nods, shakes, tilts, laughs, talk, backchannels: the listener's own.
+        nods, shakes, tilts, laughs, talk, backchannels, mm_hms: the listener's own.
         gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away".
         shared_laughs: laughs of the others.
         asked, ends: instants at which the others asked something, and at which their phrases ended.
@@ -43,50 +65,79 @@ class Score:
     """
 
     frames: int
-    nods: Doubles
-    shakes: Doubles
-    tilts: Doubles
-    laughs: Doubles
-    talk: Doubles
-    backchannels: Doubles
-    gaze: tuple[tuple[float, float, str], ...]
-    shared_laughs: Doubles
-    asked: Doubles
-    ends: Doubles
+    nods: Doubles = field(default_factory=_spans)
+    shakes: Doubles = field(default_factory=_spans)
+    tilts: Doubles = field(default_factory=_spans)
+    laughs: Doubles = field(default_factory=_spans)
+    talk: Doubles = field(default_factory=_spans)
+    backchannels: Doubles = field(default_factory=_spans)
+    mm_hms: Doubles = field(default_factory=_spans)
+    gaze: tuple[tuple[float, float, str], ...] = ()
+    shared_laughs: Doubles = field(default_factory=_spans)
+    asked: Doubles = field(default_factory=lambda: _nothing(0))
+    ends: Doubles = field(default_factory=lambda: _nothing(0))
     mouth: Floats | None = None
 
 
-def listener_motion(score: Score, motions: Motions, rng: np.random.Generator) -> Floats:
-    """(N, 58) of one listener, whose manners (size and pace of nods, how often he blinks, where he looks) are drawn."""
+@dataclass(frozen=True)
+class Acted:
+    """Motion (N, 58), the events that are in it by their start, and the part (N, 3) of its head that is gaze."""
+
+    motion: Floats
+    events: tuple[ListenerEvent, ...]
+    head_of_gaze_rad: Floats
+
+
+def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
+    """One listener, whose manners (size and pace of nods, how often he blinks, where he looks) are drawn."""
     motion = np.zeros((score.frames, MOTION_DIM), np.float32)
     pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
-    gaze, head, shifts = _gaze(score, rng)
-    pose[:, :3] = _sway(motions, score.frames, rng) + _head_of_gaze(head, rng)
+    targets, looks = _targets(score, rng)
+    pose[:, :3] = _sway(motions, score.frames, rng)
     pose[:, 3:] = _drift(motions, score.frames, rng)
-    pose[:, 1] += _swings(score.nods, motions.nods, score.frames, rng)
-    for start, end in score.shakes:
-        side = rng.choice([-1, 1])
-        pose[:, 2] += side * 0.8 * _swings(np.array([[start, end]]), motions.shakes, score.frames, rng)
-    for start, end in score.tilts:
-        hold = max(12, int((end - start) * FRAME_HZ) + 12)
-        pose[:, 0] += _placed(
-            rng.choice([-1, 1]) * np.deg2rad(rng.uniform(2, 6)) * edges(hold, 12), start, score.frames
-        )
-    _look(shapes, gaze, pose, rng)
+    pose += _talking_head(score, motions, rng)
+    events = looks + _gestures(pose, score, motions, rng)
     shapes += _idle(motions, score.frames, rng)
-    _smile(shapes, score, motions, rng)
-    _raise_brows(shapes, score, motions, rng)
-    _speak(shapes, score, motions, rng)
-    _blink(shapes, np.concatenate([score.ends, shifts]), motions, rng)
+    events += _smile(shapes, score, motions, rng)
+    events += _raise_brows(shapes, score, motions, rng)
+    events += _speak(shapes, score, motions, rng)
+    cues = np.concatenate([score.ends, [look.start_s for look in looks]])
+    events += _blink(shapes, cues, motions, rng)
     np.clip(shapes, 0, 1, out=shapes)
-    return mirrored(motion) if rng.random() < 0.5 else motion
+    head, eyes, _ = gaze_kinematics.follow(targets, pose, gaze_kinematics.start(int(rng.integers(2**31))))
+    pose[:, :3] += head
+    motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
+    acted = Acted(motion, tuple(sorted(events, key=lambda event: event.start_s)), head)
+    return _mirror_image(acted) if rng.random() < 0.5 else acted
 
 
-def speaker_motion(mouth: Floats, motions: Motions, rng: np.random.Generator) -> Floats:
-    """(N, 58) of somebody who speaks with this mouth (N, 52); head and the rest of the face from recordings."""
+def speaker_motion(
+    mouth: Floats,
+    motions: Motions,
+    rng: np.random.Generator,
+    attention: Floats | None = None,
+    laughs: Doubles | None = None,
+    nods: Doubles | None = None,
+) -> Floats:
+    """(N, 58) of somebody who speaks with this mouth (N, 52); head and the rest of the face from recordings.
+
+    Args:
+        attention: (N,) 1 where they look at the listener, 0 where they do not, NaN where anything may be.
+        laughs, nods: (K, 2) seconds.
+    """
     motion = np.zeros((len(mouth), MOTION_DIM), np.float32)
-    motion[:, POSE] = rng.uniform(0.5, 1.1) * tiled(motions.heads, len(mouth), rng)
-    motion[:, SHAPES] = np.clip(tiled(motions.faces, len(mouth), rng) + rng.uniform(0.8, 1.1) * mouth, 0, 1)
+    pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
+    pose += rng.uniform(0.5, 1.1) * tiled(motions.heads, len(mouth), rng)
+    _nod(pose, _spans() if nods is None else nods, motions, rng)
+    shapes += np.clip(tiled(motions.faces, len(mouth), rng) + rng.uniform(0.8, 1.1) * mouth, 0, 1)
+    for start, end in _spans() if laughs is None else laughs:
+        _lay_smile(shapes, start - 0.2, end - start + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7, motions, rng)
+    np.clip(shapes, 0, 1, out=shapes)
+    known = np.full(len(mouth), np.nan, np.float32) if attention is None else attention
+    state = gaze_kinematics.start(int(rng.integers(2**31)))
+    head, eyes, _ = gaze_kinematics.follow(_speaker_targets(known, rng), pose, state)
+    pose[:, :3] += head
+    motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
     return mirrored(motion) if rng.random() < 0.5 else motion
 
 
@@ -96,6 +147,17 @@ def mirrored(motion: Floats) -> Floats:
     out[:, SHAPES] = motion[:, SHAPES][:, _MIRROR]
     out[:, [0, 2, 4]] *= -1  # roll, yaw, y
     return out
+
+
+def _mirror_image(acted: Acted) -> Acted:
+    head = acted.head_of_gaze_rad * np.float32([-1, 1, -1])
+    events = tuple(
+        event
+        if event.target_rad is None
+        else replace(event, target_rad=(0.0 - event.target_rad[0], event.target_rad[1]))
+        for event in acted.events
+    )
+    return Acted(mirrored(acted.motion), events, head)
 
 
 # --- joining ----------------------------------------------------------------------------------------------------
@@ -127,14 +189,38 @@ def stretched(curve: Floats, frames: int) -> Floats:
     return np.asarray(curve[low] * (1 - part) + curve[low + 1] * part, np.float32)
 
 
+def held(curve: Floats, frames: int) -> Floats:
+    """A rise and fall (K, 52) that is seen (mouthSmile above half of its height) for about `frames` frames.
+
+    Longer ones rest at their height, as long smiles do; shorter ones are played faster, to 0.6 of their length at most.
+    """
+    height = curve[:, _CORNERS].mean(axis=1)
+    peak, seen = int(height.argmax()), int((height > 0.5 * height.max()).sum())
+    if frames >= seen:
+        return np.concatenate(
+            [curve[:peak], np.repeat(curve[peak : peak + 1], frames - seen + 1, axis=0), curve[peak + 1 :]]
+        )
+    return stretched(curve, int(len(curve) * max(0.6, frames / seen)))
+
+
+def _first(start_s: float) -> int:
+    """The frame that something begins with."""
+    return int(round(start_s * FRAME_HZ))
+
+
 def _placed(curve: Floats, start_s: float, frames: int) -> Floats:
     """Zeros (frames,) or (frames, C) with the curve from `start_s` on."""
     out = np.zeros((frames, *curve.shape[1:]), np.float32)
-    first = int(round(start_s * FRAME_HZ))
+    first = _first(start_s)
     low, high = max(0, first), min(frames, first + len(curve))
     if high > low:
         out[low:high] = curve[low - first : high - first]
     return out
+
+
+def _event(kind: str, start_s: float, curve: Floats, size: float) -> ListenerEvent:
+    """Of a curve that was laid with `_placed`."""
+    return ListenerEvent(kind, _first(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
 
 
 def _pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
@@ -157,22 +243,84 @@ def _drift(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
     return np.asarray(rng.uniform(0.2, 0.5) * tiled(slowly, frames, rng), np.float32)
 
 
-def _swings(spans: Doubles, shapes: Sequence[Floats], frames: int, rng: np.random.Generator) -> Floats:
-    """Nods (frames,) [rad, nose down]: 1 to 4 cycles each, 1.5 to 4 Hz, 2 to 12 degrees, dying away."""
-    out = np.zeros(frames, np.float32)
-    times = np.arange(1, frames + 1) * FRAME_S
-    habit, pace_hz = np.deg2rad(rng.normal(5.0, 1.0)), rng.uniform(1.8, 3.0)
+def _talking_head(score: Score, motions: Motions, rng: np.random.Generator) -> Floats:
+    """The head (N, 6) of somebody who speaks, while he does."""
+    talks = np.zeros(score.frames, np.float32)
+    for start, end in score.talk:
+        talks[max(0, _first(start)) : max(0, _first(end))] = 1
+    ramp = edges(FRAME_HZ, FRAME_HZ // 2)
+    eased = np.convolve(talks, ramp / ramp.sum(), "same")[:, None]
+    return np.asarray(eased * rng.uniform(0.2, 0.4) * tiled(motions.heads, score.frames, rng), np.float32)
+
+
+@dataclass(frozen=True)
+class NodHabit:
+    """How one person nods: the usual size [rad, peak to peak], and the pace of the swings."""
+
+    size_rad: float
+    pace_hz: float
+
+
+@dataclass(frozen=True)
+class NodManner:
+    """One nod: size [rad, peak to peak] of its first swing, how many there are, how long all take, how they die away."""
+
+    size_rad: float
+    swings: int
+    duration_s: float
+    fall: float
+
+
+def nod_habit(rng: np.random.Generator) -> NodHabit:
+    """A person's: about 5 degrees, 1.8 to 3 swings a second."""
+    return NodHabit(float(np.deg2rad(rng.normal(5.0, 1.0))), float(rng.uniform(1.8, 3.0)))
+
+
+def nod_manner(habit: NodHabit, length_s: float, rng: np.random.Generator) -> NodManner:
+    """How this person makes a nod that is to last about so long: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12 degrees."""
+    swings = int(np.clip(round(length_s * habit.pace_hz), 1, 4))
+    each_s = float(np.clip(length_s / swings, 0.3, 0.66))
+    size = np.clip(habit.size_rad * np.exp(rng.normal(0, 0.35)), np.deg2rad(2.2), np.deg2rad(12))
+    return NodManner(float(size), swings, swings * each_s, float(rng.uniform(0.65, 0.95)))
+
+
+def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> Floats:
+    """Nose down [rad] (frames,) of a nod from `start_s` on; smaller than its size where a neck could not follow."""
+    out = np.zeros(frames)
+    each_s = manner.duration_s / manner.swings
+    size = min(manner.size_rad, NOD_RAD_S2 * each_s**2 / max(_bend(shape, each_s), 1.0))
+    low, high = max(0, _first(start_s) - 1), min(frames, _first(start_s + manner.duration_s) + 2)
+    times = np.arange(low + 1, high + 1) * FRAME_S - start_s
+    for swing in range(manner.swings):
+        phase = times / each_s - swing
+        out[low:high] += size * manner.fall**swing * np.interp(phase, np.linspace(0, 1, len(shape)), shape, 0, 0)
+    return out.astype(np.float32)
+
+
+def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    habit, events = nod_habit(rng), []
     for start, end in spans:
-        shape = _pick(shapes, rng)
-        count = int(np.clip(round((end - start) * pace_hz), 1, 4))
-        length = float(np.clip((end - start) / count, 0.3, 0.66))
-        size = np.clip(habit * np.exp(rng.normal(0, 0.35)), np.deg2rad(2.2), np.deg2rad(12))
-        size = min(size, NOD_RAD_S2 * length**2 / max(_bend(shape, length), 1.0))
-        fall = rng.uniform(0.65, 0.95)
-        for cycle in range(count):
-            phase = (times - start - cycle * length) / length
-            out += size * fall**cycle * np.interp(phase, np.linspace(0, 1, len(shape)), shape, left=0, right=0)
-    return out
+        manner = nod_manner(habit, end - start, rng)
+        curve = nod_curve(manner, _pick(motions.nods, rng), start, len(pose))
+        pose[:, 1] += curve
+        events.append(ListenerEvent("nod", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
+    return events
+
+
+def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """Nods, shakes and tilts, added to a pose (N, 6)."""
+    events = _nod(pose, score.nods, motions, rng)
+    habit = nod_habit(rng)
+    for start, end in score.shakes:
+        manner = nod_manner(habit, end - start, rng)
+        curve = 0.8 * nod_curve(manner, _pick(motions.shakes, rng), start, len(pose))
+        pose[:, 2] += rng.choice([-1, 1]) * curve
+        events.append(ListenerEvent("shake", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
+    for start, end in score.tilts:
+        curve = np.deg2rad(rng.uniform(2, 6)) * edges(max(12, int((end - start) * FRAME_HZ) + 12), 12)
+        pose[:, 0] += rng.choice([-1, 1]) * _placed(curve, start, len(pose))
+        events.append(_event("tilt", start, curve, curve.max()))
+    return events
 
 
 def _bend(shape: Floats, length_s: float) -> float:
@@ -183,14 +331,13 @@ def _bend(shape: Floats, length_s: float) -> float:
     return float(np.abs(np.diff(twice, 2)).max()) * samples**2
 
 
-def _gaze(score: Score, rng: np.random.Generator) -> tuple[Floats, Floats, Doubles]:
-    """Where his eyes and where his head look, (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead.
+# --- gaze -------------------------------------------------------------------------------------------------------
 
-    Also when he shifts, seconds. The head stays for a glance.
-    """
+
+def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[ListenerEvent]]:
+    """Where he looks, (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead; and his gaze shifts."""
     seats = np.deg2rad(rng.uniform(16, 28)) * np.array([-1, 1, 0.7, -0.7, 1])
-    gaze = np.zeros((2, score.frames, 2), np.float32)
-    shifts = []
+    out = np.zeros((score.frames, 2), np.float32)
     for start, end, where in score.gaze:
         kind = where.split()[0]
         if kind == "side":
@@ -201,44 +348,43 @@ def _gaze(score: Score, rng: np.random.Generator) -> tuple[Floats, Floats, Doubl
             target = (seats[0] * 1.2, np.deg2rad(-3))
         else:
             target = (np.deg2rad(rng.normal(0, 12)), np.deg2rad(rng.normal(0, 6)))
-        low, high = (max(0, int(round(at * FRAME_HZ))) for at in (start, end))
-        gaze[0, low:high] = target
-        if end - start >= _GLANCE_S:
-            gaze[1, low:high] = target
-        shifts += [start, end]
-    return gaze[0], gaze[1], np.array(sorted(shifts))
+        out[max(0, _first(start)) : max(0, _first(end))] = target
+    return out, _shifts(out)
 
 
-def _fixations(frames: int, rng: np.random.Generator) -> Floats:
-    """Eyes wander over the face they look at: (N, 2) small steps, a new one every second or so."""
-    held = np.maximum(rng.exponential(0.9, frames), 0.24)
-    index = np.searchsorted(np.cumsum(held), np.arange(frames) * FRAME_S)
-    return np.deg2rad(rng.normal(0, 0.7, (frames, 2)))[index].astype(np.float32)
+def _shifts(targets: Floats) -> list[ListenerEvent]:
+    """One event at each step of the targets (N, 2); before the first frame he looked at the person."""
+    before = np.concatenate([np.zeros((1, 2), np.float32), targets])
+    at = np.flatnonzero((np.diff(before, axis=0) != 0).any(axis=1)).tolist()
+    return [
+        ListenerEvent(
+            "gaze_shift",
+            first * FRAME_S,
+            (last - first) * FRAME_S,
+            float(np.hypot(*(targets[first] - before[first]))),
+            target_rad=(float(targets[first, 0]), float(targets[first, 1])),
+        )
+        for first, last in pairwise([*at, len(targets)])
+    ]
 
 
-def _head_of_gaze(gaze: Floats, rng: np.random.Generator) -> Floats:
-    """The head's part of a look, (N, 3): later and slower than the eyes', bell-shaped speed."""
-    width = int(rng.integers(11, 17))
-    phase = (np.arange(width) + 0.5) / width
-    kernel = phase**2 * (1 - phase) ** 2  # speed of a minimum-jerk move
-    kernel = np.r_[0, kernel / kernel.sum()]
-    share = rng.uniform(0.4, 0.65)
-    padded = np.concatenate([np.repeat(gaze[:1], width, axis=0), gaze])
-    head = np.stack([np.convolve(column, kernel, "valid") for column in padded.T], axis=1)
-    yaw, pitch = share * head[:, 0], 0.8 * share * head[:, 1]
-    return np.stack([-0.08 * yaw, pitch, yaw], axis=1).astype(np.float32)
-
-
-def _look(shapes: Floats, gaze: Floats, pose: Floats, rng: np.random.Generator) -> None:
-    """Eyes do what the head leaves over, and hold their target while the head nods."""
-    kernel = np.array([0.3, 0.4, 0.3])
-    target = gaze + _fixations(len(gaze), rng)
-    eyes = np.stack([np.convolve(np.r_[[c[0]] * 2, c], kernel)[2 : 2 + len(c)] for c in target.T], axis=1)
-    yaw = (eyes[:, 0] - pose[:, 2]) / EYE_PAN_RAD
-    down = (eyes[:, 1] - 0.9 * pose[:, 1]) / EYE_TILT_RAD
-    for left, right, amount in (("Out", "In", yaw), ("In", "Out", -yaw), ("Down", "Down", down), ("Up", "Up", -down)):
-        shapes[:, SHAPE[f"eyeLook{left}Left"]] = np.clip(amount, 0, 1)
-        shapes[:, SHAPE[f"eyeLook{right}Right"]] = np.clip(amount, 0, 1)
+def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
+    """Where somebody looks who speaks, (N, 2): at the listener or not, as told; at random where nothing is told."""
+    at_listener = attention > 0.5
+    unknown = np.isnan(attention)
+    looks, row = bool(rng.random() < 0.6), 0
+    while row < len(attention):
+        long = max(5, int(FRAME_HZ * 1.5 * np.exp(rng.normal(0, 0.7))))
+        at_listener[row : row + long] |= unknown[row : row + long] & looks
+        looks, row = not looks, row + long
+    out = np.zeros((len(attention), 2), np.float32)
+    for start, end in runs(~at_listener):
+        while start < end:
+            long = int(FRAME_HZ * rng.uniform(1, 4))
+            aside = rng.choice([-1, 1]) * rng.uniform(15, 32), rng.normal(4, 6)
+            out[start : min(end, start + long)] = np.deg2rad(aside)
+            start += long
+    return out
 
 
 # --- face -------------------------------------------------------------------------------------------------------
@@ -250,19 +396,52 @@ def _idle(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
     return np.asarray(rng.uniform(0.7, 1.2) * (moving - np.percentile(moving, 20, axis=0)), np.float32)
 
 
-def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> None:
-    """Own laughs always, laughs of others often, backchannels and nods now and then; only a laugh opens the jaw."""
-    events = [(start, end, rng.uniform(0.5, 0.9), 0.7) for start, end in score.laughs]
-    events += [(a, b, rng.uniform(0.3, 0.6), 0.2) for a, b in score.shared_laughs if rng.random() < 0.6]
-    events += [(a, b, rng.uniform(0.2, 0.4), 0.1) for a, b in score.backchannels if rng.random() < 0.3]
-    events += [(a, b, rng.uniform(0.2, 0.4), 0.1) for a, b in score.nods if rng.random() < 0.12]
-    for start, end, size, jaw in events:
-        curve = _pick(motions.smiles, rng)
-        wanted = (end - start + rng.uniform(0.8, 1.8)) * FRAME_HZ
-        length = int(np.clip(wanted, 0.7 * len(curve), 1.8 * len(curve)))
-        curve = size * stretched(curve, length) * edges(length, 9)[:, None]
-        curve[:, SHAPE["jawOpen"]] *= jaw
-        np.copyto(shapes, _over(shapes, _placed(curve.astype(np.float32), start - 0.2, len(shapes))))
+def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """Own laughs always, laughs of others often, backchannels and nods now and then; only a laugh opens the jaw.
+
+    A smile that would begin during another one is left out.
+    """
+    wanted = [("laugh", a, b - a + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7) for a, b in score.laughs]
+    wanted += [
+        ("smile", a, max(b - a, _smile_s(rng)), rng.uniform(0.35, 0.7), 0.2)
+        for a, b in score.shared_laughs
+        if rng.random() < 0.6
+    ]
+    wanted += [
+        ("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3
+    ]
+    wanted += [("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.nods if rng.random() < 0.12]
+    events: list[ListenerEvent] = []
+    for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):
+        if any(event.start_s - seen_s < start < event.end_s for event in events):
+            continue
+        curve = _lay_smile(shapes, start - 0.2, seen_s, size, jaw, motions, rng)
+        events.append(_event(kind, start - 0.2, curve, curve[:, _CORNERS].mean(axis=1).max()))
+    return events
+
+
+def _smile_s(rng: np.random.Generator) -> float:
+    median_s, deviation, least_s, most_s = _SMILE_S
+    return float(np.clip(median_s * np.exp(rng.normal(0, deviation)), least_s, most_s))
+
+
+def _lay_smile(
+    shapes: Floats,
+    start_s: float,
+    seen_s: float,
+    size: float,
+    jaw: float,
+    motions: Motions,
+    rng: np.random.Generator,
+) -> Floats:
+    """A recorded smile over the face (N, 52) from `start_s` on; the curve (K, 52) that was laid."""
+    curve = held(_pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
+    knots = np.arange(0, len(curve) + FRAME_HZ, FRAME_HZ)
+    breath = np.interp(np.arange(len(curve)), knots, rng.uniform(0.9, 1.0, len(knots)))  # no smile stands still
+    curve = (size * curve * (breath * edges(len(curve), 9))[:, None]).astype(np.float32)
+    curve[:, SHAPE["jawOpen"]] *= jaw
+    np.copyto(shapes, _over(shapes, _placed(curve, start_s, len(shapes))))
+    return curve
 
 
 def _over(below: Floats, above: Floats) -> Floats:
@@ -270,35 +449,46 @@ def _over(below: Floats, above: Floats) -> Floats:
     return np.asarray(below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1), np.float32)
 
 
-def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> None:
+def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
     """After half of the questions, with some of the nods."""
     at = [instant for instant in score.asked if rng.random() < 0.5]
     at += [start for start, _ in score.nods if rng.random() < 0.15]
-    for instant in at:
-        curve = _pick(motions.brows, rng)
+    events: list[ListenerEvent] = []
+    for instant in sorted(at):
+        if events and instant - 0.1 < events[-1].end_s:
+            continue
+        curve, size = _pick(motions.brows, rng), rng.uniform(0.2, 0.5)
         length = int(len(curve) * rng.uniform(0.7, 1.3))
-        curve = rng.uniform(0.2, 0.5) * stretched(curve, length) * edges(length, 6)[:, None]
-        placed = _placed(curve.astype(np.float32), instant - 0.1, len(shapes))
-        np.copyto(shapes, _over(shapes, placed))
+        curve = (size * stretched(curve, length) * edges(length, 6)[:, None]).astype(np.float32)
+        np.copyto(shapes, _over(shapes, _placed(curve, instant - 0.1, len(shapes))))
+        events.append(_event("brow_raise", instant - 0.1, curve, size))
+    return events
 
 
-def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> None:
-    """His own words: the mouth of his voice, or else some recorded mouth over them, small for an "mm-hm"."""
-    if score.mouth is not None:
-        np.copyto(shapes, _over(shapes, score.mouth))
-        return
+def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """His own words: the mouth of his voice, or else some recorded mouth over them, small for an "mm-hm".
+
+    The size of an "mm-hm" is how far it opens the jaw.
+    """
+    said = np.zeros_like(shapes) if score.mouth is None else score.mouth
     source = motions.talk[0]
-    short = {float(start) for start, _ in score.backchannels}
-    for start, end in score.talk:
+    short = {float(start) for start, _ in np.concatenate([score.backchannels, score.mm_hms])}
+    for start, end in score.talk if score.mouth is None else ():
         length = max(4, int((end - start) * FRAME_HZ))
         gain = rng.uniform(0.25, 0.45) if any(abs(start - other) < 0.3 for other in short) else rng.uniform(0.6, 0.9)
         offset = int(rng.integers(max(1, len(source) - length)))
         piece = source[offset : offset + length]
-        placed = _placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
-        np.copyto(shapes, _over(shapes, placed))
+        said = said + _placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
+    np.copyto(shapes, _over(shapes, said))
+    events = []
+    for start, end in score.mm_hms:
+        low, high = max(0, _first(start)), max(_first(start) + 1, _first(end))
+        jaw = float(said[low:high, SHAPE["jawOpen"]].max(initial=0.0))
+        events.append(ListenerEvent("mm_hm", start, end - start, min(1.0, jaw)))
+    return events
 
 
-def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Generator) -> None:
+def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
     """Recorded intervals at a personal rate; half the blinks wait for a cue (gaze shift, phrase end) close by."""
     end_s = len(shapes) * FRAME_S
     pace, gaps = rng.uniform(0.75, 1.4), np.concatenate(motions.gaps)
@@ -308,12 +498,13 @@ def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Gener
         times.append(float(rng.choice(near)) if len(near) and rng.random() < 0.5 else at)
         at += pace * float(rng.choice(gaps))
     times += [cue for cue in cues if rng.random() < 0.08]
-    last = -1.0
+    events: list[ListenerEvent] = []
     for instant in sorted(times):
-        if instant - last < 0.5:
+        if events and instant - events[-1].start_s < 0.5:
             continue
-        last = instant
         curve = _pick(motions.blinks, rng)
         size = rng.uniform(0.55, 0.8) if rng.random() < 0.15 else rng.uniform(0.85, 1.0)
-        placed = _placed((size * curve).astype(np.float32), instant, len(shapes))
-        np.maximum(shapes, placed, out=shapes)
+        curve = (size * curve).astype(np.float32)
+        np.maximum(shapes, _placed(curve, instant, len(shapes)), out=shapes)
+        events.append(_event("blink", instant, curve, curve[:, _LIDS].mean(axis=1).max()))
+    return events

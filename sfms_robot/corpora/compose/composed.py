@@ -1,10 +1,17 @@
 """Composed dyads: real timing, real movement, put together here.
 
-Real are: when somebody nods, looks away, laughs or says "mm-hm" while others talk, and when they talk and pause (AMI
-meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`); how speech sounds (`voices`). That they
-belong together is ours: the voice says other words than the meeting did, only its phrases begin and end when they did.
-Whoever holds the floor sits straight ahead. Stretches with nods, above all those with nods at the end of a phrase, are
-drawn more often than they are in the meetings. Meetings, people, takes and voices kept for validation are whole ones.
+Real are: when somebody nods, laughs or says "mm-hm" while others talk, when they talk and pause, laugh and nod, and
+when they look at him (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`); how speech
+sounds (`voices`). That they belong together is ours: the voice says other words than the meeting did, only its phrases
+begin and end when they did. Meetings, people, takes and voices kept for validation and test are whole ones (`splits`).
+
+All others of a meeting become one speaker. Whoever holds the floor sits straight ahead, and looks at the listener when
+he was annotated to; where nobody annotated his gaze he looks at random and `Dyad.attention` is unknown, as it is while
+no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, his looks
+are drawn from how long looks last in the training part (`looks`), and so is their order, which is ours.
+
+Stretches with nods, above all those with nods at the end of a phrase, and those in which he is spoken to are drawn more
+often than they are in the meetings; asked for enough minutes, a set holds every stretch once.
 
 A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
 serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
@@ -13,7 +20,7 @@ the filmed recordings themselves (`speaking.py`). Each is a data set of its own 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -24,25 +31,36 @@ from numpy.typing import NDArray
 from sfms_robot.corpora import conversational_states as labels
 from sfms_robot.corpora.clips import Dyad, save
 from sfms_robot.corpora.compose import speaking
-from sfms_robot.corpora.compose.acting import Score, listener_motion, speaker_motion
+from sfms_robot.corpora.compose.acting import Score, act, speaker_motion
 from sfms_robot.corpora.compose.ami import Person, read_people, split_series
-from sfms_robot.corpora.compose.motions import SPLITS, Motions
+from sfms_robot.corpora.compose.looks import Dwell, away, learn_dwell
+from sfms_robot.corpora.compose.motions import Motions
 from sfms_robot.corpora.compose.motions import load as load_motions
-from sfms_robot.corpora.compose.voices import Voice, find_voices, lay, room, split_voices
+from sfms_robot.corpora.compose.recorded import heard, seen
+from sfms_robot.corpora.compose.voices import (
+    Voice,
+    find_laughter,
+    find_voices,
+    laugh,
+    lay,
+    mouth_over,
+    split_voices,
+)
+from sfms_robot.corpora.splits import SPLITS, Split
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, Doubles, Floats
 from sfms_robot.signals.events import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 
 LENGTH_S: Final = (30.0, 60.0)
-VALIDATION_SHARE: Final = 1 / 6  # of the training minutes
+HELD_OUT_SHARE: Final = 1 / 6  # of the training minutes, for validation and for test
 SHARES: Final = {"interaction": 0.5, "speaking": 0.25}  # minutes of the sets that speak, per minute of listening
 Scene = Literal["listening", "interaction"]
-_FILMED: Final = 0.65  # share of dyads with a voice whose mouth was recorded
-_FACELESS: Final = 0.3  # share of those in which the speaker is heard only
-_LOOKS: Final = 0.6  # share of the looks away that is kept: across a table with papers people look away a lot
-_LONGEST_LOOK_S: Final = (1.5, 4.0)  # a look away ends after this: in meetings people watch slides for minutes
-_WEIGHTS: Final = (4.0, 3.0, 2.0, 3)  # of a stretch: base + nods a minute, up to + a nod after a phrase, up to
+_SOUNDS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", "ami_audio_clips")
+_FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
+_FACELESS: Final = 0.25  # share of those in which the speaker is heard only
+_FLOOR_S: Final = 1.0  # a shorter phrase does not take the floor
+_WEIGHTS: Final = (4.0, 3.0, 2.0, 3, 30.0)  # base + nods a minute, up to + a nod after a phrase, up to + addressed time
 
 _FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # Stretch.name
 
@@ -54,6 +72,7 @@ class Stretch:
     Attributes:
         nods_per_minute: of listening time.
         answers: nods that begin 0 to 0.8 s after the end of a phrase.
+        addressed: share of the time in which whoever holds the floor is known to look at him.
     """
 
     person: Person
@@ -61,12 +80,14 @@ class Stretch:
     end_s: float
     nods_per_minute: float = 0.0
     answers: int = 0
+    addressed: float = 0.0
 
     @property
     def weight(self) -> float:
-        """How often it is drawn: more for nods, and more again for nods when a phrase ends."""
-        base, most, answer, answers = _WEIGHTS
-        return base + min(self.nods_per_minute, most) + answer * min(self.answers, answers)
+        """How often it is drawn: more for nods, for nods when a phrase ends, and for being addressed."""
+        base, most, answer, answers, addressed = _WEIGHTS
+        nods = min(self.nods_per_minute, most) + answer * min(self.answers, answers)
+        return base + nods + addressed * self.addressed
 
     @property
     def frames(self) -> int:
@@ -77,79 +98,119 @@ class Stretch:
         return f"{self.person.meeting}_{self.person.agent}_{int(self.start_s):04d}"
 
 
-def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> dict[str, list[Dyad]]:
-    """`minutes` of "train" dyads and a sixth of it of "validation" dyads; the same for the same seed.
+@dataclass(frozen=True)
+class Material:
+    """What the dyads of one part are made of."""
+
+    people: Sequence[Person]
+    voices: Sequence[Voice]
+    laughter: Sequence[Floats]
+    motions: Motions
+    dwell: Dwell
+
+
+def read_material(ami: Path, voices: Sequence[Path], motions: Path) -> dict[Split, Material]:
+    """By part, from the AMI tables, folders of WAV files and a file of motion primitives. Raises ConfigError."""
+    people = split_series(read_people(ami))
+    spoken, laughter, moves = split_voices(find_voices(voices)), find_laughter(voices), load_motions(motions)
+    dwell = learn_dwell(people["train"])
+    return {split: Material(people[split], spoken[split], laughter[split], moves[split], dwell) for split in SPLITS}
+
+
+def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> dict[Split, list[Dyad]]:
+    """`minutes` of "train" dyads and a sixth of it of "validation" and "test"; the same for the same seed.
 
     `ami` holds the AMI tables, `voices` are folders of WAV files, `motions` is a file of motion primitives. Raises
     ConfigError.
     """
-    made: dict[str, list[Dyad]] = {split: [] for split in SPLITS}
-    for split, dyad in dyads(ami, voices, motions, seed, minutes):
+    made: dict[Split, list[Dyad]] = {split: [] for split in SPLITS}
+    for split, dyad in dyads(read_material(ami, voices, motions), seed, minutes):
         made[split].append(dyad)
     return made
 
 
-def compose_folder(data: Path, out: Path, seed: int, minutes: float, voices: Sequence[Path] = ()) -> dict[str, float]:
-    """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train and out/validation.
+def compose_folder(
+    data: Path,
+    out: Path,
+    seed: int,
+    minutes: float,
+    voices: Sequence[Path] = (),
+    told: Callable[[str, float, float], None] | None = None,
+) -> dict[str, float]:
+    """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train, validation and test.
 
     Beside them, out/interaction and out/speaking are sets of the same form. No filmed voice, no speaking.
 
-    Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, the AMI clips) and
-    those of further folders. Dyads of an earlier run are removed from `out` once the new ones are written, so that two
-    sets never mix. Returns the minutes written per split. Raises ConfigError.
+    Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
+    ami_audio_clips/, the clips beside the tables) and those of further folders. Dyads of an earlier run are removed
+    from `out` once the new ones are written, so that two sets never mix. `told` hears of every dyad: the set, the
+    minutes written of it, the minutes wanted. Returns the minutes written per split. Raises ConfigError.
     """
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
-    brought = [folder for folder in (data / "facegood_audio_mouth", data / "speech_audio", ami) if folder.is_dir()]
+    brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
-    motions = data_dir("sim") / "listeners" / "motions.npz"
-    sounds = [*bundled, *brought, *voices]
-    spoken = speaking.dyads(find_voices(sounds), motions, seed, SHARES["speaking"] * minutes)
-    conversation = dyads(ami, sounds, motions, seed, SHARES["interaction"] * minutes, "interaction")
-    return {
-        **_write(dyads(ami, sounds, motions, seed, minutes), out),
-        **_named("interaction", _write(conversation, out / "interaction")),
-        **_named("speaking", _write(spoken, out / "speaking")),
+    material = read_material(ami, [*bundled, *brought, *voices], data_dir("sim") / "listeners" / "motions.npz")
+    sets = {
+        "listening": (out, minutes, dyads),
+        "interaction": (out / "interaction", SHARES["interaction"] * minutes, conversations),
+        "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),
     }
+    written = {}
+    for name, (folder, wanted, make) in sets.items():
+        whole = wanted * (1 + 2 * HELD_OUT_SHARE)
+
+        def each(done: float, name: str = name, whole: float = whole) -> None:
+            if told:
+                told(name, done, whole)
+
+        found = _write(make(material, seed, wanted), folder, each)
+        written |= found if name == "listening" else {f"{name}_{split}": value for split, value in found.items()}
+    return written
 
 
-def _write(made: Iterator[tuple[str, Dyad]], out: Path) -> dict[str, float]:
+def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float], None]) -> dict[str, float]:
     """Write a set and remove what an earlier one left; minutes per split."""
     written, fresh = dict.fromkeys(SPLITS, 0.0), set()
     for split, dyad in made:
         save(out / split, [dyad])
         fresh.add(out / split / f"{dyad.name}.npz")
         written[split] += len(dyad.listener) * FRAME_S / 60
+        each(sum(written.values()))
     for split in SPLITS:
         for stale in {file for pattern in _FILES for file in (out / split).glob(pattern)} - fresh:
             stale.unlink()
-    return written
-
-
-def _named(scene: str, minutes: Mapping[str, float]) -> dict[str, float]:
-    return {f"{scene}_{split}": value for split, value in minutes.items()}
+    return {str(split): value for split, value in written.items()}
 
 
 def dyads(
-    ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float, scene: Scene = "listening"
-) -> Iterator[tuple[str, Dyad]]:
-    """The same one by one, as (split, dyad): for sets that need not lie in memory."""
+    material: Mapping[Split, Material], seed: int, minutes: float, scene: Scene = "listening"
+) -> Iterator[tuple[Split, Dyad]]:
+    """Dyads one by one, as (split, dyad): for sets that need not lie in memory. Raises ConfigError."""
     if not minutes > 0:
         raise ConfigError(f"--minutes {minutes:g}: must be above 0")
-    people = split_series(read_people(ami))
-    spoken = split_voices(find_voices(voices))
-    moves = load_motions(motions)
     for number, split in enumerate(SPLITS):
         rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
-        wanted = minutes * (1 if split == "train" else VALIDATION_SHARE)
-        annotated = [person for person in people[split] if person.gaze is not None]
-        for stretch in choose(stretches(people[split], rng, scene), wanted, rng):
-            lender = annotated[int(rng.integers(len(annotated)))] if annotated else None
-            voice = cast(spoken[split], rng)
-            yield split, compose_one(stretch, lender, voice, own_voice(spoken[split], voice, rng), moves[split], rng)
+        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
+        for stretch in choose(stretches(material[split].people, rng, scene), wanted, rng):
+            yield split, compose_one(stretch, material[split], rng)
+
+
+def conversations(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
+    """Dyads in which both talk."""
+    return dyads(material, seed, minutes, "interaction")
+
+
+def monologues(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
+    """Dyads in which the agent speaks and nobody answers; none of a part without filmed voices."""
+    for number, split in enumerate(SPLITS):
+        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
+        part = material[split]
+        for dyad in speaking.dyads(part.voices, part.motions, part.dwell, [seed, number, 2], wanted):
+            yield split, dyad
 
 
 def cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
-    """A voice by lot, mostly one whose mouth was filmed."""
+    """A voice by lot, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
     return fitting[int(rng.integers(len(fitting)))]
@@ -186,12 +247,13 @@ def stretches(people: Sequence[Person], rng: np.random.Generator, scene: Scene =
             onsets = within(person.nods, piece)[:, 0]
             rate = nods_per_minute(onsets, listening, FRAME_HZ)
             answers = phrase_end_counts(onsets, phrase_ends(others, FRAME_HZ), listening, FRAME_HZ)[0]
-            found.append(replace(piece, nods_per_minute=rate, answers=answers))
+            addressed = float((others & (attention_of(piece) == 1)).mean())
+            found.append(replace(piece, nods_per_minute=rate, answers=answers, addressed=addressed))
     return found
 
 
 def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -> list[Stretch]:
-    """Draw about `minutes` of stretches without repetition, by weight.
+    """Draw about `minutes` of stretches without repetition, by weight; all of them where there are no more.
 
     Systematic draw along the nod rate: even a small set has the rates of the large one.
     """
@@ -199,28 +261,33 @@ def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -
         return []
     ranked = sorted(found, key=lambda stretch: stretch.nods_per_minute)
     weights = np.array([stretch.weight for stretch in ranked])
-    mean_s = float(np.average([stretch.frames * FRAME_S for stretch in ranked], weights=weights))
-    count = max(1, round(60 * minutes / mean_s))
-    spots = (rng.random() + np.arange(count)) / count
-    drawn = np.unique(np.searchsorted(np.cumsum(weights) / weights.sum(), spots).clip(max=len(ranked) - 1))
+    lengths = np.array([stretch.frames * FRAME_S / 60 for stretch in ranked])
+    chances = _chances(weights, lengths, minutes)
+    if chances.sum() < 1:  # less than one stretch is asked for
+        chances = chances / chances.sum()
+    spots = np.floor(np.cumsum(chances) + rng.random())
+    drawn = np.flatnonzero(np.diff(spots, prepend=0.0) >= 1)
     return [ranked[int(index)] for index in rng.permutation(drawn)]
+
+
+def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
+    """(K,) proportional to the weights, none above 1, so that the expected length is what is wanted (or all)."""
+    low, high = 0.0, 1 / weights.min()
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if (np.minimum(1, middle * weights) * lengths).sum() < wanted else (low, middle)
+    return np.asarray(np.minimum(1, high * weights), np.float64)
 
 
 # --- one dyad ---------------------------------------------------------------------------------------------------
 
 
-def compose_one(
-    stretch: Stretch,
-    lender: Person | None,
-    voice: Voice,
-    own_voice: Voice | None,
-    motions: Motions,
-    rng: np.random.Generator,
-) -> Dyad:
-    """One stretch, acted and voiced. `lender` gives his looks where those of this meeting were not annotated."""
+def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) -> Dyad:
+    """One stretch, cast, acted and voiced."""
     person, frames = stretch.person, stretch.frames
+    voice = cast(material.voices, rng)
     others, own = active(person.others, stretch), active(person.talk, stretch)
-    said, mouth = _own_words(stretch, own_voice, rng.spawn(1)[0])
+    said, mouth = _own_words(stretch, own_voice(material.voices, voice, rng), rng.spawn(1)[0])
     score = Score(
         frames,
         nods=within(person.nods, stretch),
@@ -229,28 +296,34 @@ def compose_one(
         laughs=within(person.laughs, stretch),
         talk=within(person.talk, stretch),
         backchannels=within(person.backchannels, stretch),
-        gaze=_looks(stretch, lender, rng),
+        mm_hms=within(person.mm_hms, stretch),
+        gaze=_looks(stretch, material.dwell, rng),
         shared_laughs=within(person.others_laughs, stretch),
         asked=person.asked[(person.asked > stretch.start_s) & (person.asked < stretch.end_s)] - stretch.start_s,
         ends=phrase_ends(others, FRAME_HZ),
         mouth=mouth,
     )
-    heard = labels.Voices(
+    feedback = labels.Voices(
         own,
         others,
         active(person.backchannels, stretch),
         active(person.others_backchannels, stretch),
         active(person.nods, stretch),
     )
-    audio, face = speaker_of(stretch, voice, motions, rng)
+    audio, face = speaker_of(stretch, voice, material.motions, rng, material.laughter)
+    acted = act(score, material.motions, rng)
+    faced = np.isfinite(face).all(axis=1)
     return Dyad(
         stretch.name,
         audio,
         face,
-        listener_motion(score, motions, rng),
+        acted.motion,
         listening_mask(others, FRAME_HZ, own),
         agent_audio=said,
-        states=labels.label(heard),
+        states=labels.label(feedback),
+        events=acted.events,
+        head_of_gaze_rad=acted.head_of_gaze_rad,
+        attention=np.where(faced, attention_of(stretch), np.nan).astype(np.float32),
     )
 
 
@@ -263,51 +336,56 @@ def _own_words(stretch: Stretch, voice: Voice | None, rng: np.random.Generator) 
     return speaking.sent(speech, rng), mouth
 
 
-def speaker_of(stretch: Stretch, voice: Voice, motions: Motions, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """What is heard and seen of the others: audio (N * 640,), face (N, 58), rows of NaN for a voice without one."""
-    said = np.clip(stretch.person.others - stretch.start_s, 0, stretch.frames * FRAME_S)
-    speech, mouth = lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
-    faceless = mouth is None or rng.random() < _FACELESS
-    audio = _recorded(speech, voice, rng)
-    if mouth is None or faceless:
-        return audio, np.full((stretch.frames, MOTION_DIM), np.nan, np.float32)
-    return audio, speaker_motion(mouth, motions, rng)
+def speaker_of(
+    stretch: Stretch,
+    voice: Voice,
+    motions: Motions,
+    rng: np.random.Generator,
+    laughter: Sequence[Floats] = (),
+) -> tuple[Floats, Floats]:
+    """What is heard and seen of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen."""
+    person, frames = stretch.person, stretch.frames
+    said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
+    speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
+    laughs, nods = within(person.others_laughs, stretch), within(_spans(person.others_nods), stretch)
+    audio = heard(laugh(speech, laughs, laughter, rng), voice, rng)
+    if rng.random() < _FACELESS:
+        return audio, np.full((frames, MOTION_DIM), np.nan, np.float32)
+    moving = mouth_over(speech, motions.talk, frames, rng) if mouth is None else mouth
+    return audio, seen(speaker_motion(moving, motions, rng, attention_of(stretch), laughs, nods), rng)
 
 
-def _recorded(speech: Floats, voice: Voice, rng: np.random.Generator) -> Floats:
-    """Speech as some microphone in some room would take it: tilt, gain, noise floor."""
-    tilt = np.float32(rng.uniform(-0.3, 0.3))
-    heard = speech - tilt * np.concatenate([[0], speech[:-1]]).astype(np.float32)
-    gain = np.float32(10 ** (rng.uniform(-10, 6) / 20))
-    return np.asarray(np.clip(gain * heard + room(len(speech), voice, rng), -1, 1), np.float32)
+def attention_of(stretch: Stretch) -> Floats:
+    """(N,) 1 where whoever holds the floor looks at him, 0 where not, NaN where nobody annotated where that one looks.
 
-
-def _looks(stretch: Stretch, lender: Person | None, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
-    """Looks away from whoever has the floor, in seconds of the stretch, none longer than a few seconds."""
+    The floor is held by who began the latest phrase of a second or more.
+    """
     person = stretch.person
-    if person.gaze is None:
-        if lender is None:
-            return ()
-        length = stretch.end_s - stretch.start_s
-        begin = float(rng.uniform(0, max(0.0, lender.until_s - length)))
-        stretch, person = Stretch(lender, begin, begin + length), lender
-    looks = []
-    for start, end, target in person.gaze or ():
-        if end < stretch.start_s or start > stretch.end_s:
-            continue
-        where = _where(person, start, end, target)
-        if where is not None and rng.random() < _LOOKS:
-            end = min(end, start + float(rng.uniform(*_LONGEST_LOOK_S)))
-            looks.append((start - stretch.start_s, end - stretch.start_s, where))
-    return tuple(looks)
+    holder = np.full(stretch.frames, "", dtype="<U1")
+    for start, _, agent in (phrase for phrase in person.floor if phrase[1] - phrase[0] >= _FLOOR_S):
+        if start >= stretch.end_s:
+            break
+        holder[max(0, int(round((start - stretch.start_s) * FRAME_HZ))) :] = agent
+    out = np.full(stretch.frames, np.nan, np.float32)
+    for agent in person.gaze_known:
+        looks = active(_spans(person.looked_at, agent), stretch)
+        out[holder == agent] = looks[holder == agent]
+    return out
 
 
-def _where(person: Person, start: float, end: float, target: str) -> str | None:
-    """A gaze target as a direction; None for somebody who speaks during the look, or is about to or just has."""
-    if len(target) != 1:
-        return {"table": "down", "slide-screen": "screen", "whiteboard": "screen"}.get(target, "away")
-    heard = any(agent == target and a < end + 1 and b > start - 1 for a, b, agent in person.floor)
-    return None if heard else f"side {target}"
+def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+    """(K, 2) of what one agent did, or all."""
+    return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
+
+
+def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
+    """Looks away from whoever has the floor, in seconds of the stretch: annotated ones, or drawn ones."""
+    if stretch.person.gaze is None:
+        return dwell.looks(stretch.frames * FRAME_S, rng)
+    return tuple(
+        (start - stretch.start_s, end - stretch.start_s, where)
+        for start, end, where in away(stretch.person, stretch.start_s, stretch.end_s, rng)
+    )
 
 
 def active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:

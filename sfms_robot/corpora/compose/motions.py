@@ -2,7 +2,7 @@
 
 A *primitive* is one nod cycle, one blink, one smile with everything that moves along, one brow raise, or a stretch
 of idle face or head motion. `build` cuts them from a folder of recordings, `save` and `load` keep them in one small
-file (`sim/listeners/motions.npz`). Whole recordings are kept apart for validation.
+file (`sim/listeners/motions.npz`). Whole recordings are kept apart for validation and test (`splits.TAKES`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from sfms_robot.corpora.splits import SPLITS, split_of_take
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SHAPES, Floats
 from sfms_robot.signals.tracks import read_track, resample
 
-SPLITS: Final = ("train", "validation")
 CYCLE: Final = 24  # samples of one normalised nod
 STEP: Final = 1e-3  # resolution on disk
 SHAPE: Final = {name: index for index, name in enumerate(BLENDSHAPES)}
@@ -32,12 +32,10 @@ _NODS: Final = (
     "yes1", "yes_sad1", "understanding1", "understanding2", "attentive1", "listening1",
     "yes_excited1", "attentive2", "listening2",
 )  # fmt: skip
-_SHAKES: Final = ("no1", "no_excited1", "no_sad1")
+_SHAKES: Final = ("no_excited1", "reprimand2", "no_sad1", "displeased2")
 _SWAY: Final = ("listening1", "attentive1", "thoughtful1", "inquiring2", "serenity1", "listening2", "attentive2")
+_TALKERS: Final = ("d6", "d3", "d18")
 _SMILES: Final = ("S07-001", "facial", "d19", "d0", "d12", "d18")
-_HELD_OUT: Final = frozenset(
-    ("apfel", "d12", "d18", "yes_excited1", "attentive2", "listening2", "no_excited1", "1114_3_15", "d3")
-)  # whole takes only seen in validation
 
 _EYES: Final = tuple(name for name in BLENDSHAPES if name.startswith(("eyeLook", "eyeBlink", "eyeWide")))
 _MOUTH: Final = tuple(name for name in BLENDSHAPES if name.startswith(("mouth", "jaw", "tongue")))
@@ -103,7 +101,7 @@ Pieces = dict[str, dict[str, list[Floats]]]  # split -> kind -> primitives
 
 
 def load(file: Path) -> dict[str, Motions]:
-    """Motions of "train" and "validation". Raises ConfigError when the file is not what `save` wrote."""
+    """Motions of every part (`splits`). Raises ConfigError when the file is not what `save` wrote."""
     pieces: Pieces = {split: {kind: [] for kind in KINDS} for split in SPLITS}
     try:
         with np.load(file, allow_pickle=False) as arrays:
@@ -124,8 +122,7 @@ def save(file: Path, named: Iterable[tuple[str, str, Floats]]) -> None:
     count: dict[str, int] = {}
     arrays: dict[str, NDArray[np.int16]] = {}
     for kind, take, array in named:
-        split = "validation" if take in _HELD_OUT else "train"
-        stem = f"{split}/{kind}/{take}"
+        stem = f"{split_of_take(take)}/{kind}/{take}"
         count[stem] = count.get(stem, -1) + 1
         arrays[f"{stem}/{count[stem]}"] = np.round(array / STEP).astype(np.int16)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -139,14 +136,14 @@ def build(data: Path) -> Iterator[tuple[str, str, Floats]]:
     """
     yield from _heads(data)
     yield from _faces(data)
-    for take in ("1114_2_01", "1114_3_15"):
+    for take in ("1114_2_01", "1114_3_15", "1114_3_16"):
         mouth = facegood_mouth(data / "facegood_audio_mouth" / f"{take}.npz")
         yield "talk", take, mouth[: 40 * FRAME_HZ]
 
 
 def _heads(data: Path) -> Iterator[tuple[str, str, Floats]]:
     poses = _reachy(data / "reachy2_recordings" / "head_and_antennas.csv.gz")
-    poses |= {take: _mediapipe(data, take)[:, :3] for take in ("d6", "d3")}
+    poses |= {take: _mediapipe(data, take)[:, :3] for take in _TALKERS}
     for take in (*_NODS, "d6"):
         for cycle in cycles(poses[take][:, 1], FRAME_HZ):
             yield "nods", take, cycle
@@ -155,7 +152,7 @@ def _heads(data: Path) -> Iterator[tuple[str, str, Floats]]:
             yield "shakes", take, cycle
     for take in _SWAY:
         yield "sway", take, slow(poses[take])
-    for take in ("d6", "d3"):
+    for take in _TALKERS:
         pose = _mediapipe(data, take)[:, :6]
         yield "heads", take, (pose - pose.mean(0)).astype(np.float32)
 

@@ -7,47 +7,41 @@ face come from other recordings. What `--agent-audio` asks of a listener is lear
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from sfms_robot.corpora import conversational_states as labels
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.corpora.compose.acting import speaker_motion
-from sfms_robot.corpora.compose.motions import SPLITS, Motions
-from sfms_robot.corpora.compose.motions import load as load_motions
-from sfms_robot.corpora.compose.voices import Voice, room, split_voices
-from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, Floats
-from sfms_robot.signals.events import voice_activity
+from sfms_robot.corpora.compose.acting import Score, act
+from sfms_robot.corpora.compose.looks import Dwell
+from sfms_robot.corpora.compose.motions import Motions
+from sfms_robot.corpora.compose.voices import Voice, room
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats
+from sfms_robot.signals.events import phrase_ends, runs, voice_activity
 
 LENGTH_S: Final = (15.0, 35.0)
-VALIDATION_SHARE: Final = 1 / 6
 FILES: Final = "speaking_*_[0-9][0-9][0-9].npz"
 _QUIET: Final = 0.5  # share of dyads in which the other's microphone hears nothing at all, not even the room
 _GAIN_DB: Final = (-10.0, 6.0)
-_SEED: Final = 2
 
 
-def dyads(voices: Sequence[Voice], motions: Path, seed: int, minutes: float) -> Iterator[tuple[str, Dyad]]:
-    """`minutes` of training and a sixth of it of validation, as (split, dyad); none of a split without filmed voices.
-
-    Raises ConfigError.
-    """
-    moves, spoken = load_motions(motions), split_voices(voices)
-    for number, split in enumerate(SPLITS):
-        filmed = [voice for voice in spoken[split] if voice.mouth is not None]
-        rng = np.random.default_rng([seed, number, _SEED])
-        frames, count = minutes * 60 * FRAME_HZ * (1 if split == "train" else VALIDATION_SHARE), 0
-        while filmed and frames > 0:
-            weights = np.array([len(voice.recording) for voice in filmed], float)
-            voice = filmed[int(rng.choice(len(filmed), p=weights / weights.sum()))]
-            dyad = take(f"speaking_{voice.name}_{count:03d}", voice, moves[split], rng)
-            yield split, dyad
-            frames, count = frames - len(dyad.listener), count + 1
+def dyads(
+    voices: Sequence[Voice], motions: Motions, dwell: Dwell, seed: Sequence[int], minutes: float
+) -> Iterator[Dyad]:
+    """About `minutes` of pieces of the filmed ones among the voices; none where none was filmed."""
+    filmed = [voice for voice in voices if voice.mouth is not None]
+    weights = np.array([len(voice.recording) for voice in filmed], float)
+    rng = np.random.default_rng(seed)
+    frames, count = minutes * 60 * FRAME_HZ, 0
+    while filmed and frames > 0:
+        voice = filmed[int(rng.choice(len(filmed), p=weights / weights.sum()))]
+        dyad = take(f"speaking_{voice.name}_{count:03d}", voice, motions, dwell, rng)
+        yield dyad
+        frames, count = frames - len(dyad.listener), count + 1
 
 
-def take(name: str, voice: Voice, motions: Motions, rng: np.random.Generator) -> Dyad:
+def take(name: str, voice: Voice, motions: Motions, dwell: Dwell, rng: np.random.Generator) -> Dyad:
     """A piece of a filmed recording. Raises ValueError for a voice that was not filmed."""
     if voice.mouth is None:
         raise ValueError(f"{voice.name} was not filmed")
@@ -55,18 +49,28 @@ def take(name: str, voice: Voice, motions: Motions, rng: np.random.Generator) ->
     frames = min(int(rng.uniform(*LENGTH_S) * FRAME_HZ), whole)
     first = int(rng.integers(whole - frames + 1))
     said = voice.recording[first * FRAME_SAMPLES : (first + frames) * FRAME_SAMPLES]
-    mouth = voice.mouth[first + 1 : first + frames + 1]  # a frame shows the face at its end
     active = voice_activity(said)
+    score = Score(
+        frames,
+        talk=np.array(runs(active), np.float64).reshape(-1, 2) * FRAME_S,
+        gaze=dwell.looks(frames * FRAME_S, rng),
+        ends=phrase_ends(active, FRAME_HZ),
+        mouth=voice.mouth[first + 1 : first + frames + 1],  # a frame shows the face at its end
+    )
+    acted = act(score, motions, rng)
     silent = np.zeros(frames, bool)
     heard = np.zeros(len(said), np.float32) if rng.random() < _QUIET else room(len(said), voice, rng)
     return Dyad(
         name,
         heard,
         np.full((frames, MOTION_DIM), np.nan, np.float32),
-        speaker_motion(mouth, motions, rng),
+        acted.motion,
         silent,
         agent_audio=sent(said, rng),
         states=labels.label(labels.of_activity(active, silent)),
+        events=acted.events,
+        head_of_gaze_rad=acted.head_of_gaze_rad,
+        attention=np.full(frames, np.nan, np.float32),
     )
 
 

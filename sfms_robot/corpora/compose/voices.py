@@ -16,15 +16,19 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import oaconvolve
 
-from sfms_robot.corpora.compose.motions import SHAPE, facegood_mouth
+from sfms_robot.corpora.compose.motions import SHAPE, facegood_mouth, table
+from sfms_robot.corpora.splits import SPLITS, Split, by_split, split_of_voice
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.events import runs, voice_activity
 from sfms_robot.signals.tracks import read_track, resample
 
-HELD_OUT: Final = ("1114_3_15", "katie", "audio_EN2006b_0-30s")  # whole recordings only heard in validation
-_UNFIT: Final = ("katiesteve", "audio_ES2003a_0-30s")  # holds a voice kept for validation; hardly audible
+# Two people in one track, hardly audible, hardly any speech, or people talking over one another.
+_UNFIT: Final = (
+    "katiesteve", "audio_ES2003a", "audio_EN2001b", "audio_EN2001d", "audio_EN2002", "audio_EN2009b", "pair_",
+)  # fmt: skip
+_LAUGH_S: Final = 0.4  # shorter ones are a puff of breath
 _GRAIN: Final = AUDIO_HZ // 50  # 20 ms: pauses are cut out down to this
 _PHRASE: Final = AUDIO_HZ // 5  # a pause this long ended a phrase
 _JOIN: Final = AUDIO_HZ // 200  # 5 ms where two phrases meet
@@ -58,17 +62,58 @@ class Voice:
 def find_voices(folders: Sequence[Path]) -> list[Voice]:
     """Every WAV file in the folders, or one level below them. Raises ConfigError when there is none."""
     files = [file for folder in folders for file in sorted([*folder.glob("*.wav"), *folder.glob("*/*.wav")])]
-    voices = [read_voice(file) for file in files if file.stem not in _UNFIT]
+    voices = [read_voice(file) for file in files if not file.stem.startswith(_UNFIT)]
     if not voices:
         raise ConfigError(f"{', '.join(map(str, folders))}: no WAV file to take voices from")
     return voices
 
 
-def split_voices(voices: Sequence[Voice]) -> dict[str, list[Voice]]:
-    """Whole recordings for training and for validation; a lone voice serves both."""
-    held_out = [voice for voice in voices if voice.name in HELD_OUT]
-    rest = [voice for voice in voices if voice.name not in HELD_OUT]
-    return {"train": rest or held_out, "validation": held_out or rest[-1:]}
+def split_voices(voices: Sequence[Voice]) -> dict[Split, list[Voice]]:
+    """Whole recordings by part (`splits.VOICES`). A part that has none uses all there are: bring more, and none does."""
+    parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
+    return {split: parts[split] or list(voices) for split in SPLITS}
+
+
+def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
+    """Laughs that were annotated in clips and that nobody speaks into, (n,) 16 kHz each, by part; maybe none.
+
+    Looks for a table words.csv.gz (clip, start_s, end_s, kind, text) beside the clips. Raises ConfigError when one of
+    them is broken.
+    """
+    found: list[tuple[Split, Floats]] = []
+    for folder in folders:
+        rows = table(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
+        if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
+            continue
+        said = list(
+            zip(rows["clip"], map(float, rows["start_s"]), map(float, rows["end_s"]), rows["kind"], strict=True)
+        )
+        for (clip, start, end, _), text in zip(said, rows["text"], strict=True):
+            spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind in said)
+            if text == "laugh" and end - start >= _LAUGH_S and not spoken_into and (folder / clip).is_file():
+                audio = read_audio(folder / clip)[int(start * AUDIO_HZ) : int(end * AUDIO_HZ)]
+                found.append((split_of_voice(Path(clip).stem), _eased(audio * (_LEVEL / np.sqrt(np.mean(audio**2))))))
+    return by_split(found)
+
+
+def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Floats], rng: np.random.Generator) -> Floats:
+    """Speech (n,) with laughs in the spans (K, 2); as it is where there is no laughter to take."""
+    out = speech.copy()
+    for start_s, end_s in spans_s if laughter else ():
+        at, end = (int(np.clip(t * AUDIO_HZ, 0, len(out))) for t in (start_s, end_s))
+        while end - at > _FADE:
+            piece = laughter[int(rng.integers(len(laughter)))][: end - at]
+            out[at : at + len(piece)] += np.float32(rng.uniform(0.5, 1.2)) * _eased(piece)
+            at += len(piece)
+    return out
+
+
+def _eased(sound: Floats) -> Floats:
+    ramp = np.ones(len(sound), np.float32)
+    fade = min(_FADE, len(sound) // 2)
+    ramp[:fade] = np.linspace(0, 1, fade)
+    ramp[len(ramp) - fade :] = np.linspace(1, 0, fade)
+    return np.asarray(np.clip(sound, -1, 1) * ramp, np.float32)
 
 
 def read_voice(file: Path) -> Voice:
@@ -177,3 +222,25 @@ def room(samples: int, voice: Voice, rng: np.random.Generator) -> Floats:
     knots = np.arange(0, samples + AUDIO_HZ, AUDIO_HZ)
     level_db = rng.uniform(-70, -48) + np.interp(np.arange(samples), knots, rng.normal(0, 1, len(knots)))
     return np.asarray(coloured * 10 ** (level_db / 20), np.float32)
+
+
+def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
+    """Speech as a room of 0.12 to 0.4 s reverberation gives it back, 6 to 16 dB below the direct sound."""
+    length_s = rng.uniform(0.12, 0.4)
+    times = np.arange(int(length_s * AUDIO_HZ)) / AUDIO_HZ
+    tail = rng.standard_normal(len(times)) * 10 ** (-3 * times / length_s)
+    tail *= 10 ** (-rng.uniform(6, 16) / 20) / np.sqrt(np.sum(tail**2))
+    return np.asarray(speech + oaconvolve(speech, tail)[: len(speech)], np.float32)
+
+
+def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.random.Generator) -> Floats:
+    """A mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
+
+    It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
+    """
+    source = talk[int(rng.integers(len(talk)))]
+    piece = np.roll(source, int(rng.integers(len(source))), axis=0)[np.arange(frames) % len(source)]
+    power = uniform_filter1d(speech[: frames * FRAME_SAMPLES].astype(np.float64) ** 2, 3 * FRAME_SAMPLES)
+    level_db = 10 * np.log10(power[FRAME_SAMPLES - 1 :: FRAME_SAMPLES] + 1e-10)
+    open_share = np.clip((level_db - 20 * np.log10(_LEVEL) + 26) / 20, 0, 1)
+    return _soften(np.asarray(piece * open_share[:, None], np.float32))

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sfms_robot.config.arig import STATES
 from sfms_robot.corpora.clips import Dyad as Conversation
 from sfms_robot.corpora.collection import Dataset
 from sfms_robot.corpora.conversational_states import UNKNOWN
@@ -20,23 +21,31 @@ from sfms_robot.corpora.formats import open_dataset
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning import corpus as dyads
-from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales
+from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales, without_gaze
 from sfms_robot.listeners.arig import audio_frontend
+from sfms_robot.listeners.arig.csu import FEEDBACK, LISTENING, NODDING, QUANTILES, StateUnderstanding, with_feedback
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
+from sfms_robot.signals.control import control_track
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.voice_activity import levels_db
 
 SCENES: Final = ("speaking", "listening", "interaction")
 LEAST_STEP: Final = 0.01  # of a frame, in deviations of the motion
+LARGEST_RHO: Final = 0.999  # of one frame to the next: a time constant of 40 s
+RARE: Final = 0.02  # of the frames with the same voices: a state so rare there is a label's edge
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LabelledDyad(Dyad):
-    """What the model takes, sound in half precision while it is kept, and states (..., N) int64, -1 unlabelled."""
+    """What the model takes, sound in half precision while it is kept, and states (..., N) int64, -1 unlabelled.
+
+    `control` is (..., N, 0) for a listener without events.
+    """
 
     states: Tensor
 
@@ -55,9 +64,11 @@ def open_scenes(data: Path, split: str) -> dict[str, Dataset]:
     return found
 
 
-def gather(scenes: Mapping[str, Sequence[Conversation]], window: int, space: MotionSpace, width: int) -> ArigCorpus:
-    """`corpus.gather` in one motion space; `width` is that of the sound features."""
-    return dyads.gather(scenes, window, partial(frames_of, space=space, width=width))
+def gather(
+    scenes: Mapping[str, Sequence[Conversation]], window: int, space: MotionSpace, width: int, events: bool = False
+) -> ArigCorpus:
+    """`corpus.gather` in one motion space, for a listener with events or without; `width` of the sound features."""
+    return dyads.gather(scenes, window, partial(frames_of, space=space, width=width, events=events))
 
 
 def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
@@ -66,14 +77,21 @@ def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
     return replace(found, user_sound=found.user_sound.float(), agent_sound=found.agent_sound.float())
 
 
-def frames_of(dyad: Conversation, space: MotionSpace, width: int) -> LabelledDyad:
-    """One conversation (N, ...). Raises ConfigError for a motion space or sound that does not fit."""
+def frames_of(dyad: Conversation, space: MotionSpace, width: int, events: bool = False) -> LabelledDyad:
+    """One conversation (N, ...). Raises ConfigError for a motion space, sound or events that do not fit."""
     frames = len(dyad.listener)
+    control = torch.zeros(frames, 0)
+    if events:
+        if dyad.events is None:
+            raise ConfigError(f"{dyad.name}: what the listener did is not known, which events: true needs")
+        control, dyad = torch.from_numpy(control_track(dyad.events, 0, frames)), without_gaze(dyad)
     face = in_space(dyad, dyad.speaker, space)
     seen = face.isfinite().all(-1)
     user, user_voiced, heard = _audio_features(dyad, "user", width)
     agent, agent_voiced, says = _audio_features(dyad, "agent", width)
-    states = np.full(frames, UNKNOWN) if dyad.states is None else dyad.states
+    states = torch.from_numpy((np.full(frames, UNKNOWN) if dyad.states is None else dyad.states).astype(np.int64))
+    if events:
+        states = with_feedback(torch.where((states == FEEDBACK) & ~agent_voiced, LISTENING, states), control)
     return LabelledDyad(
         user_sound=user,
         user_heard=torch.full((frames,), heard),
@@ -83,7 +101,8 @@ def frames_of(dyad: Conversation, space: MotionSpace, width: int) -> LabelledDya
         user_seen=seen,
         agent_motion=in_space(dyad, dyad.listener, space),
         voiced=torch.stack([agent_voiced, user_voiced], dim=-1),
-        states=torch.from_numpy(states.astype(np.int64)),
+        control=control,
+        states=states,
     )
 
 
@@ -117,21 +136,52 @@ def _beside_phase(rows: Floats, audio: Floats | None) -> Floats:
     return np.concatenate([rows, place], axis=1).astype(np.float32)
 
 
+def autocorrelation(last: Tensor, now: Tensor) -> Tensor:
+    """Lag-1 autocorrelation (C,) of values of mean 0, (M, C) each and the next, within 0..`LARGEST_RHO`."""
+    power = (last.square().sum(0) * now.square().sum(0)).sqrt()
+    return ((last * now).sum(0) / power.clamp(min=1e-9)).clamp(0.0, LARGEST_RHO)
+
+
+def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
+    """How long each of the paper's states lasts, and which there are with which voices, as the model hears them."""
+    labels = corpus.frames.states
+    labels = torch.where(labels >= NODDING, LISTENING, labels)  # feedback that is seen lies on top
+    of_dyads = torch.split(labels, list(corpus.lengths))
+    places = torch.linspace(0, 1, QUANTILES)
+    for state in range(len(STATES)):
+        lasted = [float(end - start) for one in of_dyads for start, end in runs(one == state)]
+        if lasted:
+            states.durations[state] = torch.quantile(torch.tensor(lasted), places)
+    known = labels >= 0
+    voices = corpus.frames.voiced[known].long()
+    found = torch.zeros(2, 2, len(STATES))
+    found.index_put_((voices[:, 0], voices[:, 1], labels[known]), torch.ones(()), accumulate=True)
+    share = found / found.sum(-1, keepdim=True).clamp(min=1)
+    states.possible.copy_((share >= RARE) | (share == share.amax(-1, keepdim=True)))
+
+
 def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) -> None:
     """Set means and deviations of motion and sound, and the range that the sampler keeps to."""
     frames = corpus.frames
     mean, spread = motion_scales(frames.agent_motion, channels)
+    if not model.is_drawn.all() and frames.user_seen.any():  # what is not drawn is seen all the same
+        spread = torch.where(model.is_drawn, spread, motion_scales(frames.user_motion[frames.user_seen], channels)[1])
     model.motion_mean.copy_(mean)
     model.motion_std.copy_(spread)
     standard = model.standardise(frames.agent_motion)
     model.motion_low.copy_(standard.amin(0))
     model.motion_high.copy_(standard.amax(0))
-    steps = corpus.steps(standard)
-    model.step_std.copy_(steps.std(0).clamp(min=LEAST_STEP))
+    of_dyads = torch.split(standard, list(corpus.lengths))
+    last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(-1), slice(1, None)))
+    if model.settings.draws == "innovation":
+        model.rho.copy_(autocorrelation(last, now))
+    model.step_std.copy_((now - model.expected(last)).std(0).clamp(min=LEAST_STEP))
     if isinstance(model.head, Denoiser):
-        drawn = standard if model.settings.draws == "motion" else steps / model.step_std
+        drawn = model.target(now, last)
         model.head.low.copy_(drawn.amin(0))
         model.head.high.copy_(drawn.amax(0))
+    if model.settings.events and model.states is not None:
+        _fit_states(model.states, corpus)
     rows = torch.cat([frames.user_sound[frames.user_heard], frames.agent_sound[frames.agent_heard]])
     if len(rows):
         mean, spread = sound_scales(rows)

@@ -4,12 +4,14 @@ loss = L(3) + state_weight * CE(states, 3.3) + coarse_weight * |coarse motion - 
 
 Every frame is told the true past (teacher forcing). The paper states (3) and the cross-entropy; that the coarse motion
 is held to the motion itself, through a linear layer that is thrown away afterwards, is ours: it makes lips follow
-sounds within fewer steps.
+sounds within fewer steps. So are weights of groups of channels: by number, (3) is about the mouth.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 from torch import Tensor, nn
@@ -17,9 +19,11 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.config.arig import STATES
+from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH
 from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.parts import weighted_mean
 from sfms_robot.signals import mel
 
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
@@ -27,6 +31,13 @@ COLOURS = 4  # waves over the bands that make up another microphone's colour
 JUMPS = 0.04  # of frames at which the slow part jumps
 COLD = 0.5  # share of windows whose past is exact
 SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
+# Groups of channels, by how their names begin; the mouth has the rest.
+GROUPS: Final = {
+    "head": (*POSE_CHANNELS, "rotation", "translation", "head"),
+    "lids": ("eye",),
+    "brows": ("brow",),
+    "mouth": ("",),
+}
 
 
 class Student(nn.Module):
@@ -58,6 +69,7 @@ def loss_parts(
     draws: int,
     generator: torch.Generator,
     previous: Tensor,
+    group_weights: config.GroupWeights | None = None,
 ) -> Parts:
     """Losses of frames 1..N-1.
 
@@ -67,14 +79,16 @@ def loss_parts(
         truth: (B, N, C) motion to be predicted after the past it is told.
         draws: noise levels per frame.
         previous: (B, N) the states it is told, of which each frame gets the one before.
+        group_weights: of `GROUPS` in equation (3); None: every channel counts the same.
     """
     model = student.model
+    weights = channel_weights(model.settings, group_weights).to(truth.device) if group_weights else None
     found = model.condition(told, previous)
     target = model.standardise(truth[:, 1:])
     to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]))
     z, wanted = (each.flatten(0, 1).repeat(draws, 1) for each in (found.z, to_draw))
-    motion = model.head.loss(z, wanted, generator).mean()
-    coarse = (student.readout(found.outline) - target).square().mean()
+    motion = model.head.loss(z, wanted, generator, weights).mean()
+    coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
     known = states[:, 1:] >= 0
     state = motion.new_zeros(())
     if found.states is not None and bool(known.any()):
@@ -82,12 +96,30 @@ def loss_parts(
     return Parts(motion, state, coarse)
 
 
+def group_of(channel: str) -> str:
+    """Of `GROUPS`."""
+    return next(group for group, begins in GROUPS.items() if channel.startswith(begins))
+
+
+def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tensor:
+    """(C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
+    drawn = set(settings.drawn_channels)
+    members = Counter(group_of(name) for name in drawn)
+    weights = torch.zeros(len(settings.channels))
+    for index, name in enumerate(settings.channels):
+        if name in drawn:
+            weights[index] = getattr(groups, group_of(name)) / members[group_of(name)]
+    return weights / weights.sum()
+
+
 def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> tuple[Dyad, Tensor]:
     """Missing modalities, other microphones, and a past that is not quite what it was.
 
     Also the motion (B, N, C) that comes after such a past.
     The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
-    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter.
+    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. Of a
+    head that is drawn by innovations even that tenth is left to the autoregression: where it is held tells nothing of
+    what it does next, and what a stream's head forgets is what `rho` says.
     Lips are another matter while the agent speaks: its sounds say where they have to be, so their past is off by more,
     in every window, and all of it is taken back at once.
     """
@@ -101,7 +133,8 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     mute = dropped(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
     voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf], dim=-1)
     user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
-    slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, model, phase, generator))
+    kept = _kept(model).to("cpu")
+    slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, kept, phase, generator))
     lips = torch.tensor([name.startswith(SPOKEN) for name in model.settings.channels], device=device)
     spoken = dyad.voiced[..., :1] & lips
     missed = torch.rand(b, 1, 1, generator=generator) * phase.speaking_noise
@@ -116,7 +149,7 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
         agent_motion=dyad.agent_motion + slow + fast * model.step_std + torch.where(spoken, missed, 0.0),
         voiced=voiced,
     )
-    carried = (1 - RETURN) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
+    carried = kept.to(device) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
     return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
 
 
@@ -136,26 +169,34 @@ def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, gener
     return off
 
 
-def _wander(
-    b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+def _kept(model: ArigModel) -> Tensor:
+    """(C,) share of the slow part of the noise that is there a frame later."""
+    kept = torch.full((model.channels,), 1 - RETURN)
+    if model.settings.draws != "innovation":
+        return kept
+    head = torch.tensor([group_of(name) == "head" for name in model.settings.channels])
+    return torch.where(head, model.rho.cpu(), kept)
+
+
+def _wander(b: int, n: int, kept: Tensor, phase: config.ArigPhase, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of steps.
 
-    The slow part jumps once a second or so, and goes back by a tenth a frame.
+    The slow part jumps once a second or so, and of it `kept` (C,) is there a frame later.
     """
     size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
     size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
-    jumps = torch.randn(b, n, model.channels, generator=generator)
+    jumps = torch.randn(b, n, len(kept), generator=generator)
     jumps = jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS)
-    fast = torch.randn(b, n, model.channels, generator=generator)
-    frame = torch.arange(n, dtype=torch.float32)
-    left = torch.tril((1 - RETURN) ** (frame[:, None] - frame).clamp(min=0))  # of a jump, frames later
-    return size * torch.einsum("ts,bsc->btc", left, jumps), size * fast
+    fast = torch.randn(b, n, len(kept), generator=generator)
+    slow = jumps.clone()
+    for frame in range(1, n):
+        slow[:, frame] += kept * slow[:, frame - 1]
+    return size * slow, size * fast
 
 
-def previous_states(states: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """(B, N) what the model is told: unlabelled ones count as `waiting`, a share of them is drawn at random."""
+def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int = len(STATES)) -> Tensor:
+    """(B, N) what the model is told: unlabelled ones count as `waiting`, a share of them is drawn of `count` by lot."""
     known = torch.where(states < 0, FIRST, states)
-    drawn = torch.randint(len(STATES), states.shape, generator=generator).to(states.device)
+    drawn = torch.randint(count, states.shape, generator=generator).to(states.device)
     replaced = (torch.rand(states.shape, generator=generator) < share).to(states.device)
     return torch.where(replaced, drawn, known)

@@ -17,7 +17,7 @@ from sfms_robot.learning.arig.losses import Parts, Student, augment, loss_parts,
 from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.space import MotionSpace
 
 HELD_OUT_WINDOWS, HELD_OUT_BATCH = 24, 4
@@ -39,8 +39,10 @@ def train_arig(
     torch.manual_seed(settings.seed)
     student = Student(ArigModel(listener))
     space, width = MotionSpace.of(listener), student.model.sound_width
-    corpus = gather(open_scenes(data, "train"), phase.window_frames, space, width)
-    held_out = gather(open_scenes(data, "validation"), phase.window_frames, space, width)
+    corpus, held_out = (
+        gather(open_scenes(data, split), phase.window_frames, space, width, listener.events)
+        for split in ("train", "validation")
+    )
     fit_scales(student.model, corpus, listener.channels)
     job = arig_job(settings, student, corpus, held_out, run.device)
     outcome = fit(job, out, run)
@@ -71,8 +73,7 @@ def arig_job(
         chosen = draw(starts, weights_of(phase.stage(step), starts), phase.batch, generator)
         dyad = cut(corpus, chosen.to(device), phase.window_frames)
         told, truth = augment(dyad, student.model, phase, generator)
-        previous = previous_states(dyad.states, phase.state_noise, generator)
-        return loss_parts(student, told, dyad.states, truth, phase.draws, generator, previous).total(phase)
+        return _loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
 
     return Job(
         name="arig",
@@ -119,7 +120,14 @@ def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
         dyad = cut(corpus, some.to(corpus.frames.states.device), phase.window_frames)
-        previous = previous_states(dyad.states, phase.state_noise, generator)
-        found.append(loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase.draws, generator, previous))
+        found.append(_loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
     mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
     return Parts(**mean)
+
+
+def _loss_parts(
+    student: Student, told: Dyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: torch.Generator
+) -> Parts:
+    """`losses.loss_parts` as the phase says, previous states drawn."""
+    previous = previous_states(states, phase.state_noise, generator, len(student.model.settings.states))
+    return loss_parts(student, told, states, truth, phase.draws, generator, previous, phase.group_weights)

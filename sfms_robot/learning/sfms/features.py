@@ -11,16 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad, at_rate
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.learning import corpus as dyads
-from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales, windows
+from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales, windows, without_gaze
+from sfms_robot.learning.sfms.slow_motion import fit_sway, slow_part
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.model import SfmsModel, head_channels
 from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
+from sfms_robot.signals.control import control_track
 
 FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
 LEAST_SPEED = 0.05  # deviations a frame
@@ -31,10 +35,12 @@ class SfmsFrames:
     """N frames of dyads.
 
     Attributes:
-        motion: (N, C) listener, in the motion space of the model.
+        motion: (N, C) listener, in the motion space of the model; what the model draws of it.
         face: (N, C) speaker, likewise, 0 where unknown; face_known: (N,) bool.
         sound: (N, R, bins) half precision, features of the speaker's voice; heard: (N,) bool.
         phase: (N, F) where he is in a phrase.
+        control: (N, K) what is told of the listener's events; K = 0 without.
+        sway: (N, S) the listener's slow motion, where it is not in `motion`; S = 0 without.
     """
 
     motion: Tensor
@@ -43,34 +49,71 @@ class SfmsFrames:
     sound: Tensor
     heard: Tensor
     phase: Tensor
+    control: Tensor
+    sway: Tensor
 
 
 SfmsCorpus = Corpus[SfmsFrames]
 
 
 def gather(
-    listened: Sequence[Dyad], window: int, space: MotionSpace, frontend: AudioFrontend | None = None
+    listened: Sequence[Dyad],
+    window: int,
+    space: MotionSpace,
+    frontend: AudioFrontend | None = None,
+    settings: config.Sfms | None = None,
 ) -> SfmsCorpus:
     """`corpus.gather` in one motion space.
 
     `frontend` says what is taken from the sound; None: nothing, and nobody is heard, which is enough for a tokenizer.
+    `settings`: of a listener that may be told of events; None: one that is not.
     """
-    return dyads.gather({"listening": listened}, window, partial(frames_of, space=space, frontend=frontend))
+    one = partial(frames_of, space=space, frontend=frontend, settings=settings)
+    return dyads.gather({"listening": listened}, window, one)
 
 
-def frames_of(dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None) -> SfmsFrames:
-    """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one."""
+def frames_of(
+    dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None, settings: config.Sfms | None = None
+) -> SfmsFrames:
+    """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one, and for a listener
+    that is told of events where the dyad does not say them.
+    """
+    control = np.zeros((len(dyad.listener), 0), np.float32)
+    if settings is not None and settings.events:
+        control = _control(dyad)
+        dyad = without_gaze(dyad)
     face = in_space(dyad, dyad.speaker, space)
     known = face.isfinite().all(-1)
     sound, phase = _audio_features(dyad, frontend)
+    motion = in_space(dyad, dyad.listener, space)
+    sway = torch.zeros(len(motion), 0)
+    if settings is not None and settings.sway:
+        head = head_channels(settings.channels)
+        slow = torch.from_numpy(slow_part(motion[:, head].numpy(), dyad.events or ()))
+        sway = slow - torch.tensor(space.neutral, dtype=torch.float32)[head]
+        motion = motion.clone()
+        motion[:, head] -= sway
     return SfmsFrames(
-        motion=in_space(dyad, dyad.listener, space),
+        motion=motion,
         face=torch.where(known[:, None], face, 0.0),
         face_known=known,
         sound=sound,
         heard=torch.full((len(sound),), bool(sound.any())),
         phase=phase,
+        control=torch.from_numpy(control),
+        sway=sway,
     )
+
+
+def _control(dyad: Dyad) -> Floats:
+    """(N, K). Raises ConfigError where the dyad does not say its events, or not at our rate."""
+    if dyad.events is None:
+        raise ConfigError(
+            f"dyad {dyad.name} does not say when its listener nods and smiles; a listener with events needs it"
+        )
+    if dyad.fps != FRAME_HZ:
+        raise ConfigError(f"dyad {dyad.name} has {dyad.fps:g} frames a second; a listener with events takes {FRAME_HZ}")
+    return control_track(dyad.events, 0, len(dyad.listener))
 
 
 def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
@@ -103,12 +146,16 @@ def _whole(audio: Floats) -> Floats:
 
 
 def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) -> None:
-    """Set the means, deviations and speeds of the model's motion."""
+    """Set the means, deviations and speeds of the model's motion, and its sway where that is apart."""
     mean, spread = motion_scales(corpus.frames.motion, channels)
     model.motion_mean.copy_(mean)
     model.motion_std.copy_(spread)
     steps = (corpus.steps(corpus.frames.motion) / model.motion_std).abs().sort(dim=0).values
     model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
+    if model.head:
+        amplitude, spread = fit_sway(torch.split(corpus.frames.sway, list(corpus.lengths)))
+        model.sway_amplitude.copy_(amplitude)
+        model.sway_spread.copy_(spread)
 
 
 def fit_sound_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
@@ -128,10 +175,12 @@ def context(
     past: int,
     future: int,
     louder: Tensor | None = None,
+    held: Tensor | None = None,
 ) -> Context:
     """What the predictor sees at the seam of each window; `tokens` (N, G), those of the future undecided.
 
     `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms.
+    `held` (N, G): what stands at a window's first frame, where the last keyframe is held on to (`tokens.held_tokens`).
     """
     frames = corpus.frames
     index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it
@@ -142,6 +191,8 @@ def context(
         sound = sound + louder.view(-1, 1, 1, 1)
     sound = torch.where(heard[..., None, None], model.standardise_sound(sound), 0.0)
     own = windows(tokens, starts, past)
+    if held is not None:
+        own[:, 0] = held[starts]
     undecided = own.new_full((len(own), future, own.shape[2]), UNDECIDED)
     return Context(
         face=model.standardise(windows(frames.face, starts, past)),
@@ -150,4 +201,5 @@ def context(
         heard=heard[:, 1:],
         phase=windows(frames.phase, starts, past),
         tokens=torch.cat([own, undecided], dim=1),
+        control=windows(frames.control, starts, past + future),
     )

@@ -71,6 +71,17 @@ def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn:
 
         return look_up
 
+    if tokenizer.strategy == "penalised":  # a window is a piece of its dyad, and begins where the last keyframe is held
+        whole = place_all(tokenizer, motion, lengths)
+
+        def pieces(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+            first = starts[torch.randint(len(starts), (size,), generator=generator)]
+            mask = windows(whole, first, tokenizer.window)
+            mask[:, 0] = 1.0
+            return windows(motion, first, tokenizer.window), mask
+
+        return pieces
+
     # A tokenizer that places exactly at run time sees half its masks from long stretches, as the predictor will.
     stretched = tokenizer.strategy == "exact"
     long_masks = place_all(tokenizer, motion, lengths) if stretched else None

@@ -21,7 +21,7 @@ from sfms_robot.learning.sfms.features import SfmsCorpus, context, fit_sound_sca
 from sfms_robot.learning.sfms.losses import next_tokens
 from sfms_robot.learning.sfms.soft_dtw import keyframe_dtw
 from sfms_robot.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
-from sfms_robot.learning.sfms.tokens import tokenise
+from sfms_robot.learning.sfms.tokens import held_tokens, tokenise
 from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
@@ -30,6 +30,7 @@ from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
 from sfms_robot.listeners.sfms.stream import neutral_tokens
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.mel import LN_PER_DB
 
 HELD_OUT_BATCHES, HELD_OUT_BATCH = 20, 64
@@ -54,8 +55,7 @@ def train_listener(
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
     frontend = AudioFrontend.of(listener)
-    corpus = gather(dyads, listener.window_frames, space, frontend)
-    held_out = gather(unseen, listener.window_frames, space, frontend)
+    corpus, held_out = (gather(some, listener.window_frames, space, frontend, listener) for some in (dyads, unseen))
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
@@ -75,22 +75,29 @@ def listener_job(
     """Phase 2 as the loop takes it, on a model whose tokenizer is trained; moves the model to `device`."""
     phase, listener = settings.predictor, settings.listener
     starts = corpus.starts(listener.window_frames)
+    eventful = starts_with_events(corpus, starts, listener) if phase.event_windows else starts
     fingerprint = corpus.fingerprint()
     neutral = neutral_tokens(model, MotionSpace.of(listener), listener.past_frames).to(device)
     tokenizer_digest = digest_of(model.tokenizer)
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
+    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
 
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
 
     def loss_of(step: int, generator: torch.Generator) -> Tensor:
         chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
+        if phase.event_windows and len(eventful):
+            busy = torch.rand(phase.batch, generator=generator) < phase.event_windows
+            chosen = torch.where(
+                busy, eventful[torch.randint(len(eventful), (phase.batch,), generator=generator)], chosen
+            )
         gain = None
         if listener.audio == "mel":  # microphones differ
             gain = (torch.rand(phase.batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
             gain = gain.to(device)
-        seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain)
+        seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
         seen = augment(seen, levels, neutral, phase, generator)
         target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
         return _loss(model, seen, target, settings, generator)
@@ -112,6 +119,13 @@ def listener_job(
             "tokenizer weights": tokenizer_digest,
         },
     )
+
+
+def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
+    """Those of the `starts` in whose future something other than a blink is under way."""
+    active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
+    busy = (corpus.frames.control[:, active] > 0).any(-1)
+    return starts[windows(busy, starts + listener.past_frames, listener.future_frames).any(1)]
 
 
 def corrected(settings: config.Training) -> config.Sfms:
@@ -171,7 +185,9 @@ def augment(
     shifted = neutral[(frame - cut) % p]  # (B, P, G): its end at the cut
     past = torch.where(before[..., None], shifted, past)
     tokens = torch.cat([past, seen.tokens[:, p:]], dim=1)
-    return replace(seen, heard=heard & ~before, face_known=known & ~before, tokens=tokens)
+    nothing_yet = torch.cat([before, before.new_zeros(b, tokens.shape[1] - p)], dim=1)
+    control = seen.control.masked_fill(nothing_yet[..., None], 0.0)
+    return replace(seen, heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
 
 
 def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator | None = None) -> Tensor:
@@ -212,9 +228,10 @@ def some_windows(
     """Batches of contexts and the tokens (B, H, G) that came next."""
     starts = corpus.starts(listener.window_frames)
     past, future = listener.past_frames, listener.future_frames
+    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
     for _ in range(HELD_OUT_BATCHES):
         chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
-        yield context(model, corpus, tokens, chosen, past, future), windows(tokens, chosen + past, future)
+        yield context(model, corpus, tokens, chosen, past, future, held=held), windows(tokens, chosen + past, future)
 
 
 @torch.no_grad()

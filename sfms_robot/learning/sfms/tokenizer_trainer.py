@@ -20,7 +20,7 @@ from sfms_robot.learning.job import Job, Run
 from sfms_robot.learning.sfms.features import SfmsCorpus, fit_scales, gather
 from sfms_robot.learning.sfms.imitation import imitation, lively
 from sfms_robot.learning.sfms.losses import masking, reconstruction
-from sfms_robot.learning.sfms.masks import batches
+from sfms_robot.learning.sfms.masks import batches, teacher
 from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -57,8 +57,8 @@ def train_tokenizer(
             "%s has %g frames a second and is learned as it is; streamed, a listener shows %d a second",
             data, dyads.fps, FRAME_HZ,
         )  # fmt: skip
-    corpus = gather(dyads, listener.window_frames, space)
-    held_out = gather(open_for(space.name, data, "validation", order), listener.window_frames, space)
+    unseen = open_for(space.name, data, "validation", order)
+    corpus, held_out = (gather(some, listener.window_frames, space, None, listener) for some in (dyads, unseen))
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     fit_scales(model, corpus, listener.channels)
@@ -198,12 +198,12 @@ def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
 
 
 def _held_out(model: SfmsModel, corpus: SfmsCorpus) -> Callable[[], float]:
-    """Error to watch: with the masks that training uses, placed once, since conditional scores take their time."""
+    """Error to watch: with the masks that training uses, placed once where that takes its time."""
     tokenizer = model.tokenizer
-    if not isinstance(tokenizer.score, ConditionalScore):
+    if not isinstance(tokenizer.score, ConditionalScore) and tokenizer.strategy != "penalised":
         return lambda: reconstruction_error(model, corpus)
     seen = held_out_windows(model, corpus)
-    mask = tokenizer.place(seen, strategy="exact")
+    mask = tokenizer.place(seen, strategy=teacher(tokenizer.strategy))
     return lambda: float(window_errors(tokenizer, seen, mask).mean())
 
 

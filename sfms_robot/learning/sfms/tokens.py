@@ -9,16 +9,22 @@ from torch import Tensor
 
 from sfms_robot.learning.sfms.features import SfmsCorpus
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
+from sfms_robot.listeners.sfms.predictor import last_keyframes
 
 STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
 
 
 @torch.no_grad()
 def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
-    """Keyframe masks (N, G) of all dyads, placed stretch by stretch so that busy seconds may borrow from quiet ones."""
+    """Keyframe masks (N, G) of all dyads: each dyad as a whole where a keyframe has its cost, else stretch by stretch,
+    so that busy seconds may borrow from quiet ones of the same stretch.
+    """
     size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
     masks = []
     for dyad in torch.split(motion, list(lengths)):
+        if tokenizer.strategy == "penalised":
+            masks.append(tokenizer.place(dyad[None])[0])
+            continue
         for stretch in torch.split(dyad, _stretches(len(dyad), size, tokenizer.window)):
             masks.append(tokenizer.place(stretch[None])[0])
     return torch.cat(masks)
@@ -42,3 +48,8 @@ def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     mask = place_all(model.tokenizer, motion, corpus.lengths)
     parts = zip(torch.split(motion, 4096), torch.split(mask, 4096), strict=True)
     return torch.cat([model.tokenizer.encode(m[None], k[None])[0] for m, k in parts])
+
+
+def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:
+    """Of tokens (N, G) of dyads of those lengths: the last keyframe at or before each frame of its dyad, 0 for none."""
+    return torch.cat([last_keyframes(one[None]).tokens[0, ..., 0] for one in torch.split(tokens, list(lengths))])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.listeners.arig.parts import Linear
+from sfms_robot.listeners.arig.parts import Linear, weighted_mean
 from sfms_robot.listeners.sfms.quantizer import as_levels, codes_to_indices, indices_to_codes, quantize
 
 
@@ -21,23 +21,25 @@ class CodeHead(nn.Module):
 
     levels: Tensor
 
-    def __init__(self, channels: int, width: int, levels: tuple[int, ...]) -> None:
+    def __init__(self, channels: int, width: int, condition: int, levels: tuple[int, ...]) -> None:
         super().__init__()
         self.register_buffer("levels", as_levels([levels]), persistent=False)
         self.encode = nn.Sequential(Linear(channels, width), nn.GELU(), Linear(width, len(levels)))
         self.decode = nn.Sequential(Linear(len(levels), width), nn.GELU(), Linear(width, channels))
-        self.classify = Linear(width, math.prod(levels))
+        self.classify = Linear(condition, math.prod(levels))
 
-    def loss(self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """z (N, D), standardised motion (N, C) -> cross-entropy of its code plus squared error of the code, (N,)."""
+    def loss(
+        self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
+    ) -> Tensor:
+        """z (N, D), motion (N, C), weights (C,) -> cross-entropy of its code plus squared error of the code, (N,)."""
         code = quantize(self.encode(motion)[:, None], self.levels)  # (N, 1, dims)
-        rebuilt: Tensor = (self.decode(code[:, 0]) - motion).square().mean(-1)
+        rebuilt = weighted_mean((self.decode(code[:, 0]) - motion).square(), weights)
         index = codes_to_indices(code.detach(), self.levels)[:, 0]
         wrong: Tensor = F.cross_entropy(self.classify(z), index, reduction="none")
         return rebuilt + wrong
 
     def sample(self, z: Tensor, noise: Tensor) -> Tensor:
-        """Conditions (N, D), noise (N, 1, 1) standard normal -> motion (N, C) of a code drawn by the softmax."""
+        """Conditions z (N, D), noise (N, 1, 1) standard normal -> motion (N, C) of a code drawn by the softmax."""
         share = torch.special.ndtr(noise[:, 0].double())  # standard normal -> uniform
         mass = torch.softmax(self.classify(z).double(), dim=-1).cumsum(-1)
         index = (mass <= share * mass[:, -1:]).sum(-1, keepdim=True).clamp(max=mass.shape[-1] - 1)

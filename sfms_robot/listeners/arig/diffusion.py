@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.arig.parts import Linear, Modulation, modulated
+from sfms_robot.listeners.arig.parts import Linear, Modulation, modulated, weighted_mean
 from sfms_robot.listeners.layers import sinusoidal
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
@@ -83,16 +83,20 @@ class Denoiser(nn.Module):
         layers = [self.enter, *blocks, self.leave]
         return [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
 
-    def loss(self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Equation (3) for z (N, D) and standardised motion (N, C): squared error of the noise, per sample (N,)."""
+    def loss(
+        self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
+    ) -> Tensor:
+        """Equation (3) for z (N, D) and standardised motion (N, C): squared error of the noise, per sample (N,).
+
+        `weights` (C,) of the channels, which add up to 1, are ours: by number most channels are of the mouth.
+        """
         n = len(motion)
         t = torch.randint(0, self.settings.train_steps, (n,), generator=generator).to(motion.device)
         noise = torch.randn(motion.shape, generator=generator).to(motion.device)
         alpha_bar = self.alpha_bar[t][:, None]
         noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise
         found = self(noisy, self.modulate(z, self.level(t)))
-        wrong: Tensor = (noise - found).square().mean(-1)
-        return wrong
+        return weighted_mean((noise - found).square(), weights)
 
     def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
         """Motion (N, C), standardised, of conditions (N, D).

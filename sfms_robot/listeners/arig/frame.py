@@ -3,7 +3,8 @@
 Offline the same parts run over all frames at once (`model.condition`, `model.generate`); that both agree is a law of
 the tests. As functions of tensors alone they can become graphs (`graphs`).
 
-A features of sound, C channels, D width, c frames of a chunk, S whole chunks in view.
+N streams of one speaker, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of
+a chunk, S whole chunks in view.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ class Frame(Part):
         sound_keys: Tensor,
         motion: Tensor,
         motion_keys: Tensor,
+        sample: Tensor,
+        rows: Tensor,
     ) -> tuple[Tensor, ...]:
         """One frame.
 
@@ -48,27 +51,32 @@ class Frame(Part):
             voiced: (1, 2) bool, speech of agent, user.
             face: (1, C) standardised motion of the user; seen: (1,) bool.
             first: () bool, of the stream: chunks begin as its behaviour repeated (A.2).
-            state: (1,) conversational state of the frame before.
+            state: (N,) conversational state of the frame before.
             rotary, past: place and keys of `LongRange.step`.
-            agent_sound, ...: of `stream.Memory`.
+            agent_sound, ...: of `stream.Memory`, of N streams.
+            rows: (N, 2K) control of the frame before and of the frame to be made; anything without events.
 
         Returns:
-            z (1, D), logits of the state (1, 7), empty without states, keys and values of the chunk in progress, and
-            the next agent_sound, agent_behaviour, user_behaviour and sound_keys.
+            z (N, D) and what the sampler is told beside it, logits of the state (N, 7 or 9), empty without states, keys
+            and values of the chunk in progress, and the next agent_sound, agent_behaviour, user_behaviour and
+            sound_keys.
         """
-        model = self.model
+        model, n = self.model, motion.shape[0]
         absent = torch.stack([model.no_user_sound, model.no_agent_sound])
         embedded = model.embed_sound(sounds, heard, absent)
-        user_sound, now = embedded[:1], embedded[1:].clone()  # memory holds no more than it needs
+        # Streams hear the same; memory holds no more than it needs.
+        user_sound, now = embedded[:1].expand(n, -1), embedded[1:].repeat(n, 1)
+        face, voiced = model.embed_face(face, seen).expand(n, -1), voiced.expand(n, -1)
         agent_behaviour = _after(agent_behaviour, model.merge_agent(agent_sound, motion), first)
-        user_behaviour = _after(user_behaviour, model.merge_user(user_sound, model.embed_face(face, seen)), first)
+        user_behaviour = _after(user_behaviour, model.merge_user(user_sound, face), first)
         sound_keys = push(sound_keys, model.progress.coarse.keys(now))
         summary = model.short(agent_behaviour, user_behaviour, now, user_sound)
         cis, made = model.long.step(summary, past, rotary)
         feature, logits = None, cis[:, :0]
         if model.states is not None:
             feature, logits = model.states(model.states.condition(cis, voiced), state)
-        z = model.progress(motion, sound_keys, motion_keys, now, cis, feature)
+        events = model.embed_events(rows)
+        z = model.beside(model.progress(motion, sound_keys, motion_keys, now, cis, feature, events), events, sample)
         return z, logits, made, now, agent_behaviour, user_behaviour, sound_keys
 
 
@@ -89,18 +97,19 @@ class Draw(Part):
         """One frame.
 
         Args:
-            z: (1, D); noise: (1, *model.noise_shape).
-            standard: (1, C) standardised motion of the frame before; motion_keys: of `stream.Memory`.
+            z: of `Frame`; noise: (N, *model.noise_shape).
+            standard: (N, C) standardised motion of the frame before; motion_keys: of `stream.Memory`.
 
         Returns:
-            Motion (1, C) in plain units, the same standardised (1, C) and embedded (1, D), and the next motion_keys.
+            Motion (N, C) in plain units, the same standardised (N, C), as what the sampler drew (N, C), and embedded
+            (N, D), and the next motion_keys.
         """
         model, head = self.model, self.model.head
         sample = head.sample(z, noise, self.levels) if isinstance(head, Denoiser) else head.sample(z, noise)
-        standard = model.drawn(sample, standard)
-        motion = model.embed_motion(standard)
+        made = model.drawn(sample, standard)
+        motion = model.embed_motion(made)
         keys = push(motion_keys, model.progress.temporal.keys(motion))
-        return model.restore(standard), standard, motion, keys
+        return model.restore(made), made, model.target(made, standard), motion, keys
 
 
 def repeated(x: Tensor, count: int) -> Tensor:
@@ -109,10 +118,10 @@ def repeated(x: Tensor, count: int) -> Tensor:
 
 
 def push(queue: Tensor, new: Tensor) -> Tensor:
-    """(1, S, D) without its oldest row and with `new` (1, D) as its newest."""
+    """(N, S, D) without its oldest row and with `new` (N, D) as its newest."""
     return torch.cat([queue[:, 1:], new[:, None]], dim=1)
 
 
 def _after(queue: Tensor, new: Tensor, first: Tensor) -> Tensor:
-    """(1, S, D) with `new` (1, D) as its newest, or all of it new."""
+    """(N, S, D) with `new` (N, D) as its newest, or all of it new."""
     return torch.where(first, new[:, None], push(queue, new))

@@ -225,23 +225,23 @@ class LongRange(nn.Module):
         return out
 
     def step(self, summary: Tensor, past: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor]:
-        """One frame of one stream.
+        """One frame of N streams.
 
         Args:
-            summary: (1, D) of the chunk in progress.
-            past: (L, 2, 1, h, S, D/h) keys and values of the S whole chunks in view, oldest first.
+            summary: (N, D) of the chunk in progress.
+            past: (L, 2, N, h, S, D/h) keys and values of the S whole chunks in view, oldest first.
             rotary: (2, 1, D/h) of this chunk.
 
         Returns:
-            cis-token (1, D), and keys and values (L, 2, 1, h, 1, D/h) of this summary, should it be the last of its
+            cis-token (N, D), and keys and values (L, 2, N, h, 1, D/h) of this summary, should it be the last of its
             chunk.
         """
-        x, made = summary[None], []
+        x, made = summary[:, None], []
         for layer, cached in zip(self._layers(), past, strict=True):
             own = layer.project(x, rotary)
             x = layer(x, own, cached, None)
             made.append(torch.stack(own[1:]))
-        return self.norm(x)[0], torch.stack(made)
+        return self.norm(x)[:, 0], torch.stack(made)
 
 
 def _rotated(x: Tensor, rotary: Tensor) -> Tensor:

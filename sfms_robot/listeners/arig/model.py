@@ -14,7 +14,15 @@ draws. Where that is steps (`draws: step`, ours), `step_std` and the range `moti
 to join them; `target` is what the sampler learns and `drawn` its inverse. Everything that goes in and out here is in
 plain units: motion of the listener's motion space, sound features of `sound.track`.
 
-B batch, N frames, C channels of the motion space, A sound features, D width.
+Beyond the paper, too:
+ - `draws: innovation`: x_t = rho x_(t-1) + step_std * drawn, standardised, with the lag-1 autocorrelation `rho` < 1 of
+   the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near its mean as in the data
+   however long a stream runs: its place is that of a first-order autoregression, not a sum of steps. What was drawn
+   last is told to the sampler beside z: how fast the face moves is too fine for the few numbers of z.
+ - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
+   and told to the sampler beside z. Where the eyes look is not drawn: they rest.
+
+B batch, N frames, C channels of the motion space, A sound features, D width, K numbers of a control row.
 """
 
 from __future__ import annotations
@@ -33,6 +41,10 @@ from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
 from sfms_robot.listeners.arig.parts import Linear, windows
 from sfms_robot.listeners.arig.pmp import Progressive
+from sfms_robot.signals.control import COLUMNS
+
+CONTROL_ROWS = 2  # that are told: of the frame before and of the frame
+LARGEST_TOLD = 8.0  # of the last sample, in deviations
 
 
 @dataclass(frozen=True)
@@ -46,6 +58,7 @@ class Dyad:
         user_seen: (B, N) bool.
         agent_motion: (B, N, C).
         voiced: (B, N, 2) bool: speech of agent, user.
+        control: (B, N, K) of the agent's events; any for a model without.
     """
 
     user_sound: Tensor
@@ -56,8 +69,9 @@ class Dyad:
     user_seen: Tensor
     agent_motion: Tensor
     voiced: Tensor
+    control: Tensor | None = None
 
-    def check(self, sound: int, channels: int) -> None:
+    def check(self, sound: int, channels: int, events: bool = False) -> None:
         """Raise ValueError, naming the array, when one has another shape or there are fewer than two frames."""
         b, n = self.agent_motion.shape[:2]
         wanted = {
@@ -68,6 +82,9 @@ class Dyad:
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"{name} is {found}, not {shape}")
+        rows = None if self.control is None else tuple(self.control.shape)
+        if events and rows != (b, n, len(COLUMNS)):
+            raise ValueError(f"control is {rows}, not {(b, n, len(COLUMNS))}")
         if n < 2:
             raise ValueError(f"a dyad needs two frames or more, got {n}")
 
@@ -77,8 +94,8 @@ class Condition:
     """What the sampler is told of frames 1..N-1.
 
     Attributes:
-        z: (B, N-1, D).
-        states: the states' logits (B, N-1, 7) or None.
+        z: (B, N-1, D), and beside it what the sampler is told besides.
+        states: the states' logits (B, N-1, S) or None.
         outline: (B, N-1, D) coarse motion.
     """
 
@@ -103,6 +120,8 @@ class ArigModel(nn.Module):
     motion_low: Tensor
     motion_high: Tensor
     step_std: Tensor
+    rho: Tensor
+    is_drawn: Tensor
     sound_mean: Tensor
     sound_std: Tensor
 
@@ -116,6 +135,10 @@ class ArigModel(nn.Module):
         self.register_buffer("motion_low", torch.full((self.channels,), -8.0))
         self.register_buffer("motion_high", torch.full((self.channels,), 8.0))
         self.register_buffer("step_std", torch.ones(self.channels))
+        if settings.draws == "innovation":
+            self.register_buffer("rho", torch.zeros(self.channels))
+        is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
+        self.register_buffer("is_drawn", is_drawn, persistent=False)
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
         self.register_buffer("sound_std", torch.ones(self.sound_width))
         self.sound_in = nn.Sequential(Linear(self.sound_width, d), nn.GELU(), Linear(d, d))
@@ -129,14 +152,17 @@ class ArigModel(nn.Module):
         linear = settings.interaction == "linear"
         self.short = ShortRange(d, hidden, heads, settings.chunk_frames, depths, linear)
         self.long = LongRange(d, hidden, heads, settings.context_layers, settings.chunk_frames, settings.context_chunks)
-        self.states = StateUnderstanding(d, hidden, heads) if settings.state_guidance else None
-        self.progress = Progressive(
-            d, hidden, heads, settings.sound_frames, settings.motion_frames, settings.state_guidance
+        guided, events = settings.state_guidance, settings.events
+        self.states = StateUnderstanding(d, hidden, heads, events) if guided else None
+        self.progress = Progressive(d, hidden, heads, settings.sound_frames, settings.motion_frames, guided, events)
+        self.events_in = (
+            nn.Sequential(Linear(CONTROL_ROWS * len(COLUMNS), d), nn.GELU(), Linear(d, d)) if events else None
         )
+        condition = d + d * events + self.channels * (settings.draws == "innovation")
         self.head: Denoiser | CodeHead = (
-            CodeHead(self.channels, d, settings.code_levels)
+            CodeHead(self.channels, d, condition, settings.code_levels)
             if settings.discrete
-            else Denoiser(settings.channels, d, settings.diffusion)
+            else Denoiser(settings.channels, condition, settings.diffusion)
         )
 
     @property
@@ -154,13 +180,33 @@ class ArigModel(nn.Module):
 
     def target(self, motion: Tensor, last: Tensor) -> Tensor:
         """What the sampler is to draw: motion (..., C) after `last` (..., C), both standardised -> (..., C)."""
-        return motion if self.settings.draws == "motion" else (motion - last) / self.step_std
+        return motion if self.settings.draws == "motion" else (motion - self.expected(last)) / self.step_std
 
     def drawn(self, sample: Tensor, last: Tensor) -> Tensor:
-        """The inverse of `target`; a step never leads out of the range of the motion."""
+        """The inverse of `target`; a step never leads out of the range of the motion, and what is not drawn rests."""
         if self.settings.draws == "motion":
-            return sample
-        return torch.addcmul(last, sample, self.step_std).clamp(self.motion_low, self.motion_high)
+            return self._at_rest(sample)
+        made = torch.addcmul(self.expected(last), sample, self.step_std).clamp(self.motion_low, self.motion_high)
+        return self._at_rest(made)
+
+    def _at_rest(self, motion: Tensor) -> Tensor:
+        """Standardised motion (..., C) with what is not drawn at its mean, which is 0."""
+        return motion.where(self.is_drawn, 0.0) if self.settings.events else motion
+
+    def expected(self, last: Tensor) -> Tensor:
+        """Where a step after `last` (..., C), standardised, begins: there, or a little on its way back to the mean."""
+        return self.rho * last if self.settings.draws == "innovation" else last
+
+    def beside(self, z: Tensor, events: Tensor | None, sample: Tensor) -> Tensor:
+        """z (..., D) and what the sampler is told besides: embedded events (..., D), its last sample (..., C)."""
+        told = [z] if events is None else [z, events]
+        if self.settings.draws == "innovation":
+            told.append(sample.clamp(-LARGEST_TOLD, LARGEST_TOLD))
+        return torch.cat(told, dim=-1) if len(told) > 1 else z
+
+    def embed_events(self, rows: Tensor) -> Tensor | None:
+        """Control rows of the frame before and the frame (..., 2K) -> (..., D), or None without events."""
+        return None if self.events_in is None else self.events_in(rows)
 
     def embed_sound(self, sound: Tensor, heard: Tensor, absent: Tensor) -> Tensor:
         """Features (..., A), heard (...) bool, embedding (D,) or (..., D) of what is not heard -> (..., D)."""
@@ -183,10 +229,11 @@ class ArigModel(nn.Module):
         `states` (B, N): the state of every frame, of which each frame is told the one before. Without, each frame goes
         on from the model's own answer, as a stream does. Raises ValueError for shapes that do not fit.
         """
-        dyad.check(self.sound_width, self.channels)
+        dyad.check(self.sound_width, self.channels, self.settings.events)
         user = self.embed_sound(dyad.user_sound, dyad.user_heard, self.no_user_sound)[:, :-1]
         agent = self.embed_sound(dyad.agent_sound, dyad.agent_heard, self.no_agent_sound)
-        motion = self.embed_motion(self.standardise(dyad.agent_motion))[:, :-1]
+        standard = self.standardise(dyad.agent_motion)[:, :-1]
+        motion = self.embed_motion(standard)
         face = self.embed_face(self.standardise(dyad.user_motion), dyad.user_seen)[:, :-1]
         b, t, d = motion.shape  # frame t of what follows is made from frames 0..t and makes frame t + 1
         c = self.settings.chunk_frames
@@ -200,6 +247,7 @@ class ArigModel(nn.Module):
         cis = self.long(summaries.view(b, t, d)).reshape(b * t, d)
         voiced = torch.stack([dyad.voiced[:, 1:, 0], dyad.voiced[:, :-1, 1]], dim=-1)
         feature, logits = self._states(cis, voiced, states)
+        events = self._events(dyad)
         outline = self.progress.coarse(
             motion.reshape(b * t, d),
             windows(self.progress.coarse.keys(agent), self.settings.sound_frames)[:, 1:].flatten(0, 1),
@@ -210,11 +258,19 @@ class ArigModel(nn.Module):
             now,
             cis,
             feature,
+            None if events is None else events.flatten(0, 1),
         )
-        return Condition(z.view(b, t, d), logits, outline.view(b, t, d))
+        sample = torch.cat([torch.zeros_like(standard[:, :1]), self.target(standard[:, 1:], standard[:, :-1])], dim=1)
+        return Condition(self.beside(z.view(b, t, d), events, sample), logits, outline.view(b, t, d))
+
+    def _events(self, dyad: Dyad) -> Tensor | None:
+        """(B, N - 1, D) embedded, or None without events."""
+        if dyad.control is None or not self.settings.events:
+            return None
+        return self.embed_events(torch.cat([dyad.control[:, :-1], dyad.control[:, 1:]], dim=-1))
 
     def _states(self, cis: Tensor, voiced: Tensor, states: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """cis (B * T, D), voiced (B, T, 2) -> features (B * T, D), logits (B, T, 7)."""
+        """cis (B * T, D), voiced (B, T, 2) -> features (B * T, D), logits (B, T, S)."""
         if self.states is None:
             return None, None
         b, t = voiced.shape[:2]
@@ -242,9 +298,9 @@ class ArigModel(nn.Module):
         wrong = F.cross_entropy(found.states.transpose(1, 2), states[:, 1:], ignore_index=-1, reduction="none")
         return Losses(motion, wrong)
 
-    def generate(self, dyad: Dyad, noise: Tensor) -> Tensor:
-        """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape)."""
-        z = self.condition(dyad).z
+    def generate(self, dyad: Dyad, noise: Tensor, states: Tensor | None = None) -> Tensor:
+        """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape); states: above."""
+        z = self.condition(dyad, states).z
         made = self.head.sample(z.flatten(0, 1), noise.flatten(0, 1))
         last = self.standardise(dyad.agent_motion[:, :-1])
         return self.restore(self.drawn(made.view(*z.shape[:2], -1), last))

@@ -94,6 +94,11 @@ def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
 
 
+def weighted_mean(x: Tensor, weights: Tensor | None) -> Tensor:
+    """x (..., C) -> (...), each channel by its weight (C,), which add up to 1; None: all alike."""
+    return x.mean(-1) if weights is None else (x * weights).sum(-1)
+
+
 def windows(x: Tensor, size: int) -> Tensor:
     """x (B, T, D) -> (B, T, size, D): each frame and those before it; the first one repeated before the start (A.2)."""
     padded = torch.cat([x[:, :1].expand(-1, size - 1, -1), x], dim=1)

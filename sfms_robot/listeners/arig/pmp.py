@@ -12,12 +12,17 @@ from sfms_robot.listeners.arig.parts import CrossAttention, LayerNorm, Part
 
 
 class Progressive(Part):
-    """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions."""
+    """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions.
 
-    def __init__(self, width: int, hidden: int, heads: int, sounds: int, motions: int, states: bool) -> None:
+    What happens (`events`, beyond the paper) is one token more of the second.
+    """
+
+    def __init__(
+        self, width: int, hidden: int, heads: int, sounds: int, motions: int, states: bool, events: bool = False
+    ) -> None:
         super().__init__()
         self.coarse = CrossAttention(width, hidden, heads, sounds)
-        self.fine = CrossAttention(width, hidden, heads, 2 + states)
+        self.fine = CrossAttention(width, hidden, heads, 2 + states + events)
         self.temporal = CrossAttention(width, hidden, heads, motions)
         self.norm = LayerNorm(width)
 
@@ -29,15 +34,24 @@ class Progressive(Part):
         sound: Tensor,
         cis: Tensor,
         state: Tensor | None,
+        events: Tensor | None = None,
     ) -> Tensor:
         """`coarse` motion, then `refine`: everything of the frame to be made, N of them.
 
         `last` (N, D) is the embedded motion of the frame before: the query of the coarse motion. `sound_keys`
         (N, 3, 2D) are `coarse.keys` of the agent's sounds, the newest that of the frame itself. The rest: `refine`.
         """
-        return self.refine(self.coarse(last, sound_keys), motion_keys, sound, cis, state)
+        return self.refine(self.coarse(last, sound_keys), motion_keys, sound, cis, state, events)
 
-    def refine(self, outline: Tensor, motion_keys: Tensor, sound: Tensor, cis: Tensor, state: Tensor | None) -> Tensor:
+    def refine(
+        self,
+        outline: Tensor,
+        motion_keys: Tensor,
+        sound: Tensor,
+        cis: Tensor,
+        state: Tensor | None,
+        events: Tensor | None = None,
+    ) -> Tensor:
         """Fine motion.
 
         Args:
@@ -46,11 +60,12 @@ class Progressive(Part):
             sound: (N, D) embedded sound of the agent in the frame itself.
             cis: (N, D).
             state: (N, D) feature, or None without state guidance.
+            events: (N, D) embedded control rows, or None without events.
 
         Returns:
             z (N, D).
         """
-        tokens = [cis, sound] if state is None else [cis, state, sound]
+        tokens = [token for token in (cis, state, sound, events) if token is not None]
         x = self.fine(outline, self.fine.keys(torch.stack(tokens, dim=1)))
         out: Tensor = self.norm(self.temporal(x, motion_keys))
         return out

@@ -4,13 +4,16 @@ What has not changed is not computed again: behaviours of old frames, keys and v
 chunks are kept, as are the embeddings of the sampler's noise levels. Only the chunk in progress is read anew, since
 the newest sounds modulate all of it.
 
+A listener with events (`config.Listener.events`) takes two control rows a frame, of the frame heard and of the frame to
+be made. Its conversational state is drawn (`csu`); a stream of the paper's goes on from its most probable one.
+
 The robot's own voice belongs to the frame that is made, so `SpeakerFrame.agent_audio` is best given one frame early:
 its samples are those the robot says in the 40 ms after `time_s`. Given on time, lips follow one frame late.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,14 +23,15 @@ from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.arig import audio_frontend, fast
 from sfms_robot.listeners.arig.audio_frontend import AudioState
-from sfms_robot.listeners.arig.csu import FIRST
+from sfms_robot.listeners.arig.csu import FIRST, Sojourn, with_feedback
 from sfms_robot.listeners.arig.frame import Draw, Frame, repeated
-from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.model import CONTROL_ROWS, ArigModel
 from sfms_robot.listeners.graphs import graph
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.control import COLUMNS
 
 BEYOND = 1e3  # rad, m or of a blendshape: no face
 
@@ -43,8 +47,10 @@ class Memory:
         agent_behaviour, user_behaviour: (1, c, D) of the last c frames, the newest last.
         sound_keys: (1, 3, 2D) of the agent's last sounds; motion_keys: (1, 5, 2D) of its last motions.
         context: (L, 2, 1, h, w - 1, D/h) keys and values of whole chunks, the newest last.
-        motion: (1, D) embedded motion of the agent's last frame; standard: (1, C) the same, standardised.
-        state: conversational state of the last frame.
+        motion: (1, D) embedded motion of the agent's last frame; standard: (1, C) the same, standardised; sample:
+            (1, C) what the sampler drew for it.
+        state: conversational state of the last frame, of `settings.states`; sojourn: that which it is drawn from, of a
+            listener with events.
         random: state of the stream's own generator.
     """
 
@@ -59,7 +65,9 @@ class Memory:
     context: Tensor
     motion: Tensor
     standard: Tensor
+    sample: Tensor
     state: int
+    sojourn: Sojourn
     random: Tensor
 
 
@@ -73,8 +81,10 @@ class ArigListener:
         self.settings = settings
         self.model = fast.with_precision(model, settings.precision).eval()
         self.space = space or MotionSpace.of(settings)
-        self._frame: Callable[..., Any] = Frame(self.model)
-        self._draw: Callable[..., Any] = Draw(self.model)
+        self._frame = Frame(self.model)
+        self._draw = Draw(self.model)
+        self._frame_of_one: Callable[..., Any] = self._frame  # graphs, once they are built
+        self._draw_of_one: Callable[..., Any] = self._draw
 
     @property
     def hop(self) -> int:
@@ -84,15 +94,20 @@ class ArigListener:
     def horizon(self) -> int:
         return 1
 
+    @property
+    def control_frames(self) -> tuple[int, int]:
+        """Control rows that a step takes: up to the newest frame heard, and after it."""
+        return (1, CONTROL_ROWS - 1) if self.settings.events else (0, 0)
+
     @torch.inference_mode()
     def build_graphs(self) -> ArigListener:
-        """The weights stay as they are from now on: what a frame computes becomes graphs. Itself."""
+        """The weights stay as they are from now on: what a single stream computes of a frame becomes graphs. Itself."""
         memory = self.start(0)
-        told, _ = self._frame_inputs(SpeakerFrame(0.0, np.zeros(0, np.float32)), memory)
+        told, _ = self._frame_inputs(SpeakerFrame(0.0, np.zeros(0, np.float32)), [memory], self._rows(None, 1))
         z, *_ = self._frame(*told)
         noise = torch.zeros(1, *self.model.noise_shape)
-        self._frame = graph(Frame(self.model), told)
-        self._draw = graph(Draw(self.model), (z, noise, memory.standard, memory.motion_keys))
+        self._frame_of_one = graph(Frame(self.model), told)
+        self._draw_of_one = graph(Draw(self.model), (z, noise, memory.standard, memory.motion_keys))
         return self
 
     @torch.inference_mode()
@@ -114,47 +129,129 @@ class ArigListener:
             context=torch.zeros(settings.context_layers, 2, 1, heads, settings.context_chunks - 1, d // heads),
             motion=motion,
             standard=still,
+            sample=torch.zeros_like(still),
             state=FIRST,
+            sojourn=Sojourn(FIRST, 0),
             random=torch.Generator().manual_seed(seed).get_state(),
         )
 
-    @torch.inference_mode()
-    def step(self, speaker: SpeakerFrame, memory: Memory) -> tuple[Plan, Memory]:
+    def step(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Plan, Memory]:
         """Take one frame, plan the next. Never changes `memory` in place.
 
-        Raises ValueError when the frame holds another number of samples than 640 or none.
+        `control` (2, K): rows of `signals.control` of the frame heard and of the next; None: nothing happens. Raises
+        ValueError when the frame holds another number of samples than 640 or none, for control of another shape, and
+        for any where the listener has no events.
         """
-        z, now = self.condition(speaker, memory)
-        generator = torch.Generator()
-        generator.set_state(now.random)
-        noise = torch.randn(1, *self.model.noise_shape, generator=generator)
-        made, standard, motion, keys = self._draw(z, noise, now.standard, now.motion_keys)
-        after = replace(now, motion=motion, standard=standard, motion_keys=keys, random=generator.get_state())
-        frames, jaw_rad = self.space.decode(made.numpy())
-        return Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad), after
+        (plan,), (now,) = self.step_many(speaker, [memory], None if control is None else [control])
+        return plan, now
 
     @torch.inference_mode()
-    def condition(self, speaker: SpeakerFrame, memory: Memory) -> tuple[Tensor, Memory]:
-        """What the sampler is told of the next frame, z (1, D), and the memory but for the motion to be drawn."""
-        told, now = self._frame_inputs(speaker, memory)
-        z, logits, made, agent_sound, agent_behaviour, user_behaviour, sound_keys = self._frame(*told)
-        whole = now.frames % self.settings.chunk_frames == 0
-        after = replace(
-            now,
-            agent_sound=agent_sound,
-            agent_behaviour=agent_behaviour,
-            user_behaviour=user_behaviour,
-            sound_keys=sound_keys,
-            context=torch.cat([now.context[..., 1:, :], made], dim=-2) if whole else now.context,
-            state=int(logits.argmax()) if logits.numel() else now.state,
-        )
-        return z, after
+    def step_many(
+        self, speaker: SpeakerFrame, memories: Sequence[Memory], controls: Sequence[Floats] | None = None
+    ) -> tuple[list[Plan], list[Memory]]:
+        """`step` of streams that began together and heard the same speaker ever since, each with its own control.
 
-    def _frame_inputs(self, speaker: SpeakerFrame, memory: Memory) -> tuple[tuple[Tensor, ...], Memory]:
-        """What `Frame` takes, and memory with both tracks heard."""
-        user, heard, user_voice = audio_frontend.hear(speaker.audio, memory.user_voice)
+        Each draws from its own randomness, as it would alone, at a fraction of the time.
+        """
+        rows = self._rows(controls, len(memories))
+        z, logits, now = self._conditions(speaker, memories, rows)
+        generators = [torch.Generator().set_state(memory.random) for memory in now]
+        noise = torch.cat([torch.randn(1, *self.model.noise_shape, generator=each) for each in generators])
+        draw = self._draw_of_one if len(now) == 1 else self._draw
+        drawn = draw(z, noise, _joined([m.standard for m in now]), _joined([m.motion_keys for m in now]))
+        made, standard, sample, motion, keys = (part.split(1) for part in drawn)
+        sojourns, states = self._states(logits, now, rows, generators)
+        plans, after = [], []
+        for index, memory in enumerate(now):
+            frames, jaw_rad = self.space.decode(made[index].numpy())
+            plans.append(Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad))
+            after.append(
+                replace(
+                    memory,
+                    motion=motion[index],
+                    standard=standard[index],
+                    sample=sample[index],
+                    motion_keys=keys[index],
+                    state=states[index],
+                    sojourn=sojourns[index],
+                    random=generators[index].get_state(),
+                )
+            )
+        return plans, after
+
+    @torch.inference_mode()
+    def condition(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Tensor, Memory]:
+        """What the sampler is told of the next frame, (1, its width), and the memory but for what is to be drawn."""
+        rows = self._rows(None if control is None else [control], 1)
+        z, _, (now,) = self._conditions(speaker, [memory], rows)
+        return z, now
+
+    def _conditions(
+        self, speaker: SpeakerFrame, memories: Sequence[Memory], rows: Tensor
+    ) -> tuple[Tensor, Tensor, list[Memory]]:
+        """What the sampler is told (N, its width), logits of the states (N, S), and memories but for what is drawn."""
+        told, (user_voice, agent_voice) = self._frame_inputs(speaker, memories, rows)
+        found = (self._frame_of_one if len(memories) == 1 else self._frame)(*told)
+        z, logits, made, *rest = found
+        agent_sound, agent_behaviour, user_behaviour, sound_keys = (part.split(1) for part in rest)
+        frames = memories[0].frames + 1
+        whole = frames % self.settings.chunk_frames == 0
+        after = [
+            replace(
+                memory,
+                frames=frames,
+                user_voice=user_voice,
+                agent_voice=agent_voice,
+                agent_sound=agent_sound[index],
+                agent_behaviour=agent_behaviour[index],
+                user_behaviour=user_behaviour[index],
+                sound_keys=sound_keys[index],
+                context=torch.cat([memory.context[..., 1:, :], summary], dim=-2) if whole else memory.context,
+            )
+            for index, (memory, summary) in enumerate(zip(memories, made.split(1, dim=2), strict=True))
+        ]
+        return z, logits, after
+
+    def _states(
+        self, logits: Tensor, now: Sequence[Memory], rows: Tensor, generators: Sequence[torch.Generator]
+    ) -> tuple[list[Sojourn], list[int]]:
+        """States of the frame that is made: the most probable, or drawn where the model has events."""
+        before = [memory.sojourn for memory in now]
+        if self.model.states is None:
+            return before, [memory.state for memory in now]
+        if not self.settings.events:
+            return before, logits.argmax(-1).tolist()
+        voiced = (now[0].agent_voice.voiced, now[0].user_voice.voiced)
+        sojourns = [
+            self.model.states.draw(scores, voiced, last, torch.rand(2, generator=generator))
+            for scores, last, generator in zip(logits, before, generators, strict=True)
+        ]
+        drawn = torch.tensor([sojourn.state for sojourn in sojourns])
+        return sojourns, with_feedback(drawn, rows[:, -len(COLUMNS) :]).tolist()
+
+    def _rows(self, controls: Sequence[Floats] | None, streams: int) -> Tensor:
+        """(streams, 2K); of a listener without events (streams, 0)."""
+        if not self.settings.events:
+            if controls is not None:
+                raise ValueError("control is for a listener with events: true")
+            return torch.zeros(streams, 0)
+        if controls is None:
+            return torch.zeros(streams, CONTROL_ROWS * len(COLUMNS))
+        rows = np.stack([np.asarray(control, np.float32) for control in controls])
+        if rows.shape != (streams, CONTROL_ROWS, len(COLUMNS)):
+            raise ValueError(
+                f"control is {rows.shape[1:]} of {len(rows)}, not {(CONTROL_ROWS, len(COLUMNS))} of {streams}"
+            )
+        return torch.from_numpy(rows.reshape(streams, -1))
+
+    def _frame_inputs(
+        self, speaker: SpeakerFrame, memories: Sequence[Memory], rows: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[AudioState, AudioState]]:
+        """What `Frame` takes, and user and agent heard."""
+        heard_so_far = memories[0]
+        user, heard, user_voice = audio_frontend.hear(speaker.audio, heard_so_far.user_voice)
         agent, says, agent_voice = audio_frontend.hear(
-            audio_frontend.fit_frame(speaker.agent_audio), memory.agent_voice
+            audio_frontend.fit_frame(speaker.agent_audio), heard_so_far.agent_voice
         )
         face, seen = self._face(speaker)
         told = (
@@ -163,18 +260,20 @@ class ArigListener:
             torch.tensor([[agent_voice.voiced, user_voice.voiced]]),
             face,
             seen,
-            torch.tensor(memory.frames == 0),
-            torch.tensor([memory.state]),
-            self.model.long.rotary(torch.tensor([memory.frames // self.settings.chunk_frames])),
-            self._in_view(memory),
-            memory.agent_sound,
-            memory.agent_behaviour,
-            memory.user_behaviour,
-            memory.sound_keys,
-            memory.motion,
-            memory.motion_keys,
+            torch.tensor(heard_so_far.frames == 0),
+            torch.tensor([memory.state for memory in memories]),
+            self.model.long.rotary(torch.tensor([heard_so_far.frames // self.settings.chunk_frames])),
+            self._in_view(heard_so_far.frames, _joined([memory.context for memory in memories], dim=2)),
+            _joined([memory.agent_sound for memory in memories]),
+            _joined([memory.agent_behaviour for memory in memories]),
+            _joined([memory.user_behaviour for memory in memories]),
+            _joined([memory.sound_keys for memory in memories]),
+            _joined([memory.motion for memory in memories]),
+            _joined([memory.motion_keys for memory in memories]),
+            _joined([memory.sample for memory in memories]),
+            rows,
         )
-        return told, replace(memory, frames=memory.frames + 1, user_voice=user_voice, agent_voice=agent_voice)
+        return told, (user_voice, agent_voice)
 
     def _face(self, speaker: SpeakerFrame) -> tuple[Tensor, Tensor]:
         """(1, C) standardised, (1,) seen; what is not finite or beyond all faces is not: memory would keep it."""
@@ -183,8 +282,11 @@ class ArigListener:
             return torch.zeros(1, self.model.channels), torch.tensor([False])
         return self.model.standardise(torch.from_numpy(self.space.encode(motion[None]))), torch.tensor([True])
 
-    def _in_view(self, memory: Memory) -> Tensor:
-        """Keys and values of the whole chunks there are; `memory.frames` does not count the frame to come."""
-        room = memory.context.shape[-2]
-        chunks = min(memory.frames // self.settings.chunk_frames, room)
-        return memory.context[..., room - chunks :, :]
+    def _in_view(self, frames: int, context: Tensor) -> Tensor:
+        """Keys and values of the whole chunks there are after so many frames."""
+        room = context.shape[-2]
+        return context[..., room - min(frames // self.settings.chunk_frames, room) :, :]
+
+
+def _joined(parts: Sequence[Tensor], dim: int = 0) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim)

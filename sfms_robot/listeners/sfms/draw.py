@@ -64,12 +64,21 @@ class FrameSampler(nn.Module):
         self.reach = Reach(model)
 
     def forward(
-        self, slots: Tensor, last: Tensor, at: Tensor, frame: Tensor, guidance: Tensor, nucleus: Tensor, chance: Tensor
+        self,
+        slots: Tensor,
+        known: Tensor,
+        last: Tensor,
+        at: Tensor,
+        frame: Tensor,
+        guidance: Tensor,
+        nucleus: Tensor,
+        chance: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One frame.
 
         Args:
             slots: (B, W) of this frame, or (2, B, W) where a group is guided.
+            known: (B, G) its tokens where they are drawn already, which stay; UNDECIDED elsewhere.
             last, at: the last keyframes (B, G, 2) up to the frame before; frame: () its number.
             guidance: (1 or B, G, 1); nucleus, chance: (1 or B, G), as `sample` takes them.
 
@@ -82,6 +91,7 @@ class FrameSampler(nn.Module):
             logits = guided(logits[0], logits[1], guidance)  # (B, G, V)
         too_soon = self.reach.too_soon(last[..., 0], frame + 1 - at[..., 0])
         drawn = sample(logits.masked_fill(too_soon, -torch.inf) / self.temperature, self.bias, nucleus, chance)
+        drawn = torch.where(known == UNDECIDED, drawn, known)
         after = recent.then(drawn, frame + 1)
         return drawn, after.tokens, after.at
 
@@ -108,24 +118,34 @@ class Sampler:
         """The weights stay as they are: what a single stream such as `seen` draws is drawn by graphs from now on."""
         slots, last, at = self._ahead(*seen.parts)
         frame, chance = torch.tensor(0), torch.zeros(1, seen.tokens.shape[2])
-        example = (slots[..., 0, :], last[:, 0], at[:, 0], frame, self._guidance[None], self._nucleus[None], chance)
+        known = seen.tokens[:, -1]
+        example = (
+            slots[..., 0, :], known, last[:, 0], at[:, 0], frame, self._guidance[None], self._nucleus[None], chance
+        )  # fmt: skip
         self._graphs = graph(self._ahead, seen.parts), graph(self._next, example)
 
     def draw(self, seen: Context, generators: Sequence[torch.Generator]) -> Tensor:
-        """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b by the numbers of generators[b]."""
+        """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b by the numbers of generators[b].
+
+        A stream's undecided frames are its last ones; how many may differ from stream to stream.
+        """
         ahead, after = self._graphs if self._graphs and len(generators) == 1 else (self._ahead, self._next)
         tokens = seen.tokens.clone()
-        first = int((tokens[0] > UNDECIDED).all(-1).sum())  # the same for all streams
+        left = (tokens[..., 0] == UNDECIDED).sum(1).tolist()  # frames of each stream
+        first, groups = tokens.shape[1] - max(left), tokens.shape[2]
         slots, last, at = ahead(*seen.parts)
         last, at = last[:, first - 1], at[:, first - 1]
-        left, groups = tokens.shape[1] - first, tokens.shape[2]
-        chances = torch.stack([torch.rand(left, groups, generator=one) for one in generators], dim=1)
+        chances = torch.zeros(max(left), len(tokens), groups)
+        for row, (frames, generator) in enumerate(zip(left, generators, strict=True)):
+            chances[max(left) - frames :, row] = torch.rand(frames, groups, generator=generator)
         lately = self._lately(seen)
         guidance = 1 + (self._guidance - 1) * lately[:, None, None]  # (1 or B, G, 1)
         nucleus = self._nucleus_in_silence + (self._nucleus - self._nucleus_in_silence) * lately[:, None]
         for frame, chance in enumerate(chances, first):
             slot = slots[..., frame - tokens.shape[1], :]
-            tokens[:, frame], last, at = after(slot, last, at, torch.tensor(frame - 1), guidance, nucleus, chance)
+            tokens[:, frame], last, at = after(
+                slot, tokens[:, frame], last, at, torch.tensor(frame - 1), guidance, nucleus, chance
+            )
         return tokens
 
     def _lately(self, seen: Context) -> Tensor:

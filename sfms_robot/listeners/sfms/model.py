@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
+from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.listeners.sfms.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms.inpainter import Inpainter
 from sfms_robot.listeners.sfms.placement import Strategy, place
@@ -15,7 +16,19 @@ from sfms_robot.listeners.sfms.predictor import Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork
 from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
+from sfms_robot.listeners.sfms.sway import BANDS
+from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
+
+# Channels of any motion space that turn or move the head.
+HEAD = frozenset(
+    {*POSE_CHANNELS, *(f"{part}_{axis}" for part in ("rotation", "translation", "head") for axis in "xyz")}
+)
+
+
+def head_channels(channels: Sequence[str]) -> list[int]:
+    """Which of the channels move the head."""
+    return [index for index, name in enumerate(channels) if name in HEAD]
 
 
 def membership(groups: Sequence[config.ChannelGroup], channels: Sequence[str]) -> Tensor:
@@ -35,7 +48,9 @@ class Tokenizer(nn.Module):
         self.max_gap = settings.max_gap_frames
         self.sweeps = settings.scores.sweeps
         self.window = settings.window_frames
-        self.keyframes = [group.keyframes for group in groups]
+        self.ramp = settings.ramp_frames
+        self.keyframes = [group.keyframes or 0 for group in groups]  # none where each has its cost instead
+        self.costs = [group.keyframe_cost or 0.0 for group in groups]
         self.register_buffer("member", membership(groups, settings.channels), persistent=False)
         levels = [group.levels for group in groups]
         self.quantizer = Quantizer(self.member, levels, settings.quantizer, settings.code_dims)
@@ -45,6 +60,7 @@ class Tokenizer(nn.Module):
             settings.heads,
             settings.tokenizer_layers,
             residual=settings.inpainter == "residual",
+            ramp=settings.ramp_frames,
         )
         self.score = _score_network(settings)
 
@@ -63,6 +79,8 @@ class Tokenizer(nn.Module):
             score=self.score,
             max_gap=gap,
             sweeps=self.sweeps,
+            costs=self.costs,
+            ramp=self.ramp,
         )
 
     def encode(self, motion: Tensor, mask: Tensor) -> Tensor:
@@ -101,6 +119,8 @@ class SfmsModel(nn.Module):
     motion_speed: Tensor
     sound_mean: Tensor
     sound_std: Tensor
+    sway_amplitude: Tensor
+    sway_spread: Tensor
 
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
@@ -112,6 +132,10 @@ class SfmsModel(nn.Module):
         self.register_buffer("motion_speed", torch.full((width,), 1e6))
         self.register_buffer("sound_mean", torch.zeros(bins))
         self.register_buffer("sound_std", torch.ones(bins))
+        self.head = head_channels(settings.channels) if settings.sway else []
+        if settings.sway:
+            self.register_buffer("sway_amplitude", torch.zeros(BANDS, len(self.head)))
+            self.register_buffer("sway_spread", torch.zeros(()))
         self.tokenizer = Tokenizer(settings)
         inner, heads = settings.predictor_width, settings.heads
         self.predictor = Predictor(
@@ -123,6 +147,7 @@ class SfmsModel(nn.Module):
             heads,
             settings.predictor_layers,
             settings.sequential,
+            len(COLUMNS) if settings.events else 0,
         )
 
     def standardise(self, motion: Tensor) -> Tensor:

@@ -15,12 +15,13 @@ POSITION_BITS = 6  # distances to the neighbouring keyframes up to 63 frames, as
 class Neighbours:
     """For every frame and group the keyframe before (or at) it and the one after.
 
-    FutureEncoder of the first and behind the last keyframe the nearest one is held.
+    Before the first and behind the last keyframe the nearest one is held.
 
     Attributes:
         frame: (T, 1) number of each frame.
         before, after: (B, T, G) frames of the two.
         has_before, has_after: (B, T, G) bool.
+        ramp: the way to the keyframe after takes so many frames at most, before it the one before is held; None: all.
     """
 
     frame: Tensor
@@ -28,9 +29,10 @@ class Neighbours:
     after: Tensor
     has_before: Tensor
     has_after: Tensor
+    ramp: int | None = None
 
     @classmethod
-    def in_mask(cls, mask: Tensor) -> Neighbours:
+    def in_mask(cls, mask: Tensor, ramp: int | None = None) -> Neighbours:
         """From a mask (B, T, G)."""
         t = mask.shape[1]
         frame = torch.arange(t, device=mask.device)[:, None]
@@ -44,12 +46,15 @@ class Neighbours:
             torch.where(has_after, after, before).clamp(0, t - 1),
             has_before,
             has_after,
+            ramp,
         )
 
     def last(self, frames: int) -> Neighbours:
         """Of so many frames at the end alone."""
-        rest = (part[:, -frames:] for part in (self.before, self.after, self.has_before, self.has_after))
-        return Neighbours(self.frame[-frames:], *rest)
+        before, after, has_before, has_after = (
+            part[:, -frames:] for part in (self.before, self.after, self.has_before, self.has_after)
+        )
+        return Neighbours(self.frame[-frames:], before, after, has_before, has_after, self.ramp)
 
     @property
     def since(self) -> Tensor:
@@ -64,8 +69,9 @@ class Neighbours:
     @cached_property
     def weight(self) -> Tensor:
         """(B, T, G): 0 at the keyframe before, 1 at the one after."""
-        span = (self.after - self.before).clamp(min=1)
-        return ((self.frame - self.before) / span).clamp(0.0, 1.0)
+        begin = self.before if self.ramp is None else torch.maximum(self.before, self.after - self.ramp)
+        span = (self.after - begin).clamp(min=1)
+        return ((self.frame - begin) / span).clamp(0.0, 1.0)
 
     def interpolate(self, values: Tensor) -> Tensor:
         """(B, S, G, D) at keyframes -> (B, T, G, D) on the straight lines between them, T the frames in here."""

@@ -1,12 +1,13 @@
-"""Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and five answers.
+"""Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and six answers.
 
     exact          the mask with the least error of linear interpolation, by dynamic programming
+    penalised      as many as pay: least error plus a cost per keyframe, by dynamic programming (`penalised`)
     static         evenly, centred
     static_paper   at every floor(N / k)-th frame, the paper's baseline, which leaves the window's end to extrapolation
     learned_paper  the paper's: one look of the score network, Gumbel top-k by Algorithm 1
     learned        ours: conditional scores, asked again at each of the k steps, then swept over (`choice`)
 
-Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T.
+Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T, but `penalised`.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from torch import Tensor
 
 from sfms_robot.listeners.sfms.choice import choose, sweep
 from sfms_robot.listeners.sfms.exact import best_frames, segments
+from sfms_robot.listeners.sfms.penalised import place_penalised
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks
 
-Strategy = Literal["exact", "static", "static_paper", "learned_paper", "learned"]
+Strategy = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
 EPSILON = 1e-20  # a chosen frame falls back by 46: more than any two scores differ
 
 
@@ -34,12 +36,17 @@ def place(
     score: ScoreNetwork | ConditionalScore | None = None,
     max_gap: int | None = None,
     sweeps: int = 0,
+    costs: Sequence[float] = (),
+    ramp: int | None = None,
 ) -> Tensor:
     """Keyframe mask (B, T, G) of motion (B, T, C), deterministic: what encoding uses.
 
-    `score` is what the learned strategies ask; `max_gap` bounds `exact`; `sweeps` improve `learned`. Raises ValueError
-    when a strategy has no score network of its kind, or k does not fit the frames.
+    `score` is what the learned strategies ask; `max_gap` bounds `exact` and `penalised`, which asks the `costs` of a
+    keyframe per group and the `ramp` of interpolation in place of k; `sweeps` improve `learned`. Raises ValueError when
+    a strategy has no score network of its kind, or k does not fit the frames.
     """
+    if strategy == "penalised":
+        return place_penalised(motion, costs, member, max_gap, ramp)
     if strategy == "exact":
         return place_exact(motion, k, member, max_gap)
     if strategy in ("static", "static_paper"):

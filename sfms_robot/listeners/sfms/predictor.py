@@ -3,9 +3,10 @@
 Class 0 is transition, class 1 + i the keyframe code i. The speaker has a gated dual encoder (`speaker`), the listener's
 own tokens an encoder of their own, and a decoder asks both from all future frames at once: the paper's parallel
 prediction. Beyond the paper, a `sequential` predictor ends in a small network that is told which keyframes precede each
-frame, so that frames drawn one after another agree; the transformers still run once per plan.
+frame, so that frames drawn one after another agree; the transformers still run once per plan. And one that is told of
+events reads what each frame, past or to come, belongs to: a row of `signals.control` joins the tokens of the frame.
 
-Shapes: B batch, P past frames, H future frames, G channel groups, D digits of a code, W width, V classes.
+Shapes: B batch, P past frames, H future frames, G channel groups, D digits of a code, W width, V classes, K columns.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class Context:
         phase: (B, P, F) where the speaker is in a phrase; anything where not `heard`; F = 0 without.
         tokens: (B', P + H, G) the listener's own: past, what of the future is drawn already, UNDECIDED. B' = B, or
             any number when B = 1: many answers to one speaker.
+        control: (B', P + H, K) what is told of events in each of those frames; K = 0 without.
     """
 
     face: Tensor
@@ -45,6 +47,7 @@ class Context:
     heard: Tensor
     phase: Tensor
     tokens: Tensor
+    control: Tensor
 
     @property
     def parts(self) -> tuple[Tensor, ...]:
@@ -94,7 +97,9 @@ class Predictor(nn.Module):
         heads: int,
         layers: int,
         sequential: bool,
+        control: int = 0,
     ) -> None:
+        """`levels` of each group; `control` columns, 0 for a predictor that is not told of events."""
         super().__init__()
         grid = as_levels(levels)
         sizes = grid.prod(-1).long()
@@ -127,6 +132,9 @@ class Predictor(nn.Module):
         self.chain = FeedForward(width) if sequential else None
         self.norm = nn.LayerNorm(width)
         self.classify = nn.Linear(width, int(classes.sum()))
+        self.control_in = (
+            nn.Sequential(nn.Linear(control, width), nn.GELU(), nn.Linear(width, width)) if control else None
+        )
 
     def forward(self, context: Context, recent: LastKeyframes | None = None, absent: Tensor | None = None) -> Tensor:
         """What is known about every future frame without knowing those before it: (B', H, W).
@@ -136,7 +144,7 @@ class Predictor(nn.Module):
         """
         c = context
         speaker = self.speaker(c.face, c.face_known, c.voice, c.heard, c.phase)
-        own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent)
+        own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent, c.control)
         newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(len(own), -1)
         speaker = speaker.expand(len(own), -1, -1)
         if absent is not None:
@@ -161,10 +169,12 @@ class Predictor(nn.Module):
         out: Tensor = self.speaker(face, away, voice, away, phase)
         return out
 
-    def _own(self, tokens: Tensor, recent: LastKeyframes) -> Tensor:
-        """Tokens (B, P + H, G) and their last keyframes -> (B, P + H, W)."""
+    def _own(self, tokens: Tensor, recent: LastKeyframes, control: Tensor) -> Tensor:
+        """Tokens (B, P + H, G), their last keyframes and control rows (B, P + H, K) -> (B, P + H, W)."""
         features = torch.cat([self.describe(recent, _frames(tokens)), (tokens > 0).float()], dim=-1)
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
+        if self.control_in is not None:
+            x = x + self.control_in(control)
         x = x + sinusoidal(x.shape[1], x.shape[2]).to(x)
         for block in self.own:
             x = block(x)

@@ -170,6 +170,7 @@ class Quantizer(nn.Module):
     """Encoder, codebook and decoder of single frames. Frames do not see each other, groups do not either."""
 
     member: Tensor
+    drawn: Tensor
     slots: Tensor
     filled: Tensor
     owner: Tensor
@@ -184,12 +185,16 @@ class Quantizer(nn.Module):
         dims: int = 4,
         hidden: int = 48,
     ) -> None:
-        """`member` (G, C): 1 where channel c belongs to group g; `levels` of a group multiply to its codes."""
+        """`member` (G, C): 1 where channel c belongs to group g; `levels` of a group multiply to its codes.
+
+        A channel of no group is not drawn: it stays 0.
+        """
         super().__init__()
         groups, _ = member.shape
         own = [row.nonzero()[:, 0] for row in member]
         most = max(map(len, own))
         self.register_buffer("member", member, persistent=False)
+        self.register_buffer("drawn", member.amax(0), persistent=False)
         self.register_buffer("levels", as_levels(levels), persistent=False)
         # Each group's channels in slots 0..: with a group per channel a full (G, C) matrix would be zeros but for 1/C.
         self.register_buffer("slots", torch.stack([F.pad(c, (0, most - len(c))) for c in own]), persistent=False)
@@ -217,7 +222,7 @@ class Quantizer(nn.Module):
 
     def by_channel(self, slots: Tensor) -> Tensor:
         """What `decoder` makes, (..., G, slots of a group), in the order of channels (..., C)."""
-        return slots[..., self.owner, self.slot]
+        return slots[..., self.owner, self.slot] * self.drawn
 
     def indices(self, codes: Tensor) -> Tensor:
         """Codes (..., G, D) -> (..., G) from 0."""

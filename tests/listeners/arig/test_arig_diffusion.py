@@ -145,7 +145,7 @@ def test_a_trained_sampler_draws_what_it_was_shown():
 @torch.no_grad()
 def test_codes_are_drawn_by_their_probability():
     torch.manual_seed(0)
-    head = CodeHead(3, 8, (3, 2))
+    head = CodeHead(3, 8, 8, (3, 2))
     z = torch.randn(1, 8)
     drawn = head.sample(z.expand(4000, 8), torch.randn(4000, 1, 1))
     kinds, counts = drawn.unique(dim=0, return_counts=True)

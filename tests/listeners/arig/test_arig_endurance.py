@@ -6,15 +6,19 @@ import torch
 from tiny_arig import arig_listener
 
 from sfms_robot.data import data_dir
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, ListenerEvent, SpeakerFrame
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig import audio_frontend, load
 from sfms_robot.listeners.arig.diffusion import Denoiser
+from sfms_robot.signals.audio import read_audio
+from sfms_robot.signals.control import control_track
 
 FRAMES = 600 * FRAME_HZ
 SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
 PPM = 200e-6
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
+# Roll, pitch, yaw of listeners of composed dyads (`data compose`, training), less gaze: 1st and 99th percentile.
+PEOPLE_RAD = ((-0.04, 0.04), (-0.04, 0.06), (-0.04, 0.04))
 
 
 def silent_minutes(listener, frames: int = FRAMES) -> np.ndarray:
@@ -59,6 +63,39 @@ def test_the_shipped_listener_lives_calmly_through_ten_silent_minutes():
     late = out[-60 * FRAME_HZ :, :3]
     assert 1e-4 < late.std(0).max() < 0.3  # alive in the last minute, and near where a head is held
     assert np.abs(late.mean(0)).max() < 0.5
+
+
+def minutes_of_events(minutes: float) -> list[ListenerEvent]:
+    """Nods, smiles, blinks and raised brows as often as people's, at random."""
+    rng, found = np.random.default_rng(0), []
+    for kind, a_minute, length_s, size in (
+        ("nod", 4.0, 0.9, 0.09), ("smile", 1.0, 2.0, 0.4), ("blink", 16.0, 0.28, 0.9), ("brow_raise", 1.0, 1.2, 0.3)
+    ):  # fmt: skip
+        for start_s in np.sort(rng.uniform(0, 60 * minutes, rng.poisson(a_minute * minutes))):
+            found.append(ListenerEvent(kind, float(start_s), length_s, size, 2 if kind == "nod" else 1))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not (SHIPPED / checkpoint.WEIGHTS).is_file() or not checkpoint.load_config(SHIPPED).events,
+    reason="arig-small is told no events here",
+)
+def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs():
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")
+    listener = load(SHIPPED).build_graphs()
+    control = control_track(minutes_of_events(10), 0, FRAMES + 1)
+    memory, out = listener.start(0), np.zeros((FRAMES, 3))
+    for index in range(FRAMES):
+        at = index * FRAME_SAMPLES % (len(said) - FRAME_SAMPLES)
+        heard = SpeakerFrame((index + 1) * FRAME_S, said[at : at + FRAME_SAMPLES])
+        plan, memory = listener.step(heard, memory, control[index : index + 2])
+        out[index] = plan.frames[0, :3]
+    low, high = np.array(PEOPLE_RAD).T
+    last = out[-60 * FRAME_HZ :]
+    assert (last.mean(0) > low).all() and (last.mean(0) < high).all()
+    assert ((out < low) | (out > high)).mean(axis=0).max() < 0.05
+    assert (last.std(0) > 0.2 * (high - low) / 4.65).all()  # alive
 
 
 def drifting(samples: np.ndarray, ppm: float) -> list[np.ndarray]:

@@ -20,6 +20,8 @@ INTEGERS = {"width": 256, "feedforward": 512, "heads": 4, "precision": "int8"}
         {"discrete": True},
         {"interaction": "linear"},
         {"draws": "step"},
+        {"draws": "innovation"},
+        {"events": True, "draws": "innovation"},
         pytest.param(INTEGERS, marks=pytest.mark.skipif(not fast.supported(), reason="no fast integers here")),
     ],
     ids=str,
@@ -47,6 +49,6 @@ def test_a_listener_from_a_folder_runs_on_graphs(tmp_path):
     checkpoint.save_config(tmp_path, model.settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, model)
     found = arig.load(tmp_path).build_graphs()
-    assert isinstance(found._frame, torch.jit.ScriptModule) and isinstance(found._draw, torch.jit.ScriptModule)
+    assert all(isinstance(part, torch.jit.ScriptModule) for part in (found._frame_of_one, found._draw_of_one))
     speaker = talk(5)
     np.testing.assert_allclose(streamed(found, speaker), streamed(arig_listener(), speaker), atol=1e-5)

@@ -12,6 +12,7 @@ from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.ibu import LongRange
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.parts import windows
+from sfms_robot.signals.control import COLUMNS
 
 ABLATIONS = [
     {},
@@ -22,12 +23,15 @@ ABLATIONS = [
     {"interaction": "linear"},
     {"motion_space": "deca56"},
     {"sound": "wav2vec2"},
+    {"draws": "innovation"},
+    {"events": True},
+    {"events": True, "draws": "innovation", "discrete": True},
 ]
 
 
 @pytest.fixture(scope="module")
 def tiny() -> ArigModel:
-    return arig_model()
+    return arig_model(events=True)
 
 
 def random_dyad(model: ArigModel, frames: int = 14, batch: int = 2, seed: int = 0) -> Dyad:
@@ -46,6 +50,7 @@ def random_dyad(model: ArigModel, frames: int = 14, batch: int = 2, seed: int = 
         user_seen=chance(batch, frames),
         agent_motion=torch.randn(motion, generator=drawn),
         voiced=chance(batch, frames, 2),
+        control=torch.rand((batch, frames, len(COLUMNS)), generator=drawn) if model.settings.events else None,
     )
 
 
@@ -76,8 +81,8 @@ def test_losses_are_one_per_predicted_frame(changes):
 @given(frame=st.integers(1, 13), field=st.sampled_from([field.name for field in dataclasses.fields(Dyad)]))
 @settings(max_examples=40, deadline=None)
 def test_a_frame_is_made_from_what_equation_1_allows(tiny, frame: int, field: str):
-    """Both people up to T - 1, and of T the agent's sound: nothing of that or later changes z of T."""
-    first = frame + 1 if field.startswith(("agent_sound", "agent_heard")) else frame
+    """Both people up to T - 1, and of T the agent's sound and events: nothing of that or later changes z of T."""
+    first = frame + 1 if field.startswith(("agent_sound", "agent_heard", "control")) else frame
     dyad, other = random_dyad(tiny), random_dyad(tiny, seed=7)
     mixed = torch.cat([getattr(dyad, field)[:, :first], getattr(other, field)[:, first:]], dim=1)
     if field == "voiced":  # of the agent now, of the user one frame before

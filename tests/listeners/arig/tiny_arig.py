@@ -46,11 +46,13 @@ def talk(frames: int, seed: int = 0, face: bool = True, audio: bool = True, agen
     return out
 
 
-def streamed(listener: ArigListener, speaker: list[SpeakerFrame], seed: int = 1) -> np.ndarray:
-    """(T, 58): frame t is the plan made at the speaker's frame t."""
+def streamed(
+    listener: ArigListener, speaker: list[SpeakerFrame], seed: int = 1, control: np.ndarray | None = None
+) -> np.ndarray:
+    """(T, 58): frame t is the plan made at the speaker's frame t, told of rows t and t + 1 of control (T + 1, K)."""
     memory, out = listener.start(seed), []
-    for frame in speaker:
-        plan, memory = listener.step(frame, memory)
+    for index, frame in enumerate(speaker):
+        plan, memory = listener.step(frame, memory, None if control is None else control[index : index + 2])
         out.append(plan.frames[0])
     return np.stack(out)
 
@@ -61,7 +63,9 @@ def noise_of(listener: ArigListener, frames: int, seed: int = 1) -> torch.Tensor
     return torch.stack([torch.randn(listener.model.noise_shape, generator=generator) for _ in range(frames)])[None]
 
 
-def dyad_of(listener: ArigListener, speaker: list[SpeakerFrame], agent_motion: torch.Tensor) -> Dyad:
+def dyad_of(
+    listener: ArigListener, speaker: list[SpeakerFrame], agent_motion: torch.Tensor, control: np.ndarray | None = None
+) -> Dyad:
     """Frames 0..T of a stream of T steps; agent_motion (T, C) is what it made of frames 1..T.
 
     The agent says nothing in frame 0; what it says at step t belongs to frame t + 1. Nothing looks at the user's last.
@@ -84,4 +88,5 @@ def dyad_of(listener: ArigListener, speaker: list[SpeakerFrame], agent_motion: t
         user_seen=torch.tensor([[frame.face is not None for frame in speaker] + [False]]),
         agent_motion=torch.cat([still, agent_motion])[None],
         voiced=torch.from_numpy(np.stack([np.r_[False, agent_voiced], user_voiced], axis=-1))[None],
+        control=None if control is None else torch.from_numpy(control)[None],
     )

@@ -24,6 +24,7 @@ def outputs() -> dict[str, np.ndarray]:
         heard=torch.rand(1, 40, generator=drawn) > 0.3,
         phase=torch.rand(1, 40, 21, generator=drawn),
         tokens=torch.cat([tokens[:, :43], torch.full((1, 5, 2), UNDECIDED)], dim=1),
+        control=torch.zeros(1, 48, 0),
     )
     logits = model.predictor.teacher_forced(seen, tokens[:, 40:])
     return {"logits": logits.numpy(), "motion": model.tokenizer.decode(tokens).numpy()}

@@ -28,6 +28,7 @@ def seen(heard: bool, face_known: bool, silence_s: float = 0.0) -> Context:
         heard=torch.full((1, 40), heard),
         phase=torch.from_numpy(place).expand(1, 40, -1),
         tokens=tokens,
+        control=torch.zeros(3, 48, 0),
     )
 
 

@@ -48,7 +48,7 @@ def scores(strategy: str) -> ScoreNetwork | ConditionalScore:
     return (ScoreNetwork(3, 2, 8, 2) if strategy == "learned_paper" else ConditionalScore(2, 8, 2, 1)).eval()
 
 
-@pytest.mark.parametrize("strategy", get_args(Strategy))
+@pytest.mark.parametrize("strategy", sorted({*get_args(Strategy)} - {"penalised"}))
 @pytest.mark.parametrize("k", [(1, 1), (3, 7), (48, 10)])
 def test_every_strategy_places_exactly_k(strategy, k):
     motion = torch.randn(3, 48, 3)

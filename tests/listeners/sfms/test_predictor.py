@@ -22,6 +22,7 @@ def context(drawn_frames: int = 0, **changes) -> Context:
             heard=HEARD,
             phase=torch.rand(1, 40, 21, generator=drawn),
             tokens=tokens,
+            control=torch.zeros(1, 48, 0),
         ),
         **changes,
     )
@@ -74,8 +75,9 @@ def test_what_is_marked_missing_does_not_matter(modality: str, sequential: bool)
 def test_many_answers_to_one_speaker_are_those_to_copies_of_him(tiny):
     one, copies = context(), context()
     own = torch.cat([one.tokens, one.tokens.flip(1).clamp(min=0)])
-    copies = Context(*(getattr(one, name).expand(2, *[-1] * (getattr(one, name).ndim - 1)) for name in
-                       ("face", "face_known", "voice", "heard", "phase")), own)  # fmt: skip
+    names = ("face", "face_known", "voice", "heard", "phase")
+    both = (getattr(one, name).expand(2, *[-1] * (getattr(one, name).ndim - 1)) for name in names)
+    copies = Context(*both, own, one.control.expand(2, -1, -1))
     with torch.no_grad():
         torch.testing.assert_close(tiny.model.predictor(replace(one, tokens=own)), tiny.model.predictor(copies))
 

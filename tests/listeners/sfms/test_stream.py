@@ -47,7 +47,7 @@ def offline(listener, speaker, seed):
         past = slice(now + 1, now + 1 + p)
         own = tokens[None, past.start : past.stop + h].clone()
         own[:, p + decided - (now + 1) :] = UNDECIDED
-        seen = Context(*(x[None, past] for x in (face, known, voice, known, place)), own)
+        seen = Context(*(x[None, past] for x in (face, known, voice, known, place)), own, torch.zeros(1, p + h, 0))
         drawn = listener.sampler.draw(seen, [generator])
         tokens[past.stop : past.stop + h] = drawn[0, p:]
         decided = now + 1 + h

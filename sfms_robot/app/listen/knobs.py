@@ -1,4 +1,4 @@
-"""How much each region of a head shows, turned while it runs."""
+"""How much each region of a head shows, turned while it runs; `--intensity`, `--style` and `--calmness` of a run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from threading import Lock
 from typing import Final
 
-from sfms_robot.config import Head
+from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.retarget.channel_mapping import ChannelMapping as Face
 from sfms_robot.retarget.channel_mapping import Knobs
@@ -107,12 +107,18 @@ def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ())
     return LiveKnobs(head, _values("--intensity", intensity), _values("--style", style))
 
 
-def _values(option: str, given: Sequence[str]) -> dict[str, float]:
+def calmed(per_minute: Sequence[str] = (), addressed: str = "sense") -> Calmness:
+    """What `--calmness` and `--addressed` ask for. Raises ConfigError for an unknown kind or a rate that cannot be."""
+    asked = _values("--calmness", per_minute, "KIND=EVENTS A MINUTE")
+    return parse(Calmness, {**asked, "addressed": addressed}, "--calmness")
+
+
+def _values(option: str, given: Sequence[str], form: str = "REGION=VALUE with a value from 0 to 2") -> dict[str, float]:
     values = {}
     for text in given:
         region, _, value = text.partition("=")
         try:
             values[region] = float(value)
         except ValueError:
-            raise ConfigError(f"{option} {text!r} is not REGION=VALUE with a value from 0 to 2") from None
+            raise ConfigError(f"{option} {text!r} is not {form}") from None
     return values

@@ -1,0 +1,147 @@
+"""`evaluate naturalness`: a listener's motion beside that of people whose motion it was never trained on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from sfms_robot.config import find
+from sfms_robot.corpora.clips import Dyad
+from sfms_robot.corpora.collection import usable
+from sfms_robot.corpora.formats import open_for
+from sfms_robot.corpora.resampling import at_frame_rate
+from sfms_robot.errors import ConfigError
+from sfms_robot.evaluation import manners as manner
+from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
+from sfms_robot.evaluation.two_sample import FOLDS, REGIONS, Told, told_apart, windows
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame
+from sfms_robot.listeners.registry import load_listener, one_thread
+from sfms_robot.ports import Listener
+
+DRIFT_S: Final = 600.0
+_FIGURES: Final = ("nod_deg", "nod_s", "nod_swings", "blink_s", "smile_s", "look_s")
+_LEAST_DYADS: Final = 2 * FOLDS
+
+
+def evaluate_naturalness(
+    name: str, data: Path, split: str, clips: int | None, drift_s: float, seed: int
+) -> dict[str, Any]:
+    """Roll a listener out over the dyads of `split`, and hold what it did against what their listeners did.
+
+    Raises ConfigError for fewer than ten dyads. Blocks for minutes; shows how far it is.
+    """
+    one_thread()
+    dyads = _spread([at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, split))], clips)
+    if len(dyads) < _LEAST_DYADS:
+        raise ConfigError(f"{data}: {len(dyads)} dyads of {split}; people are told apart in {_LEAST_DYADS} or more")
+    listener = load_listener(find("listeners", name, "config.yaml"))
+    heard = [frames_of_dyad(dyad) for dyad in dyads]
+    with Progress(console=Console(stderr=True)) as progress:
+        playing = progress.add_task(f"{name} listens", total=len(dyads) + 1)
+        ours = []
+        for number, speaker in enumerate(heard):
+            ours.append(rollout(listener, speaker, [seed + number]).motion[0])
+            progress.advance(playing)
+        drift = long_run(listener, heard, drift_s, seed)
+        progress.advance(playing)
+        judging = progress.add_task("telling apart", total=2 * len(REGIONS) * FOLDS)
+        told = two_samples(ours, [dyad.listener for dyad in dyads], lambda: progress.advance(judging))
+    theirs = [dyad.listener for dyad in dyads]
+    addressed = [asked_for(dyad) for dyad in dyads]
+    return {
+        "listener": name,
+        "split": split,
+        "dyads": len(dyads),
+        "minutes": round(sum(map(len, ours)) * FRAME_S / 60, 1),
+        **told,
+        **figures(manner.manners(ours, addressed), manner.manners(theirs, addressed)),
+        **drifted(drift, theirs),
+    }
+
+
+def _spread(dyads: Sequence[Dyad], most: int | None) -> list[Dyad]:
+    if most is None or most >= len(dyads):
+        return list(dyads)
+    return [dyads[int(index)] for index in np.linspace(0, len(dyads) - 1, most).round()]
+
+
+def asked_for(dyad: Dyad) -> NDArray[np.bool_]:
+    """(N,) frames in which the person looks at the listener; all of them where nobody knows."""
+    if dyad.attention is None:
+        return np.ones(len(dyad.listener), bool)
+    return np.asarray(dyad.attention > 0.5, bool)
+
+
+def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_s: float, seed: int) -> Floats:
+    """(N, 58): one stream that hears one person after the other for so long."""
+    frames: list[SpeakerFrame] = []
+    while len(frames) < drift_s * FRAME_HZ:
+        for speaker in heard:
+            frames += speaker
+    kept = frames[: round(drift_s * FRAME_HZ)]
+    told = [_at(frame, (index + 1) * FRAME_S) for index, frame in enumerate(kept)]
+    motion: Floats = rollout(listener, told, [seed]).motion[0]
+    return motion
+
+
+def _at(frame: SpeakerFrame, time_s: float) -> SpeakerFrame:
+    return SpeakerFrame(time_s, frame.audio, frame.face, frame.agent_audio, frame.attention, frame.place_m)
+
+
+def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], each: Callable[[], object]) -> dict[str, Any]:
+    """By region, `two_sample_auc`, and for scale people against other people; each with its interval over dyads."""
+    rng = np.random.default_rng(0)
+    made, real = ([windows(motion, rng) for motion in motions] for motions in (ours, theirs))
+    pairs = len(real) // 2
+    found = {region: told_apart(made, real, region, each) for region in REGIONS}
+    people = {region: told_apart(real[0 : 2 * pairs : 2], real[1 : 2 * pairs : 2], region, each) for region in REGIONS}
+    return {
+        "two_sample_auc": {region: round(told.auc, 3) for region, told in found.items()},
+        "person_two_sample_auc": {region: round(told.auc, 3) for region, told in people.items()},
+        "interval": {"two_sample_auc": _intervals(found), "person_two_sample_auc": _intervals(people)},
+    }
+
+
+def _intervals(found: Mapping[str, Told]) -> dict[str, list[float]]:
+    return {region: [round(told.low, 3), round(told.high, 3)] for region, told in found.items()}
+
+
+def figures(ours: manner.Manners, theirs: manner.Manners) -> dict[str, Any]:
+    """Medians of both, the ratio of nod sizes, gaze, sway by band; None where nothing was found."""
+    told: dict[str, Any] = {"nod_amplitude_ratio": _or_none(manner.ratio(ours.nod_deg, theirs.nod_deg))}
+    for prefix, found in (("", ours), ("people_", theirs)):
+        for figure in _FIGURES:
+            told[prefix + figure] = _median(getattr(found, figure))
+        told[f"{prefix}gaze_on_person"] = _or_none(found.on_person)
+        told[f"{prefix}gaze_shifts_per_minute"] = _or_none(found.shifts_per_minute)
+        for (low, high), power in zip(manner.SWAY_BANDS_HZ, found.sway_db, strict=True):
+            told[f"{prefix}sway_db_{low:g}_{high:g}_hz"] = _or_none(float(power))
+    return told
+
+
+def drifted(motion: Floats, theirs: Sequence[Floats]) -> dict[str, Any]:
+    """How far from the middle the head is at the end of a long run, and whether people's 1 to 99 % reach there."""
+    end = np.median(manner.slow_poses_deg([motion])[-6:], axis=0)
+    low, high = np.percentile(manner.slow_poses_deg(theirs), [1, 99], axis=0)
+    outside = np.maximum(np.maximum(low - end, end - high), 0.0)
+    return {
+        "drift_deg": round(float(np.abs(end).max()), 2),
+        "drift_outside_people_deg": round(float(outside.max()), 2),
+        "people_pose_deg": {name: [round(float(a), 2), round(float(b), 2)] for name, a, b in
+                            zip(("roll", "pitch", "yaw"), low, high, strict=True)},
+    }  # fmt: skip
+
+
+def _median(values: Doubles) -> float | None:
+    return round(float(np.median(values)), 3) if len(values) else None
+
+
+def _or_none(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None

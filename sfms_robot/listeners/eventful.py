@@ -1,0 +1,191 @@
+"""A listener in three parts: events say when, a model of motion says how, kinematics move the eyes.
+
+Of every frame, in this order:
+
+    events      hazards look at the person and at what was done before, and decide (`events.model`)
+    control     what has been decided becomes rows of numbers, of the past and of the frames to be planned
+    motion      the model draws head and face, told those rows; the direction of the eyes it leaves alone
+    gaze        the eyes go to where the last gaze shift said, the head follows, and while it nods the eyes stay
+
+An event is decided `LEAD_FRAMES` before it begins, whatever the hop: a plan that is made in between shows it from its
+beginning. What has been decided is never taken back.
+
+Laws: `step_many` of several streams is each one's `step`; a plan tells each event once; with nothing decided the eyes
+look at the person; memory holds what is still under way, no more.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Protocol, Self, cast
+
+import numpy as np
+
+from sfms_robot.config import Calmness
+from sfms_robot.frames import FRAME_HZ, FRAME_S, POSE, Doubles, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.listeners.events.model import Decision, EventMemory, EventModel
+from sfms_robot.signals import gaze_kinematics
+from sfms_robot.signals.control import control_track
+from sfms_robot.signals.gaze_kinematics import GazeState
+
+AT_THE_PERSON: Final = np.zeros(2)
+
+
+class MotionModel(Protocol):
+    """How: a listener that is told what has been decided.
+
+    Attributes:
+        control_frames: rows it is told of (past, ahead); the past ends with the newest frame heard.
+    """
+
+    @property
+    def control_frames(self) -> tuple[int, int]: ...
+
+    @property
+    def hop(self) -> int: ...
+
+    @property
+    def horizon(self) -> int: ...
+
+    def start(self, seed: int) -> Any: ...
+
+    def step(self, speaker: SpeakerFrame, memory: Any, control: Floats | None = None) -> tuple[Plan | None, Any]: ...
+
+
+@dataclass(frozen=True)
+class EventfulMemory:
+    """What one stream remembers.
+
+    Attributes:
+        when, how: of the events, and of the motion.
+        events: decided, and not over since longer than the model looks back; the last gaze shift always.
+        news: those of them that no plan has told yet.
+        gaze: state of the eyes after the newest frame, then after every row of the plan in force.
+    """
+
+    when: EventMemory
+    how: Any
+    events: tuple[ListenerEvent, ...]
+    news: tuple[ListenerEvent, ...]
+    gaze: tuple[GazeState, ...]
+
+
+class EventfulListener:
+    """`ports.Listener`: `when` decides, `how` moves. Holds weights only."""
+
+    def __init__(self, how: MotionModel, when: EventModel, calmness: Calmness | None = None) -> None:
+        self.how, self.when, self.calmness = how, when, calmness or Calmness()
+
+    @property
+    def hop(self) -> int:
+        return self.how.hop
+
+    @property
+    def horizon(self) -> int:
+        return self.how.horizon
+
+    @property
+    def hops(self) -> Sequence[int]:
+        """Those that `at_hop` may be asked for."""
+        return tuple(getattr(self.how, "hops", (self.hop,)))
+
+    def at_hop(self, hop: int) -> Self:
+        """The same, planning every `hop` frames."""
+        other = copy.copy(self)
+        other.how = self.how if hop == self.hop else cast(Any, self.how).at_hop(hop)
+        return other
+
+    def build_graphs(self) -> Self:
+        """The weights stay as they are from now on. Itself."""
+        build: Callable[[], object] | None = getattr(self.how, "build_graphs", None)
+        if build is not None:
+            build()
+        return self
+
+    def start(self, seed: int) -> EventfulMemory:
+        """Memory of a stream that has heard nothing and decided nothing."""
+        when = self.when.start(seed, self.calmness)
+        return EventfulMemory(when, self.how.start(seed), (), (), (gaze_kinematics.start(seed),))
+
+    def calmed(self, memory: EventfulMemory, calmness: Calmness) -> EventfulMemory:
+        """The same stream, from now on with other rates."""
+        return replace(memory, when=self.when.calmed(memory.when, calmness))
+
+    def step(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
+        """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
+        decision, told = self._decided(speaker, memory)
+        plan, how = self.how.step(speaker, told.how, self._control(speaker, told))
+        return self._looking(plan, decision, replace(told, how=how))
+
+    def step_many(
+        self, speaker: SpeakerFrame, memories: Sequence[EventfulMemory]
+    ) -> tuple[list[Plan], list[EventfulMemory]]:
+        """`step` of streams that began together and heard the same speaker ever since; no plans between hops."""
+        decided = [self._decided(speaker, memory) for memory in memories]
+        told = [memory for _, memory in decided]
+        controls = [self._control(speaker, memory) for memory in told]
+        plans, hows = self._move_many(speaker, [memory.how for memory in told], controls)
+        found = [
+            self._looking(plan, decision, replace(memory, how=how))
+            for plan, (decision, memory), how in zip(plans, decided, hows, strict=True)
+        ]
+        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
+
+    def _move_many(
+        self, speaker: SpeakerFrame, hows: Sequence[Any], controls: Sequence[Floats]
+    ) -> tuple[Sequence[Plan | None], Sequence[Any]]:
+        together = getattr(self.how, "step_many", None)
+        if together is None:
+            each = [self.how.step(speaker, how, control) for how, control in zip(hows, controls, strict=True)]
+            return [plan for plan, _ in each], [how for _, how in each]
+        plans, after = together(speaker, hows, controls)
+        return plans or [None] * len(hows), after
+
+    def _decided(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Decision, EventfulMemory]:
+        """What this frame decides, and the memory that knows of it."""
+        decision, when = self.when.step(speaker, memory.when)
+        keep_s = speaker.time_s - self.how.control_frames[0] * FRAME_S
+        events = _remembered((*memory.events, *decision.events), keep_s)
+        return decision, replace(memory, when=when, events=events, news=memory.news + decision.events)
+
+    def _control(self, speaker: SpeakerFrame, memory: EventfulMemory) -> Floats:
+        past, ahead = self.how.control_frames
+        return control_track(memory.events, frame_of(speaker) + 1 - past, past + ahead)
+
+    def _looking(
+        self, plan: Plan | None, decision: Decision, memory: EventfulMemory
+    ) -> tuple[Plan | None, EventfulMemory]:
+        """The plan with eyes, what was decided since the one before, and the memory after it."""
+        newest = memory.gaze[min(1, len(memory.gaze) - 1) :]  # one frame has passed
+        if plan is None:
+            return None, replace(memory, gaze=newest)
+        frames, states = plan.frames.copy(), [newest[0]]
+        for row, time_s in enumerate(plan.times_s):
+            seen, state = gaze_kinematics.step(target_at(memory.events, time_s), frames[row, POSE], states[-1])
+            frames[row] = seen.applied(frames[row])
+            states.append(state)
+        told = replace(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
+        return told, replace(memory, news=(), gaze=tuple(states))
+
+
+def frame_of(speaker: SpeakerFrame) -> int:
+    """The index of a frame in loop time: frame 0 ends at 0.04 s."""
+    return round(speaker.time_s * FRAME_HZ) - 1
+
+
+def target_at(events: Sequence[ListenerEvent], time_s: float) -> Doubles:
+    """(yaw, pitch) [rad] of the last gaze shift that has begun by `time_s`; at the person before the first."""
+    begun = [event for event in events if event.target_rad is not None and event.start_s <= time_s + 1e-9]
+    return np.array(begun[-1].target_rad) if begun else AT_THE_PERSON
+
+
+def _remembered(events: tuple[ListenerEvent, ...], keep_s: float) -> tuple[ListenerEvent, ...]:
+    """Events that are not over by `keep_s`, in the order of their decision, and the last gaze shift begun by then."""
+    shifts = [event for event in events if event.target_rad is not None and event.start_s <= keep_s]
+    return tuple(
+        event
+        for event in events
+        if event in shifts[-1:] or (event.end_s > keep_s if event.target_rad is None else event.start_s > keep_s)
+    )

@@ -1,0 +1,105 @@
+"""What a listener takes from the other's face as it comes: they nod, they smile, they laugh, their mouth moves.
+
+Trackers lie: a face may be upside down, stuck, saturated or all noise. So everything is judged against the face's own
+last second or running neutral, which a constant becomes; turns count modulo a whole one; and a head that nods more
+than people can is taken for noise until it calms down. What is taken for a laugh is a broad smile over a mouth that
+opens and closes: somebody who talks and beams at once is taken for laughing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, FaceFrame
+
+NOD_RAD: Final = math.radians(2.0)  # a swing there, within a second, and most of it back
+BACK: Final = 0.6
+WINDOW: Final = 25  # frames
+NODS_APART: Final = 30  # frames; more than a window, so that no swing counts twice
+MOST_NODS: Final = 6  # in ten seconds: more is noise
+SMILE: Final = 0.25  # over the neutral
+BEAM: Final = 0.35
+HELD_FRAMES: Final = 6
+OPENING: Final = 0.02  # mean change of jawOpen per frame of a mouth that moves
+_SMOOTH: Final = 0.5  # share of a new value
+_NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: somebody who always beams is neutral within a minute
+_NEUTRAL_FALL: Final = 0.1
+_MOTION: Final = 0.12
+_CORNERS: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
+_JAW: Final = CHANNEL_INDEX["jawOpen"]
+_PITCH: Final = CHANNEL_INDEX["pitch"]
+
+
+@dataclass(frozen=True)
+class Signs:
+    """Of one frame: a nod has just been seen; the person smiles, laughs; the mouth moves as in speech."""
+
+    nods: bool = False
+    smiles: bool = False
+    laughs: bool = False
+    mouth_moves: bool = False
+
+
+@dataclass(frozen=True)
+class FaceState:
+    """What is remembered of a face.
+
+    Attributes:
+        frame: how many have been asked for.
+        pitch_rad: smoothed, unwrapped, of the last second.
+        nodded: frames of the swings of late.
+        neutral, held: of the smile: its neutral, and for how many frames it has been up.
+        jaw, opening: jawOpen, and how much it changes per frame.
+    """
+
+    frame: int = 0
+    pitch_rad: tuple[float, ...] = ()
+    nodded: tuple[int, ...] = ()
+    neutral: float | None = None
+    held: int = 0
+    jaw: float = 0.0
+    opening: float = 0.0
+
+
+def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceState]:
+    """One frame of 40 ms. Without a face, or with one that holds what is not finite, nothing is seen."""
+    if face is None or not (np.isfinite(face.pose).all() and np.isfinite(face.blendshapes).all()):
+        return Signs(), replace(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
+    motion = face.motion
+    nods, state = _nod(float(motion[_PITCH]), state)
+    smiles, beams, state = _smile(float(np.clip(motion[_CORNERS].mean(), 0, 1)), state)
+    jaw = float(np.clip(motion[_JAW], 0, 1))
+    opening = state.opening + _MOTION * (abs(jaw - state.jaw) - state.opening)
+    moves = opening > OPENING
+    return Signs(nods, smiles, beams and moves, moves), replace(state, frame=state.frame + 1, jaw=jaw, opening=opening)
+
+
+def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
+    before = state.pitch_rad
+    smoothed = before[-1] + _SMOOTH * math.remainder(pitch_rad - before[-1], 2 * math.pi) if before else pitch_rad
+    pitch = (*before, smoothed)[-WINDOW:]
+    recent = tuple(at for at in state.nodded if state.frame - at < 10 / FRAME_S)
+    new = (not recent or state.frame - recent[-1] >= NODS_APART) and (_swung(pitch) or _swung([-p for p in pitch]))
+    nodded = (*recent, state.frame) if new else recent
+    return new and len(recent) < MOST_NODS, replace(state, pitch_rad=pitch, nodded=nodded)
+
+
+def _swung(values: tuple[float, ...] | list[float]) -> bool:
+    """Up by a nod, and now most of the way back."""
+    top = max(values)
+    risen = top - min(values[: values.index(top) + 1])
+    return risen >= NOD_RAD and top - values[-1] >= BACK * risen
+
+
+def _smile(level: float, state: FaceState) -> tuple[bool, bool, FaceState]:
+    """Smiles, beams; after it has been up for a quarter of a second."""
+    neutral = level if state.neutral is None else state.neutral
+    neutral += _NEUTRAL_FALL * (level - neutral) if level < neutral else min(_NEUTRAL_RISE, level - neutral)
+    over = level - neutral
+    held = state.held + 1 if over > SMILE * (0.6 if state.held >= HELD_FRAMES else 1.0) else 0
+    smiles = held >= HELD_FRAMES
+    return smiles, smiles and over > BEAM, replace(state, neutral=neutral, held=held)

@@ -1,0 +1,227 @@
+"""When a listener nods, smiles, laughs, says "mm-hm", raises its brows, blinks, looks away: learned from people.
+
+    person's frame -> evidence (sensing) -> log-odds of each kind (hazards) -> a number drawn falls below: event
+
+A hazard is asked every 80 ms. What is decided begins `LEAD_FRAMES` after the next frame's beginning, so that a plan
+made every second frame still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a shake or
+a tilt; nobody nods, laughs or says "mm-hm" who is speaking or has not been spoken to for two seconds.
+
+Laws: the same evidence and seed give the same events; a later frame changes nothing before; memory is never changed in
+place; hazards are finite whatever comes in; more of a `Calmness` rate is never less of its hazard.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.config import Calmness
+from sfms_robot.data import data_dir
+from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.listeners.events import chance
+from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
+from sfms_robot.listeners.events.hazards import FILE, STEP_FRAMES, STEP_S, EventTables, HazardBank, Shape, load_tables
+from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
+
+LEAD_FRAMES: Final = 2
+LISTENING_S: Final = 2.0  # somebody else spoke this recently
+AT_PERSON: Final = (0.0, 0.0)
+# What one thing at a time does: while one of a group is under way none of it begins.
+GROUPS: Final = (
+    frozenset(("nod", "shake", "tilt")),
+    frozenset(("smile", "laugh")),
+    frozenset(("mm_hm", "laugh")),
+    frozenset(("brow_raise",)),
+    frozenset(("blink",)),
+    frozenset(("gaze_shift",)),
+)
+ALWAYS: Final = frozenset(("blink", "gaze_shift"))  # the others only while listening
+SWINGING: Final = frozenset(("nod", "shake"))
+ANGLES: Final = frozenset(("nod", "shake", "tilt", "gaze_shift"))  # sizes are degrees
+MOST_SWINGS: Final = 4
+SWING_S: Final = (0.3, 0.66)  # there and back
+SIDEWAYS, UP = 0.75, 0.75  # shares of looks away: rather sideways than not, rather up than down
+_EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
+    kind: frozenset().union(*(group for group in GROUPS if kind in group)) for kind in EVENT_KINDS
+}
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a frame has decided.
+
+    Attributes:
+        events: new ones; most frames have none.
+        hazards_hz: by kind, events a second if things stayed as they are; 0 while it cannot happen.
+    """
+
+    events: tuple[ListenerEvent, ...]
+    hazards_hz: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class DecideMemory:
+    """What one stream remembers of its own doing.
+
+    Attributes:
+        seed, calmness: of the stream.
+        done: events decided, in order, as far as they still matter.
+        hazards_hz: the last ones asked for.
+    """
+
+    seed: int
+    calmness: Calmness
+    done: tuple[ListenerEvent, ...] = ()
+    hazards_hz: Mapping[str, float] | None = None
+
+
+@dataclass(frozen=True)
+class EventMemory:
+    """What one stream remembers: of the person, and of itself."""
+
+    sensed: SenseMemory
+    decided: DecideMemory
+
+
+class EventModel:
+    """Holds what was learned; streams are values."""
+
+    def __init__(self, tables: EventTables) -> None:
+        self.tables = tables
+        self.bank = HazardBank(tables.hazards)
+        self._draw = [EVENT_KINDS.index(kind) for kind in self.bank.kinds]
+        self._never: Mapping[str, float] = dict.fromkeys(EVENT_KINDS, 0.0)
+
+    @classmethod
+    def load(cls, file: Path | None = None) -> EventModel:
+        """From a file as `train events` writes it, or the bundled one. Raises ConfigError."""
+        return cls(load_tables(data_dir("sim") / "listeners" / FILE if file is None else file))
+
+    def start(self, seed: int, calmness: Calmness | None = None) -> EventMemory:
+        """Nothing heard, nothing done."""
+        asked = calmness or Calmness()
+        return EventMemory(SenseMemory(asked.addressed), DecideMemory(seed, asked))
+
+    def calmed(self, memory: EventMemory, calmness: Calmness) -> EventMemory:
+        """The same stream, from now on at other rates."""
+        return EventMemory(
+            replace(memory.sensed, addressed=calmness.addressed), replace(memory.decided, calmness=calmness)
+        )
+
+    def step(
+        self, speaker: SpeakerFrame, memory: EventMemory, own: Sequence[ListenerEvent] | None = None
+    ) -> tuple[Decision, EventMemory]:
+        """One frame of 40 ms -> what it decides. Pure; takes some 0.1 ms.
+
+        `own` replaces the history of what was decided by somebody's real one; what has not begun by now is not looked
+        at.
+        """
+        sensed, heard = sense(speaker, memory.sensed)
+        decision, decided = self.decide(sensed, memory.decided, own)
+        return decision, EventMemory(heard, decided)
+
+    def decide(
+        self, sensed: Sensed, memory: DecideMemory, own: Sequence[ListenerEvent] | None = None
+    ) -> tuple[Decision, DecideMemory]:
+        """The second half of `step`. A gaze shift away is followed by one back when its time is over."""
+        if sensed.frame % STEP_FRAMES != STEP_FRAMES - 1:
+            return Decision((), memory.hazards_hz or self._never), memory
+        now_s = (sensed.frame + 1) * FRAME_S
+        history = memory.done if own is None else begun_before(own, now_s)
+        odds, told = self._log_odds(sensed, history, now_s, memory.calmness)
+        may = _may_happen(sensed, history, now_s)
+        draws = chance.of_instant(memory.seed, sensed.frame)[self._draw]
+        hazards, events = dict(self._never), list(self._look_back(sensed.frame, history, now_s))
+        for at, kind in enumerate(self.bank.kinds):
+            if kind not in may or memory.calmness.per_minute(kind) == 0:
+                continue
+            probability = 1.0 / (1.0 + math.exp(-odds[at]))
+            hazards[kind] = probability / STEP_S
+            if draws[at] < probability and not any(event.kind in _EXCLUDES[kind] for event in events):
+                event = self.shaped(kind, sensed.frame, memory.seed)
+                events.append(
+                    replace(event, probability=probability, draw=float(draws[at]), evidence=self.bank.told(told, kind))
+                )
+        kept = remembered((*memory.done, *events), now_s) if events else memory.done
+        return Decision(tuple(events), hazards), replace(memory, done=kept, hazards_hz=hazards)
+
+    def _log_odds(
+        self, sensed: Sensed, history: Sequence[ListenerEvent], now_s: float, calmness: Calmness
+    ) -> tuple[list[float], Doubles]:
+        """Of every kind, at the rates asked for; and what each term adds."""
+        learned = self.tables.hazards
+        nods = calmness.nod or learned["nod"].per_minute
+        evidence = np.concatenate([sensed.heard, done(history, now_s, math.log(nods))])
+        told = self.bank.contributions(evidence)
+        odds = self.bank.log_odds(told).tolist()
+        for at, kind in enumerate(self.bank.kinds):
+            asked = calmness.per_minute(kind)
+            if asked and "log_rate" not in learned[kind].weights:
+                odds[at] += math.log(asked / learned[kind].per_minute)
+        return odds, told
+
+    def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
+        """The look back at the person, once looking away is over."""
+        shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
+        if shift is None or shift.target_rad in (None, AT_PERSON) or shift.end_s > _begin_s(frame) + 1e-9:
+            return ()
+        until_s = 60.0 / self.tables.hazards["gaze_shift"].per_minute
+        return (ListenerEvent("gaze_shift", _begin_s(frame), until_s, shift.size, target_rad=AT_PERSON),)
+
+    def shaped(self, kind: str, frame: int, seed: int) -> ListenerEvent:
+        """How long, how large, where to: by lot."""
+        shape = self.tables.shapes[kind]
+        long, large, side, up = chance.of_event(seed, frame, kind, 4).tolist()
+        habit, pace = chance.of_habit(seed, kind, 2).tolist()
+        duration_s = quantile(shape.duration_s, long)
+        size = quantile(shape.size, large) * quantile(shape.habit, habit)
+        size = min(max(size, shape.size[0]), shape.size[-1])
+        size = math.radians(size) if kind in ANGLES else size
+        swings = 1
+        if kind in SWINGING:
+            swings, duration_s = _swings(duration_s, shape, pace)
+        target = _aside(size, side, up) if kind == "gaze_shift" else None
+        return ListenerEvent(kind, _begin_s(frame), duration_s, size, swings, target)
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Evenly spaced quantiles as a distribution: its value at 0..1."""
+    return float(np.interp(share * (len(values) - 1), np.arange(len(values)), values))
+
+
+def _begin_s(frame: int) -> float:
+    return (frame + 1 + LEAD_FRAMES) * FRAME_S
+
+
+def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) -> frozenset[str]:
+    """Kinds that the moment allows."""
+    heard = sensed.heard
+    spoken_to = heard[AT["silence_s"]] <= LISTENING_S and not (
+        np.isnan(heard[AT["phrase_s"]]) and np.isnan(heard[AT["last_phrase_s"]])
+    )
+    listening = spoken_to and heard[AT["own_voice_s"]] > 0
+    under_way = {event.kind for event in history if event.end_s > now_s and event.kind != "gaze_shift"}
+    shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
+    if shift is not None and (shift.target_rad != AT_PERSON or shift.start_s > now_s):
+        under_way.add("gaze_shift")
+    return frozenset(kind for kind in EVENT_KINDS if (listening or kind in ALWAYS) and not _EXCLUDES[kind] & under_way)
+
+
+def _swings(duration_s: float, shape: Shape, pace: float) -> tuple[int, float]:
+    """How often the head goes there and back in about that time, and how long that takes it."""
+    pace_hz = quantile(shape.swings_hz or (2.0, 2.0), pace)
+    swings = min(max(round(duration_s * pace_hz), 1), MOST_SWINGS)
+    return swings, swings * min(max(duration_s / swings, SWING_S[0]), SWING_S[1])
+
+
+def _aside(angle_rad: float, side: float, up: float) -> tuple[float, float]:
+    """(yaw, pitch) that far away, to either side alike."""
+    share = 2 * side % 1.0
+    steep = 45.0 * (share / SIDEWAYS if share < SIDEWAYS else 1 + (share - SIDEWAYS) / (1 - SIDEWAYS))
+    yaw = math.copysign(math.cos(math.radians(steep)), 0.5 - side)
+    return angle_rad * yaw, angle_rad * math.copysign(math.sin(math.radians(steep)), up - UP)  # pitch + is down

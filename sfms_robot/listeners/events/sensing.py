@@ -1,0 +1,103 @@
+"""A person's frame as evidence: the ear hears who speaks, the face says who looks, nods, smiles and laughs.
+
+Each input may be missing. No microphone: a mouth that moves is a voice. No face: nobody nods or laughs, and whether the
+head is looked at is what `Calmness.addressed` says. Attention flickers; looked-at changes only when a quarter second of
+it, smoothed, has clearly crossed the middle.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
+
+from sfms_robot.frames import FRAME_S, Doubles, Floats, SpeakerFrame
+from sfms_robot.listeners.events.evidence import Hearing, Instant, hear, hearing
+from sfms_robot.listeners.events.face_signs import FaceState, read_signs
+from sfms_robot.signals import voice_activity
+from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.voice_activity import Ear
+
+Addressed = Literal["sense", "assume", "never"]
+OWN_VOICE_DB: Final = -50.0  # of full scale; what a program says is silent otherwise
+OWN_GAP_FRAMES: Final = 4  # between its words
+LOOK_S: Final = 0.25
+LOOKED, NOT_LOOKED = 0.6, 0.4
+LOST_FRAMES: Final = 25  # without a face nobody knows where its owner looks
+_KEPT: Final = math.exp(-FRAME_S / LOOK_S)
+
+
+@dataclass(frozen=True)
+class SenseMemory:
+    """What is remembered of the person.
+
+    Attributes:
+        addressed: as asked for.
+        ear: of their voice; deaf: there has been no sound to hear at all.
+        own: frames since own voice.
+        attention: smoothed; None before any. looked: 1, 0, or NaN for nobody knows.
+        unseen: frames since their face; None before the first.
+    """
+
+    addressed: Addressed = "sense"
+    ear: Ear = field(default_factory=voice_activity.start)
+    deaf: bool = True
+    own: int = 10**6
+    attention: float | None = None
+    looked: float = math.nan
+    unseen: int | None = None
+    face: FaceState = FaceState()
+    hearing: Hearing = field(default_factory=hearing)
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """Evidence (len(HEARD),) after the frame of that index in loop time."""
+
+    frame: int
+    heard: Doubles
+
+
+def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemory]:
+    """Pure. Several streams of one speaker may share it if their `addressed` is the same."""
+    deaf = memory.deaf and not len(speaker.audio)
+    ear = memory.ear if deaf else voice_activity.step(energy_db(speaker.audio), memory.ear)
+    signs, face = read_signs(speaker.face, memory.face)
+    own = 0 if _sounds(speaker.agent_audio) else memory.own + 1
+    looked, watching = _looked(speaker, memory)
+    speaks = (own <= OWN_GAP_FRAMES, signs.mouth_moves if deaf else ear.active)
+    instant = Instant(speaks, (math.nan, looked), signs.laughs, signs.nods, signs.smiles)
+    heard, remembered = hear(instant, memory.hearing)
+    frame = round(speaker.time_s / FRAME_S) - 1
+    return Sensed(frame, heard), replace(watching, ear=ear, deaf=deaf, own=own, face=face, hearing=remembered)
+
+
+def _sounds(own_voice: Floats | None) -> bool:
+    return own_voice is not None and energy_db(own_voice) > OWN_VOICE_DB
+
+
+def _looked(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMemory]:
+    """1, 0 or NaN, and what is remembered of it."""
+    if memory.addressed != "sense":
+        return float(memory.addressed == "assume"), memory
+    if speaker.face is None and speaker.attention is None:
+        unseen = None if memory.unseen is None else memory.unseen + 1
+        if unseen is None:
+            return 1.0, memory
+        lost = unseen > LOST_FRAMES
+        gone = replace(memory, unseen=unseen, attention=None if lost else memory.attention,
+                       looked=math.nan if lost else memory.looked)  # fmt: skip
+        return gone.looked, gone
+    given = speaker.attention
+    if given is None or not math.isfinite(given):
+        gone = replace(memory, unseen=0, attention=None, looked=math.nan)
+        return math.nan, gone
+    before = memory.attention
+    given = min(max(given, 0.0), 1.0)
+    level = given if before is None else given + (before - given) * _KEPT
+    looked = float(level > 0.5) if math.isnan(memory.looked) else memory.looked
+    if level > LOOKED:
+        looked = 1.0
+    elif level < NOT_LOOKED:
+        looked = 0.0
+    return looked, replace(memory, unseen=0, attention=level, looked=looked)

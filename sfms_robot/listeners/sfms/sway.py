@@ -1,0 +1,56 @@
+"""Slow sway of the head, as a process of its own beside the tokens. Beyond the paper, which has tokens for all.
+
+A head at rest moves by about a degree, most of it below half a hertz. As tokens that steps: the codes of a whole head
+are as far apart as its sway is wide. A slow group of its own would need hundreds of codes to move by a tenth of a
+degree, and keyframes where nothing happens; and there is nothing to predict, since sway answers to nobody. So it is
+drawn from what recorded heads do (Shinozuka's spectral representation of a stationary Gaussian process),
+
+    x(t) = size * sum over lines l of  amplitude[l] * (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a, b ~ N(0, 1)
+
+`LINES` frequencies drawn from each of the `BANDS_HZ` per channel, amplitudes fitted to the bands' powers, `size` a
+stream's own manner. A function of time alone: any frame of the future is known, nothing adds up, and after an hour it
+is where it was. It sets in over the first `EASE_S`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
+BANDS = len(BANDS_HZ) - 1
+LINES = 3  # of each band
+EASE_S = 3.0
+
+
+def draw_sway(amplitude: Tensor, spread: Tensor, generator: torch.Generator) -> Tensor:
+    """What one stream's sway is made of.
+
+    Args:
+        amplitude: (BANDS, S) deviation of each channel within each band.
+        spread: () deviation of the logarithm of sizes between people.
+        generator: draws it.
+
+    Returns:
+        (3, BANDS * LINES, S) frequencies [Hz], factors of cosine and of sine in units of the motion.
+    """
+    bands, channels = amplitude.shape
+    edges = torch.tensor(BANDS_HZ, dtype=torch.float64)
+    uniform = torch.rand(bands, LINES, channels, generator=generator, dtype=torch.float64)
+    frequency_hz = edges[:-1, None, None] + uniform * (edges[1:] - edges[:-1])[:, None, None]
+    size = torch.exp(spread.double() * torch.randn((), generator=generator, dtype=torch.float64))
+    factors = torch.randn(2, bands, LINES, channels, generator=generator, dtype=torch.float64)
+    factors = size * factors * (amplitude.double() / math.sqrt(LINES))[:, None]
+    return torch.cat([frequency_hz[None], factors]).flatten(1, 2)
+
+
+def sway_at(sway: Tensor, times_s: Tensor) -> Tensor:
+    """Sway (..., 3, L, S) at times (T,) since the stream began -> (..., T, S) in units of the motion; 0 before that."""
+    frequency_hz, cosine, sine = sway.unbind(-3)
+    turn = 2 * math.pi * times_s.double()[:, None, None] * frequency_hz[..., None, :, :]  # (..., T, L, S)
+    wave = cosine[..., None, :, :] * turn.cos() + sine[..., None, :, :] * turn.sin()
+    begun = (times_s / EASE_S).clamp(0, 1)
+    out: Tensor = (wave.sum(-2) * (begun**2 * (3 - 2 * begun))[:, None]).float()
+    return out

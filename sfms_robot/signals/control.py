@@ -1,0 +1,62 @@
+"""Events as numbers per frame: what a model of motion is told of a nod, a smile, a blink that has been decided.
+
+Training reads the events that a dyad is made of, a stream those that it has decided so far; both get the same rows from
+here. Row i is the face at the end of frame i. Laws: rows of two halves are the rows of the whole; an event outside its
+time changes nothing; rows are finite, and bounded by `BOUND`, whatever the events.
+
+Of every kind: it is under way (0 or 1), for how long (logarithm), how much of it is over (0..1), its size. Of kinds
+that swing also sine and cosine of the swing: where in it the head is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import FRAME_S, Floats, ListenerEvent
+
+# A gaze shift is not among them: the eyes follow `gaze_kinematics`, behind the model.
+KINDS: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "blink")
+SWINGING: Final = ("nod", "shake")
+FULL_SIZE: Final = {"nod": np.deg2rad(6.0), "shake": np.deg2rad(8.0), "tilt": np.deg2rad(5.0)}  # told as 1; else 1 is 1
+BOUND: Final = 4.0
+_EACH: Final = 4
+COLUMNS: Final = tuple(f"{kind}.{what}" for kind in KINDS for what in ("active", "since", "over", "size")) + tuple(
+    f"{kind}.{what}" for kind in SWINGING for what in ("sine", "cosine")
+)
+_SOFT_S: Final = 0.2
+
+
+def control_track(events: Sequence[ListenerEvent], first: int, frames: int) -> Floats:
+    """Rows (frames, len(COLUMNS)) of frames `first`, `first` + 1, ...; times of the events count from frame 0.
+
+    Of two events of one kind at one time the later one is told. Kinds without columns are left out.
+    """
+    out = np.zeros((frames, len(COLUMNS)), np.float32)
+    times_s = (first + 1 + np.arange(frames)) * FRAME_S
+    for event in sorted(events, key=lambda one: one.start_s):
+        if event.kind not in KINDS:
+            continue
+        since_s = times_s - event.start_s
+        rows = np.flatnonzero((since_s >= -1e-9) & (since_s < event.duration_s - 1e-9))
+        if len(rows):
+            _tell(out, rows, np.maximum(since_s[rows], 0.0), event)
+    return out
+
+
+def _tell(
+    out: Floats, rows: np.typing.NDArray[np.intp], since_s: np.typing.NDArray[np.float64], event: ListenerEvent
+) -> None:
+    over = np.minimum(since_s / event.duration_s, 1.0)
+    size = min(abs(event.size) / FULL_SIZE.get(event.kind, 1.0), BOUND)
+    at = _EACH * KINDS.index(event.kind)
+    out[rows, at] = 1.0
+    out[rows, at + 1] = np.minimum(np.log1p(since_s / _SOFT_S), BOUND)
+    out[rows, at + 2] = over
+    out[rows, at + 3] = size
+    if event.kind in SWINGING:
+        at = _EACH * len(KINDS) + 2 * SWINGING.index(event.kind)
+        turn = 2 * np.pi * event.swings * over
+        out[rows, at], out[rows, at + 1] = np.sin(turn), np.cos(turn)

@@ -1,0 +1,223 @@
+"""How eyes and head go to where somebody looks: from gaze targets to motion, one 40 ms frame at a time.
+
+The eyes leave first and are there 40 to 120 ms later (the main sequence of saccades). The head follows with its share,
+which hardly exists below 8 degrees and grows with how far aside the target is, on the way of least jerk (bell-shaped
+speed), and ends later. All the while the eyes make up for the head (vestibulo-ocular reflex): eye in head is gaze less
+head, also while the head nods or sways. On a target, the eyes wander over it in fixations of 228 ms (median) whose
+steps have 0.9 degrees (median), as people's do while they listen; what is larger is a gaze shift and somebody else's to decide.
+
+Laws: N frames at once are the N frames one by one. Gaze (head and eyes together) is within 3 degrees of the target
+200 ms after a shift of up to 30 degrees between targets that eyes can reach, and within 1.5 degrees during a nod of 8.
+The head's angle never jumps, and neither does its speed; on a still target its part stays where it is. Mirrored targets
+give a mirrored head, and mirrored eyes where they do not wander. What is not finite is refused.
+
+Lids are not moved here: heads couple them with eyeLookUp and eyeLookDown.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, POSE, Floats
+
+EYE_PAN_RAD: Final = math.radians(30)  # of an eyeLook channel of 1, sideways
+EYE_TILT_RAD: Final = math.radians(20)
+# Columns of a motion row that `GazeFrame.eyes` stands for.
+EYE_CHANNELS: Final = tuple(
+    CHANNEL_INDEX[f"eyeLook{way}{side}"] for side in ("Left", "Right") for way in ("Down", "In", "Out", "Up")
+)
+PURSUIT_RAD: Final = math.radians(1)  # a target that moves less is followed, one that moves more is shifted to
+
+_EYES_ALONE_RAD: Final = math.radians(10)  # about what is left to the eyes
+_SHARES: Final = (0.5, 0.75)  # of the rest that is the head's, by person
+_TILT_SHARE: Final = 0.8  # of the pitch, less than of the yaw
+_ROLL: Final = -0.08  # of the yaw
+_SACCADE_S: Final = (0.021, 0.0022, 0.04, 0.12)  # at 0, more for each degree, least, most
+_HEAD_S: Final = (0.3, 0.012)  # at 0, more for each degree that it turns
+_SPOT_RAD: Final = (math.radians(0.55), math.radians(1.3))  # deviation and most, from the target
+_DRIFT_RAD_S: Final = math.radians(0.2)
+_FIXATION_S: Final = (0.228, 0.48, 0.11)  # median, deviation of its logarithm, least
+
+Pair = tuple[float, float]  # yaw, pitch
+Axis = tuple[float, float, float]  # angle, speed, acceleration
+
+
+@dataclass(frozen=True)
+class GazeFrame:
+    """One frame of a look.
+
+    Attributes:
+        head_rad: (3,) roll, pitch, yaw that the look adds to the head.
+        eyes: (8,) values of `EYE_CHANNELS`, 0..1.
+    """
+
+    head_rad: Floats
+    eyes: Floats
+
+    def applied(self, motion: Floats) -> Floats:
+        """(58,) the motion with this look: a new row."""
+        row = np.array(motion, np.float32)
+        row[:3] += self.head_rad
+        row[list(EYE_CHANNELS)] = self.eyes
+        return row
+
+
+@dataclass(frozen=True)
+class GazeState:
+    """Where eyes and head are between two frames. Angles are in space; all is (yaw, pitch).
+
+    Attributes:
+        seed: of the fixations.
+        wanders: eyes move over what they look at.
+        share: the head's, of what is not left to the eyes.
+        target_rad: the last one.
+        gaze_rad: where head and eyes together point.
+        from_rad, shift_s, since_s: where the shift in progress began, how long it takes, how long it has gone on.
+        number, spot_rad, drift_rad_s, left_s: the fixation: which, where from the target, its drift, how long it lasts.
+        head: the head's part, yaw and pitch; `head_left_s` until it is there.
+    """
+
+    seed: int
+    wanders: bool
+    share: float
+    target_rad: Pair = (0.0, 0.0)
+    gaze_rad: Pair = (0.0, 0.0)
+    from_rad: Pair = (0.0, 0.0)
+    shift_s: float = 0.04
+    since_s: float = 1.0
+    number: int = 0
+    spot_rad: Pair = (0.0, 0.0)
+    drift_rad_s: Pair = (0.0, 0.0)
+    left_s: float = 0.0
+    head: tuple[Axis, Axis] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    head_left_s: float = 0.0
+
+
+def start(seed: int, wanders: bool = True) -> GazeState:
+    """Somebody who looks straight ahead; how much of a look is the head's is drawn by `seed`."""
+    return GazeState(seed, wanders, float(np.random.default_rng(seed).uniform(*_SHARES)))
+
+
+def step(target_rad: ArrayLike, pose: ArrayLike, state: GazeState) -> tuple[GazeFrame, GazeState]:
+    """The look at the end of the next 40 ms.
+
+    Args:
+        target_rad: (2,) yaw and pitch in space, (0, 0) at the person; from the beginning of the frame on.
+        pose: (6,) of the head without its part of the look, at the end of the frame.
+
+    Raises ValueError for what is not finite.
+    """
+    yaw, pitch = (float(value) for value in np.asarray(target_rad, np.float64))
+    _, tilted, turned, *_ = (float(value) for value in np.asarray(pose, np.float64))
+    if not (math.isfinite(yaw) and math.isfinite(pitch) and math.isfinite(tilted) and math.isfinite(turned)):
+        raise ValueError(f"gaze target ({yaw:g}, {pitch:g}) with head at yaw {turned:g}, pitch {tilted:g}: not finite")
+    return _step((yaw, pitch), (turned, tilted), state)
+
+
+def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, GazeState]:
+    """`step` over targets (N, 2) and poses (N, 6): the head's part (N, 3), the eyes (N, 8), the state after them."""
+    targets, heads = np.asarray(targets_rad, np.float64), np.asarray(poses, np.float64)[:, POSE]
+    if not (np.isfinite(targets).all() and np.isfinite(heads[:, 1:3]).all()):
+        raise ValueError("gaze targets or head poses are not finite")
+    head, eyes = np.zeros((len(targets), 3), np.float32), np.zeros((len(targets), len(EYE_CHANNELS)), np.float32)
+    for row, ((yaw, pitch), (tilted, turned)) in enumerate(zip(targets.tolist(), heads[:, 1:3].tolist(), strict=True)):
+        frame, state = _step((yaw, pitch), (turned, tilted), state)
+        head[row], eyes[row] = frame.head_rad, frame.eyes
+    return head, eyes, state
+
+
+def _step(target: Pair, body: Pair, state: GazeState) -> tuple[GazeFrame, GazeState]:
+    state = _aimed(target, state)
+    since_s, left_s = state.since_s + FRAME_S, max(0.0, state.left_s - FRAME_S)
+    part = _least_jerk(min(1.0, since_s / state.shift_s))
+    goal = head_share(target, state.share)
+    yaw, pitch = (
+        _towards(axis, wanted, state.head_left_s, FRAME_S) for axis, wanted in zip(state.head, goal, strict=True)
+    )
+    head = (yaw[0] + body[0], pitch[0] + body[1])
+    wanted = [
+        begun + part * (aim + spot + drift * since_s - begun)
+        for begun, aim, spot, drift in zip(state.from_rad, target, state.spot_rad, state.drift_rad_s, strict=True)
+    ]
+    pan, tilt = wanted[0] - head[0], wanted[1] - head[1]
+    pan, tilt = max(-EYE_PAN_RAD, min(pan, EYE_PAN_RAD)), max(-EYE_TILT_RAD, min(tilt, EYE_TILT_RAD))
+    after = replace(
+        state,
+        gaze_rad=(head[0] + pan, head[1] + tilt),
+        since_s=since_s,
+        left_s=left_s,
+        head=(yaw, pitch),
+        head_left_s=max(0.0, state.head_left_s - FRAME_S),
+    )
+    return GazeFrame(np.array([_ROLL * yaw[0], pitch[0], yaw[0]], np.float32), _eyes(pan, tilt)), after
+
+
+def _aimed(target: Pair, state: GazeState) -> GazeState:
+    """The state with the shift that begins now, if one does: to another target, or to the next spot on this one."""
+    moved = math.dist(target, state.target_rad)
+    if moved > 0:
+        turn_rad = math.dist(head_share(target, state.share), (state.head[0][0], state.head[1][0]))
+        state = replace(state, target_rad=target, head_left_s=_HEAD_S[0] + _HEAD_S[1] * math.degrees(turn_rad))
+    if moved > PURSUIT_RAD or (state.wanders and state.left_s <= 1e-9):
+        state = _fixated(state) if state.wanders else state
+    elif moved == 0:
+        return state
+    far = math.dist((target[0] + state.spot_rad[0], target[1] + state.spot_rad[1]), state.gaze_rad)
+    first, each, least, most = _SACCADE_S
+    shift_s = max(least, min(first + each * math.degrees(far), most))
+    return replace(state, from_rad=state.gaze_rad, shift_s=shift_s, since_s=0.0)
+
+
+def _fixated(state: GazeState) -> GazeState:
+    """The next fixation: its spot, its drift and its length hang on the seed and its number alone."""
+    rng = np.random.default_rng((state.seed, state.number))
+    spread, most = _SPOT_RAD
+    x, y, drift_x, drift_y, long = rng.standard_normal(5).tolist()
+    narrow = spread * min(1.0, most / max(spread * math.hypot(x, y), 1e-9))
+    median_s, deviation, least_s = _FIXATION_S
+    return replace(
+        state,
+        number=state.number + 1,
+        spot_rad=(narrow * x, narrow * y),
+        drift_rad_s=(_DRIFT_RAD_S * drift_x, _DRIFT_RAD_S * drift_y),
+        left_s=max(least_s, median_s * math.exp(deviation * long)),
+    )
+
+
+def head_share(target_rad: Pair, share: float) -> Pair:
+    """The head's part (yaw, pitch) of a look that rests on the target: next to none near the middle, then `share`."""
+    far = math.hypot(*target_rad)
+    if far < 1e-9:
+        return 0.0, 0.0
+    part = share * (math.hypot(far, _EYES_ALONE_RAD) - _EYES_ALONE_RAD) / far
+    return part * target_rad[0], _TILT_SHARE * part * target_rad[1]
+
+
+def _towards(axis: Axis, goal: float, left_s: float, dt_s: float) -> Axis:
+    """Angle, speed and acceleration `dt_s` further on the way of least jerk that rests at `goal` in `left_s`."""
+    if left_s <= dt_s + 1e-9:
+        return goal, 0.0, 0.0
+    x, v, a = axis
+    d, v_t, a_t = goal - x, v * left_s, a * left_s**2
+    c3, c4, c5 = (20 * d - 12 * v_t - 3 * a_t) / 2, (-30 * d + 16 * v_t + 3 * a_t) / 2, (12 * d - 6 * v_t - a_t) / 2
+    s = dt_s / left_s
+    return (
+        x + s * (v_t + s * (a_t / 2 + s * (c3 + s * (c4 + s * c5)))),
+        (v_t + s * (a_t + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / left_s,
+        (a_t + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / left_s**2,
+    )
+
+
+def _least_jerk(s: float) -> float:
+    return s**3 * (10 + s * (-15 + 6 * s))
+
+
+def _eyes(pan: float, tilt: float) -> Floats:
+    left, right = max(0.0, pan) / EYE_PAN_RAD, max(0.0, -pan) / EYE_PAN_RAD
+    down, up = max(0.0, tilt) / EYE_TILT_RAD, max(0.0, -tilt) / EYE_TILT_RAD
+    return np.array([down, right, left, up, down, left, right, up], np.float32)

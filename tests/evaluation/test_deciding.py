@@ -1,0 +1,92 @@
+"""Hazards asked with somebody's history go by it; decisions go by their own, whoever is decided for beside."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.evaluation import timing
+from sfms_robot.evaluation.deciding import decisions, forced_hazards, sensed, spans_of
+from sfms_robot.evaluation.listener_meetings import ListenerMeeting, shifted
+from sfms_robot.evaluation.rollout import speaker_frames
+from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_SAMPLES
+from sfms_robot.listeners.events.hazards import EventTables
+from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.signals.events import runs
+
+MINUTES = 6
+FRAMES = MINUTES * 60 * FRAME_HZ
+
+
+def model(intercept=-4.0, **nod_weights):
+    """Nothing ever happens but nods, by these weights."""
+    never = {"learned_from": "nobody", "per_minute": 1.0, "intercept": -30.0, "weights": {"gaze_known": 0.0}}
+    hazards = dict.fromkeys(EVENT_KINDS, never)
+    hazards["nod"] = {**never, "intercept": intercept, "weights": nod_weights}
+    shape = {"duration_s": (0.4, 0.6), "size": (4.0, 5.0), "swings_hz": (2.0, 2.5)}
+    return EventModel(EventTables(hazards=hazards, shapes=dict.fromkeys(EVENT_KINDS, shape)))
+
+
+PHASE = {"silence_s": {0.0: -3.0, 0.1: 3.0, 0.8: 3.0, 1.0: -3.0}}
+HISTORY = {"nod_end_s": {0.0: -3.0, 0.5: 3.0, 2.0: 3.0, 3.0: -3.0}}
+
+
+@pytest.fixture(scope="module")
+def talk():
+    """(N,) phrases of 1 to 4 s with pauses of 0.4 to 1.6 s."""
+    rng = np.random.default_rng(1)
+    pieces = [np.r_[np.ones(rng.integers(25, 100), bool), np.zeros(rng.integers(10, 40), bool)] for _ in range(400)]
+    return np.concatenate(pieces)[:FRAMES]
+
+
+@pytest.fixture(scope="module")
+def speaker(talk):
+    noise = np.random.default_rng(2).standard_normal(FRAMES * FRAME_SAMPLES).astype(np.float32)
+    audio = noise * np.where(np.repeat(talk, FRAME_SAMPLES), np.float32(0.1), np.float32(1e-4))
+    return speaker_frames(audio, np.full((FRAMES, 58), np.nan, np.float32))
+
+
+def meeting(talk, nods_s):
+    silent = np.zeros(FRAMES, bool)
+    spans = np.stack([nods_s, nods_s + 0.5], axis=1)
+    return ListenerMeeting(
+        "M1a_A", "A", (), {"nod": spans}, np.zeros(0, bool), talk, silent, silent, talk, np.full(FRAMES, np.nan)
+    )
+
+
+def contingency(decides, speaker, one):
+    """AUC matched, and matched minus shifted."""
+    matched, other = (
+        forced_hazards(decides, sensed(decides, frames), one.history)["nod"] for frames in (speaker, shifted(speaker))
+    )
+    found = timing.contingent("x", matched, [other], one)
+    return found["x"][0] / found["x"][1], found["x_matched_minus_shifted"][0] / found["x"][1]
+
+
+def test_shifting_destroys_hazards_of_speech_phase(talk, speaker):
+    ends = np.array([end for _, end in runs(talk)]) / FRAME_HZ
+    auc, gained = contingency(model(**PHASE), speaker, meeting(talk, ends[:-1] + 0.3))
+    assert auc > 0.8 and gained > 0.25
+
+
+def test_shifting_leaves_hazards_of_own_history_as_they_were(talk, speaker):
+    first = np.arange(3.0, MINUTES * 60 - 5, 20.0)
+    auc, gained = contingency(model(**HISTORY), speaker, meeting(talk, np.sort(np.r_[first, first + 1.7])))
+    assert auc > 0.6 and abs(gained) < 0.03
+
+
+def test_what_has_not_begun_changes_no_hazard(talk, speaker):
+    one, decides = meeting(talk, np.arange(2.0, 300.0, 5.0)), model(**HISTORY)
+    heard = sensed(decides, speaker[:3000])
+    whole = forced_hazards(decides, heard, one.history)["nod"]
+    begun = forced_hazards(decides, heard, [event for event in one.history if event.start_s < 60.0])["nod"]
+    np.testing.assert_array_equal(whole[: 60 * FRAME_HZ - 1], begun[: 60 * FRAME_HZ - 1])
+    assert (whole != begun).any()
+
+
+def test_a_seed_decides_the_same_alone_and_beside_others(speaker):
+    decides = model(-3.0, **PHASE)
+    heard = sensed(decides, speaker[:3000])
+    together = decisions(decides, heard, [1, 2, 3])
+    assert together == [decisions(decides, heard, [seed])[0] for seed in (1, 2, 3)]
+    assert together[0] != together[1]
+    nods = spans_of(together[0], "nod")
+    assert len(nods) > 3 and (np.diff(nods[:, 0]) > 0).all() and not len(spans_of(together[0], "blink"))

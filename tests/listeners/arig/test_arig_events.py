@@ -1,0 +1,251 @@
+"""A listener that is told what happens: what it does with events, with gaze, and with its conversational states."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
+
+from sfms_robot.config.arig import EVENT_STATES, STATES, paper_state
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, ListenerEvent
+from sfms_robot.listeners.arig.csu import FEEDBACK, LISTENING, NODDING, SMILING, Sojourn, with_feedback
+from sfms_robot.listeners.arig.stream import ArigListener
+from sfms_robot.signals.control import COLUMNS, control_track
+
+TOLD = {"events": True, "draws": "innovation"}
+EYES = [index for name, index in CHANNEL_INDEX.items() if name.startswith("eyeLook")]
+FACE = [index for name, index in CHANNEL_INDEX.items() if index >= 6 and index not in EYES]
+
+
+@pytest.fixture(scope="module")
+def told() -> ArigListener:
+    return soft(arig_listener(**TOLD))
+
+
+def soft(listener: ArigListener) -> ArigListener:
+    """Whose motion is small and inside 0..1, where nothing is clipped, and whose states last some frames."""
+    model = listener.model
+    with torch.no_grad():
+        model.motion_std.fill_(0.02)
+        model.motion_mean.copy_(0.5 * model.is_drawn)
+        if model.settings.draws == "innovation":
+            model.rho.fill_(0.9)
+        if model.states is not None and model.settings.events:
+            model.states.durations.copy_(torch.linspace(1, 6, 33).expand(7, -1))
+    return listener
+
+
+def nods(frames: int, *starts_s: float) -> np.ndarray:
+    """(frames, K) of nods of half a second."""
+    return control_track([ListenerEvent("nod", start, 0.5, 0.1, 2) for start in starts_s], 0, frames)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        TOLD,
+        {"events": True},
+        {"events": True, "draws": "step"},
+        {"draws": "innovation"},
+        TOLD | {"state_guidance": False},
+        TOLD | {"visual": False},
+        TOLD | {"discrete": True},
+    ],
+    ids=str,
+)
+def test_stream_equals_offline_given_the_states_that_were_drawn(changes):
+    listener, speaker = soft(arig_listener(**changes)), talk(31)
+    control = nods(32, 0.3, 0.9) if listener.settings.events else None
+    memory, made, states = listener.start(3), [], [listener.start(3).state]
+    for index, frame in enumerate(speaker):
+        plan, memory = listener.step(frame, memory, None if control is None else control[index : index + 2])
+        made.append(plan.frames[0])
+        states.append(memory.state)
+    dyad = dyad_of(listener, speaker, torch.from_numpy(np.stack(made)), control)
+    with torch.no_grad():
+        offline = listener.model.generate(dyad, noise_of_told(listener, 31, seed=3), torch.tensor([states]))
+    assert 0 < np.stack(made)[:, FACE].min() and np.stack(made)[:, FACE].max() < 1
+    np.testing.assert_allclose(np.stack(made), offline[0], atol=2e-5)
+
+
+def noise_of_told(listener: ArigListener, frames: int, seed: int) -> torch.Tensor:
+    """What a stream of that seed draws, its states besides: (1, frames, steps, channels)."""
+    if not (listener.settings.events and listener.settings.state_guidance):
+        return noise_of(listener, frames, seed)
+    generator, noise = torch.Generator().manual_seed(seed), []
+    for _ in range(frames):
+        noise.append(torch.randn(listener.model.noise_shape, generator=generator))
+        torch.rand(2, generator=generator)
+    return torch.stack(noise)[None]
+
+
+@pytest.mark.parametrize("changed_from", [2, 9, 20])
+def test_later_control_never_changes_earlier_plans(told, changed_from: int):
+    """The plan made at frame t shows frame t + 1, and is told its row."""
+    speaker, control = talk(24), nods(25, 0.2)
+    other = control.copy()
+    other[changed_from + 1 :] = nods(25, changed_from * FRAME_S)[changed_from + 1 :] + 0.5
+    before, after = streamed(told, speaker, 1, control), streamed(told, speaker, 1, other)
+    np.testing.assert_array_equal(before[:changed_from], after[:changed_from])
+    assert not np.array_equal(before[changed_from:], after[changed_from:])
+
+
+def test_nothing_told_is_nothing_happening(told):
+    speaker = talk(6)
+    silent = streamed(told, speaker, 1, nods(7))
+    np.testing.assert_array_equal(streamed(told, speaker), silent)
+    assert not np.array_equal(streamed(told, speaker, 1, nods(7, 0.05)), silent)
+
+
+def test_gradients_reach_the_control_input():
+    listener = soft(arig_listener(**TOLD))
+    speaker = talk(12)
+    control = torch.from_numpy(nods(13, 0.1)).requires_grad_()
+    dyad = dyad_of(listener, speaker, torch.rand(12, 58), control.detach().numpy())
+    dyad = dataclasses.replace(dyad, control=control[None])
+    states = torch.zeros(1, 13, dtype=torch.long)
+    listener.model.losses(dyad, states, torch.Generator().manual_seed(0)).motion.sum().backward()
+    assert bool((control.grad.abs().sum(1) > 0).all())  # of every frame
+
+
+@pytest.mark.parametrize("shape", [(2, 5), (1, len(COLUMNS)), (3, len(COLUMNS)), (len(COLUMNS),)])
+def test_control_of_another_shape_is_refused(told, shape):
+    with pytest.raises(ValueError, match="control is"):
+        told.step(talk(1)[0], told.start(1), np.zeros(shape, np.float32))
+
+
+def test_a_listener_without_events_takes_no_control():
+    deaf = arig_listener()
+    assert deaf.control_frames == (0, 0) and arig_listener(**TOLD).control_frames == (1, 1)
+    with pytest.raises(ValueError, match="control is for a listener with events: true"):
+        deaf.step(talk(1)[0], deaf.start(1), nods(2))
+
+
+def test_offline_control_of_another_shape_is_refused_by_name(told):
+    dyad = dyad_of(told, talk(5), torch.rand(5, 58), nods(6))
+    for wrong in (None, torch.zeros(1, 6, 3), torch.zeros(1, 5, len(COLUMNS))):
+        with pytest.raises(ValueError, match="control is"):
+            told.model.condition(dataclasses.replace(dyad, control=wrong))
+
+
+@pytest.mark.parametrize("draws", ["motion", "step", "innovation"])
+def test_eyes_rest_whatever_the_weights_say(draws: str):
+    out = streamed(soft(arig_listener(events=True, draws=draws)), talk(8), 1, nods(9, 0.1))
+    assert not out[:, EYES].any() and out[:, FACE].std() > 0
+
+
+def test_several_streams_of_one_speaker_are_what_each_is_alone(told):
+    speaker, seeds = talk(26), (1, 2, 3)
+    controls = [nods(27), nods(27, 0.1), nods(27, 0.4)]
+    memories = [told.start(seed) for seed in seeds]
+    for index, frame in enumerate(speaker):
+        rows = [control[index : index + 2] for control in controls]
+        alone = [told.step(frame, memory, row) for memory, row in zip(memories, rows, strict=True)]
+        plans, memories = told.step_many(frame, memories, rows)
+        for plan, memory, (own_plan, own) in zip(plans, memories, alone, strict=True):
+            np.testing.assert_allclose(plan.frames, own_plan.frames, atol=1e-4)
+            assert (memory.state, memory.sojourn) == (own.state, own.sojourn)
+            assert torch.equal(memory.random, own.random)
+            torch.testing.assert_close(memory.motion_keys, own.motion_keys, rtol=1e-3, atol=1e-3)
+
+
+# --- states -----------------------------------------------------------------------------------------------------
+
+
+STATES_OF_TINY = arig_model(**TOLD).states
+
+
+@given(
+    scores=st.lists(st.floats(-20, 20), min_size=9, max_size=9),
+    possible=st.lists(st.booleans(), min_size=7, max_size=7).filter(any),
+    state=st.integers(0, 6),
+    left=st.integers(0, 5),
+    uniforms=st.tuples(st.floats(0, 1, exclude_max=True, width=32), st.floats(0, 1, exclude_max=True, width=32)),
+)
+@settings(max_examples=200, deadline=None)
+def test_a_state_is_one_that_the_voices_leave_and_lasts_as_long_as_was_drawn(scores, possible, state, left, uniforms):
+    states = STATES_OF_TINY
+    states.possible[0, 1] = torch.tensor(possible)
+    states.durations.copy_(torch.linspace(2, 9, 33).expand(7, -1))
+    found = states.draw(torch.tensor(scores), (False, True), Sojourn(state, left), torch.tensor(uniforms))
+    assert possible[found.state]
+    if possible[state] and left:
+        assert found == Sojourn(state, left - 1)
+    else:
+        assert 1 <= found.left <= 8
+        assert found.state != state or sum(possible) == 1
+
+
+def test_states_last_as_long_as_those_of_the_data():
+    states = arig_model(**TOLD).states
+    states.durations.copy_(torch.linspace(5, 50, 33).expand(7, -1))
+    generator, sojourn, lasted = torch.Generator().manual_seed(0), Sojourn(0, 0), [0]
+    for _ in range(20_000):
+        before, sojourn = (
+            sojourn,
+            states.draw(torch.zeros(9), (False, False), sojourn, torch.rand(2, generator=generator)),
+        )
+        if sojourn.state != before.state:
+            lasted.append(0)
+        lasted[-1] += 1
+    assert np.percentile(lasted[1:-1], [5, 50, 95]) == pytest.approx([7, 27, 48], abs=3)
+
+
+def test_feedback_that_is_seen_is_known_from_the_events():
+    rows = torch.from_numpy(
+        control_track([ListenerEvent("nod", 0.0, 0.2, 0.1), ListenerEvent("smile", 0.12, 0.2, 0.5)], 0, 9)
+    )
+    seen = with_feedback(torch.full((9,), LISTENING), rows).tolist()
+    assert seen == [NODDING] * 4 + [SMILING] * 3 + [LISTENING] * 2
+    assert with_feedback(torch.full((9,), FEEDBACK), rows).tolist()[:7] == seen[:7]
+    for other in (-1, STATES.index("speaking"), STATES.index("waiting")):
+        assert with_feedback(torch.full((9,), other), rows).tolist() == [other] * 9
+    assert [paper_state(state) for state in (LISTENING, NODDING, SMILING)] == [LISTENING, FEEDBACK, FEEDBACK]
+    assert EVENT_STATES[: len(STATES)] == STATES
+
+
+def test_a_stream_nods_its_feedback(told):
+    """While the user is heard and a nod is under way, a listening stream gives feedback by it."""
+    memory, control, found = told.start(1), nods(41, 0.4, 1.0), []
+    with torch.no_grad():
+        told.model.states.possible.zero_()
+        told.model.states.possible[..., LISTENING] = True
+    for index, frame in enumerate(talk(40)):
+        _, memory = told.step(frame, memory, control[index : index + 2])
+        found.append(memory.state)
+    told.model.states.possible.fill_(True)
+    active = control[1:, COLUMNS.index("nod.active")] > 0
+    assert found == np.where(active, NODDING, LISTENING).tolist()
+
+
+# --- innovations ------------------------------------------------------------------------------------------------
+
+
+@given(rho=st.floats(0.0, 0.999), place=st.floats(-5, 5), other=st.floats(-5, 5), drawn=st.floats(-3, 3))
+@settings(max_examples=50, deadline=None)
+def test_what_was_drawn_wrongly_is_forgotten_at_the_rate_of_the_data(rho, place, other, drawn):
+    model = arig_model(draws="innovation")
+    model.rho.fill_(rho)
+    model.motion_low.fill_(-100)
+    model.motion_high.fill_(100)
+    one, two = (model.drawn(torch.full((58,), drawn), torch.full((58,), each)) for each in (place, other))
+    torch.testing.assert_close(one - two, torch.full((58,), rho * (place - other)), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        model.target(one, torch.full((58,), place)), torch.full((58,), drawn), rtol=1e-3, atol=1e-3
+    )
+
+
+def test_an_hour_of_independent_draws_stays_where_the_data_are():
+    """Innovations of deviation step_std make places of deviation 1, however long it runs."""
+    model = arig_model(draws="innovation")
+    model.rho.fill_(0.99)
+    model.step_std.fill_((1 - 0.99**2) ** 0.5)
+    generator, place, places = torch.Generator().manual_seed(0), torch.zeros(58), []
+    for _ in range(90_000):
+        place = model.drawn(torch.randn(58, generator=generator), place)
+        places.append(place)
+    for part in torch.stack(places).chunk(4):
+        assert float(part.std()) == pytest.approx(1.0, abs=0.1) and abs(float(part.mean())) < 0.1

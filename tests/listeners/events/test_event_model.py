@@ -1,0 +1,279 @@
+"""The same evidence gives the same events; nothing that lies makes it nod like a woodpecker; a knob is a knob."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.config import Calmness
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import (
+    CHANNEL_INDEX,
+    EVENT_KINDS,
+    FRAME_S,
+    FRAME_SAMPLES,
+    MOTION_DIM,
+    FaceFrame,
+    ListenerEvent,
+    SpeakerFrame,
+)
+from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, EventModel
+
+MODEL = EventModel.load()
+MINUTES = 4
+FRAMES = round(MINUTES * 60 / FRAME_S)
+NOBODY = np.zeros(0, np.float32)
+MOST_NODS = 12.0  # a minute, of a head that takes itself for addressed all along
+HEAD = ("nod", "shake", "tilt")
+
+
+def talk(frames=FRAMES, seed=0):
+    """(frames,) phrases of 1 to 6 s with pauses of 0.4 to 1.6 s."""
+    rng = np.random.default_rng(seed)
+    pieces: list[np.ndarray] = []
+    while sum(map(len, pieces)) < frames:
+        pieces += [np.ones(rng.integers(25, 150), bool), np.zeros(rng.integers(10, 40), bool)]
+    return np.concatenate(pieces)[:frames]
+
+
+def sound(active, seed=0):
+    """(N, 640) noise, loud where somebody speaks."""
+    rng = np.random.default_rng(seed)
+    level = np.where(active, 0.1, 1e-4)[:, None]
+    return (level * rng.standard_normal((len(active), FRAME_SAMPLES))).astype(np.float32)
+
+
+VOICE = sound(talk())
+
+
+def conversation(voice=VOICE, attention=None, face=None, agent=None):
+    """Speaker frames; attention and face are (N,) and (N, 58), or none."""
+    for index, audio in enumerate(voice):
+        time_s = (index + 1) * FRAME_S
+        seen = None if face is None else FaceFrame.of(time_s, face[index])
+        yield SpeakerFrame(
+            time_s, audio, seen, None if agent is None else agent[index],
+            None if attention is None else attention[index],
+        )  # fmt: skip
+
+
+def listen(frames, seed=1, calmness=None, own=None, memory=None):
+    """All events, and the nod hazard of every frame."""
+    memory = memory or MODEL.start(seed, calmness or Calmness())
+    events: list[ListenerEvent] = []
+    hazards = []
+    for frame in frames:
+        decision, memory = MODEL.step(frame, memory, own)
+        events += decision.events
+        hazards.append(decision.hazards_hz["nod"])
+    return events, np.array(hazards)
+
+
+def of(kind, events):
+    return [event for event in events if event.kind == kind]
+
+
+@pytest.fixture(scope="module")
+def usual():
+    return listen(conversation())[0]
+
+
+def test_the_same_evidence_and_seed_give_the_same_events(usual):
+    assert listen(conversation())[0] == usual
+    assert listen(conversation(), seed=2)[0] != usual
+
+
+def test_a_step_never_changes_its_memory():
+    memory = MODEL.start(1, Calmness())
+    for frame in list(conversation())[:500]:
+        first, after = MODEL.step(frame, memory)
+        again, _ = MODEL.step(frame, memory)
+        assert first == again
+        memory = after
+
+
+def test_a_later_frame_changes_nothing_before(usual):
+    half = FRAMES // 2
+    other = np.concatenate([VOICE[:half], sound(talk(FRAMES - half, seed=9), seed=9)])
+    found = listen(conversation(other))[0]
+    until_s = (half + 1 + LEAD_FRAMES) * FRAME_S - 1e-6
+    assert [e for e in found if e.start_s < until_s] == [e for e in usual if e.start_s < until_s]
+
+
+def test_everything_that_people_do_happens(usual):
+    more = listen(conversation(), calmness=Calmness(shake=6, tilt=6, laugh=6, smile=6, mm_hm=6, brow_raise=6))[0]
+    assert {event.kind for event in more} == set(EVENT_KINDS)
+    assert 1 * MINUTES <= len(of("nod", usual)) <= MOST_NODS * MINUTES
+    assert 8 * MINUTES <= len(of("blink", usual)) <= 30 * MINUTES
+
+
+def test_events_are_whole(usual):
+    for event in usual:
+        assert event.duration_s > 0 and event.size > 0 and 1 <= event.swings <= 4
+        assert round(event.start_s / FRAME_S) == pytest.approx(event.start_s / FRAME_S)
+        if event.probability is not None:
+            assert event.draw < event.probability and event.evidence is not None
+        if event.kind == "nod":
+            assert math.radians(2) < event.size < math.radians(13)
+            assert 0.3 <= event.duration_s / event.swings <= 0.66
+
+
+def test_nothing_of_the_head_begins_inside_another(usual):
+    head = [event for event in usual if event.kind in HEAD]
+    assert all(after.start_s >= before.end_s - 2 * FRAME_S for before, after in zip(head, head[1:], strict=False))
+
+
+def test_a_look_away_is_followed_by_a_look_back(usual):
+    looks = of("gaze_shift", usual)
+    assert len(looks) >= 4
+    for away, back in zip(looks[::2], looks[1::2], strict=False):
+        assert away.target_rad != AT_PERSON and back.target_rad == AT_PERSON
+        assert 0 <= back.start_s - away.end_s < 0.2
+        assert math.hypot(*away.target_rad) == pytest.approx(away.size)
+    aside_s = sum(event.duration_s for event in looks[::2])
+    assert 0.005 < aside_s / (60 * MINUTES) < 0.25
+
+
+def test_nobody_nods_to_silence_or_over_own_words():
+    silence = np.zeros((FRAMES, FRAME_SAMPLES), np.float32)
+    assert not [e for e in listen(conversation(silence))[0] if e.kind not in ("blink", "gaze_shift")]
+    said = sound(np.ones(FRAMES, bool), seed=5)
+    assert not [e for e in listen(conversation(agent=said))[0] if e.kind not in ("blink", "gaze_shift")]
+
+
+def test_without_a_microphone_a_moving_mouth_is_a_voice():
+    face = np.zeros((FRAMES, MOTION_DIM), np.float32)
+    swing = 0.15 + 0.15 * np.sin(2 * np.pi * 4 * np.arange(FRAMES) * FRAME_S)
+    face[:, CHANNEL_INDEX["jawOpen"]] = np.where(talk(), swing, 0)
+    deaf = [NOBODY] * FRAMES
+    assert of("nod", listen(conversation(deaf, face=face))[0])
+    assert not of("nod", listen(conversation(deaf, face=np.zeros_like(face)))[0])
+
+
+# --- knobs ------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.floats(0.1, 30), st.floats(1.01, 4))
+def test_more_of_a_knob_is_never_less_of_its_hazard(rate, times):
+    frames = list(conversation())[:750]
+    low = listen(frames, calmness=Calmness(nod=rate), own=())[1]
+    high = listen(frames, calmness=Calmness(nod=min(60.0, rate * times)), own=())[1]
+    assert (high >= low).all() and high.max() > 0
+
+
+def test_nods_rise_with_the_knob_and_none_at_nought():
+    nods = [len(of("nod", listen(conversation(), calmness=Calmness(nod=knob))[0])) for knob in (0, 1, 2.2, 6, 20)]
+    assert nods[0] == 0 and nods == sorted(nods) and nods[-1] > 2 * nods[1] > 0
+
+
+@pytest.mark.parametrize("kind", ["blink", "gaze_shift", "smile", "mm_hm", "tilt"])
+def test_other_kinds_have_knobs_too(kind):
+    counts = [len(of(kind, listen(conversation(), calmness=Calmness(**{kind: knob}))[0])) for knob in (0, 4, 20)]
+    assert counts[0] == 0 and counts[1] < counts[2]
+
+
+def test_a_knob_may_be_turned_while_it_runs():
+    frames = list(conversation())
+    memory = MODEL.start(1, Calmness())
+    quiet = MODEL.calmed(memory, Calmness(nod=0, addressed="never"))
+    assert not of("nod", listen(frames, memory=quiet)[0])
+
+
+@pytest.mark.parametrize("wrong", [{"nod": -1}, {"nod": 100}, {"addressed": "maybe"}, {"wave": 1}])
+def test_a_wrong_knob_is_refused(wrong):
+    from sfms_robot.config import parse
+
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        parse(Calmness, wrong, "calmness.yaml")
+
+
+# --- who looks --------------------------------------------------------------------------------------------------
+
+
+def test_who_does_not_know_is_between_addressed_and_not():
+    asks = {
+        name: listen(conversation(attention=np.full(FRAMES, value)), own=())[1].mean()
+        for name, value in {"looked at": 1.0, "unknown": math.nan, "not": 0.0}.items()
+    }
+    assert asks["not"] < asks["unknown"] < asks["looked at"]
+
+
+def test_without_a_face_it_is_as_asked_for():
+    looked = listen(conversation(), own=())[1]
+    assume = listen(conversation(), own=(), calmness=Calmness(addressed="assume"))[1]
+    never = listen(conversation(), own=(), calmness=Calmness(addressed="never"))[1]
+    np.testing.assert_array_equal(looked, assume)
+    assert never.mean() < 0.6 * assume.mean()
+
+
+def test_flickering_attention_is_ridden_out():
+    rng = np.random.default_rng(3)
+    for every in (1, 2, 5, 12):
+        attention = np.repeat(rng.integers(0, 2, FRAMES // every + 1), every)[:FRAMES].astype(float)
+        assert len(of("nod", listen(conversation(attention=attention))[0])) <= MOST_NODS * MINUTES
+
+
+def faces():
+    rng = np.random.default_rng(4)
+    still = np.zeros((FRAMES, MOTION_DIM), np.float32)
+    upside = still.copy()
+    upside[:, 0] = np.pi
+    upside[:, 1] = np.pi * np.sign(rng.normal(size=FRAMES))
+    yield "constant", still + 0.3
+    yield "saturated", still + 1.0
+    yield "beyond", still + 1e6
+    yield "upside down", upside
+    yield "not finite", np.where(rng.random((FRAMES, 1)) < 0.5, np.nan, still + np.float32(np.inf)).astype(np.float32)
+    yield "noise", rng.normal(0, 1, (FRAMES, MOTION_DIM)).astype(np.float32)
+    nods = still.copy()
+    nods[:, 1] = np.radians(6) * np.sin(2 * np.pi * 2 * np.arange(FRAMES) * FRAME_S)
+    yield "always nodding", nods
+
+
+@pytest.mark.parametrize(("name", "face"), list(faces()), ids=lambda value: value if isinstance(value, str) else "")
+def test_a_face_that_lies_never_makes_it_nod_without_end(name, face):
+    attention = np.random.default_rng(5).random(FRAMES)
+    events, hazards = listen(conversation(attention=attention, face=face))
+    assert len(of("nod", events)) <= MOST_NODS * MINUTES
+    assert np.isfinite(hazards).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0.0, 1.0, -1.0, math.nan, math.inf, 1e30]),
+            st.none() | st.floats(allow_nan=True, allow_infinity=True),
+            st.none() | st.sampled_from([0.0, math.nan, math.inf, -1e30]),
+            st.booleans(),
+        ),
+        min_size=1,
+        max_size=12,
+    )
+)
+def test_hazards_are_finite_whatever_comes_in(rows):
+    memory = MODEL.start(0, Calmness())
+    for index, (level, attention, motion, heard) in enumerate(rows):
+        face = None if motion is None else FaceFrame.of(index * FRAME_S, np.full(MOTION_DIM, motion))
+        audio = np.full(FRAME_SAMPLES, level, np.float32) if heard else NOBODY
+        with np.errstate(all="ignore"):
+            decision, memory = MODEL.step(SpeakerFrame((index + 1) * FRAME_S, audio, face, audio, attention), memory)
+        assert all(math.isfinite(rate) and rate >= 0 for rate in decision.hazards_hz.values())
+
+
+# --- somebody's real history ------------------------------------------------------------------------------------
+
+
+def test_own_history_replaces_what_was_decided():
+    frames = list(conversation())[:1000]
+    nods = [ListenerEvent("nod", 10.0, 2.0, 0.1), ListenerEvent("nod", 20.0, 0.5, 0.1)]
+    _, hazards = listen(frames, own=nods)
+    inside = slice(round(10.0 / FRAME_S) + 2, round(12.0 / FRAME_S) - 2)
+    assert not hazards[inside].any()
+    _, none = listen(frames, own=())
+    before = round(10.0 / FRAME_S)
+    np.testing.assert_array_equal(hazards[:before], none[:before])
+    assert (hazards[before:] != none[before:]).any()

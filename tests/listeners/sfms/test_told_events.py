@@ -1,0 +1,197 @@
+"""A listener that is told of events: stream = offline, causality, what may be revoked, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_sfms import plans_of, speech, told_listener
+
+from sfms_robot.corpora.clips import Dyad
+from sfms_robot.errors import ConfigError
+from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
+from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
+from sfms_robot.listeners.sfms.stream import KEPT_FRAMES, later, passed, revoked
+from sfms_robot.signals.control import COLUMNS, control_track
+
+NOD = ListenerEvent("nod", 0.8, 0.8, 0.1, swings=2)
+SMILE = ListenerEvent("smile", 1.5, 2.0, 0.6)
+GAZE_NAMES = [name for name in BLENDSHAPES if name.startswith("eyeLook")]
+GAZE = [CHANNEL_INDEX[name] for name in GAZE_NAMES]
+
+
+@pytest.fixture(scope="module")
+def told():
+    return told_listener(hop=2)
+
+
+def dyad(frames: int = 60, events=(NOD, SMILE)) -> Dyad:
+    rng = np.random.default_rng(0)
+    audio = rng.normal(0, 0.1, frames * FRAME_SAMPLES).astype(np.float32)
+    faces = rng.uniform(0, 0.3, (2, frames, 58)).astype(np.float32)
+    return Dyad("a", audio, faces[0], faces[1], np.ones(frames, bool), events=events)
+
+
+@pytest.mark.parametrize("hop", [1, 2, 4, 8])
+def test_a_stream_that_is_told_equals_offline(hop: int):
+    listener, one = told_listener(hop=hop), dyad()
+    whole = offline_rollout(listener, one, [3, 4]).motion
+    streamed = rollout(listener, frames_of_dyad(one), [3, 4], one.events).motion
+    for row in range(2):
+        np.testing.assert_allclose(listener.space.decode(whole[row].numpy())[0], streamed[row], atol=2e-4)
+
+
+def test_streams_told_of_different_events_do_what_each_does_alone(told):
+    speaker, seeds, events = speech(40), (1, 2, 3), ((NOD,), (), (SMILE, replace(NOD, start_s=0.3)))
+    alone = [plans_of(told, speaker, seed, own) for seed, own in zip(seeds, events, strict=True)]
+    past, ahead = told.control_frames
+    memories = [told.start(seed) for seed in seeds]
+    for index, frame in enumerate(speaker):
+        known = [[e for e in own if e.start_s <= (index + 3) * 0.04 + 1e-9] for own in events]
+        controls = [control_track(own, index + 1 - past, past + ahead) for own in known]
+        plans, memories = told.step_many(frame, memories, controls)
+        for plan, own in zip(plans, alone, strict=False):
+            np.testing.assert_allclose(plan.frames, own[index].frames, atol=1e-5)
+
+
+@pytest.mark.parametrize("start_s", [0.5, 1.0, 1.3])
+def test_an_event_changes_nothing_before_it_is_told(told, start_s: float):
+    speaker = speech(50)
+    without = plans_of(told, speaker)
+    with_it = plans_of(told, speaker, events=[replace(NOD, start_s=start_s)])
+    for index, plan in without.items():
+        if start_s > (index + 3) * 0.04 + 1e-9:
+            np.testing.assert_array_equal(plan.frames, with_it[index].frames)
+    assert any(not np.array_equal(without[i].frames, with_it[i].frames) for i in without)
+
+
+def test_what_is_told_again_as_it_was_calls_nothing_off(told):
+    memory, last = told.start(1), None
+    past, ahead = told.control_frames
+    for index, frame in enumerate(speech(60)):
+        plan, memory = told.step(frame, memory, control_track([NOD, SMILE], index + 1 - past, past + ahead))
+        if plan is not None and last is not None:
+            assert torch.equal(memory.tokens[-8 : -told.hop], last[-8 + told.hop :])
+        last = memory.tokens if plan is not None else last
+
+
+def test_tokens_are_revoked_from_the_first_future_frame_that_is_told_otherwise():
+    tokens = torch.ones(2, 48, 3).long()
+    before = torch.zeros(2, 48, len(COLUMNS))
+    told = before.clone()
+    told[0, 43, 5] = 0.5  # of frame 3 of the future, and of that alone
+    told[1, 40, 5] = 0.5  # of the next frame, which stays nevertheless
+    told[:, 10] = 1.0  # what is past is past
+    after = revoked(tokens, before, told, 8)
+    assert (after[0, 43:] == UNDECIDED).all() and (after[0, :43] == 1).all()
+    assert (after[1, 40 + KEPT_FRAMES :] == UNDECIDED).all() and (after[1, : 40 + KEPT_FRAMES] == 1).all()
+
+
+def test_a_moving_window_takes_what_was_told_with_it():
+    control = torch.rand(1, 48, len(COLUMNS))
+    assert torch.equal(later(control, 3)[:, :45], control[:, 3:])
+
+
+def test_the_last_keyframe_that_leaves_the_window_is_held_at_its_edge():
+    tokens, path = torch.zeros(1, 48, 2).long(), torch.zeros(1, 10, 4)
+    tokens[0, 1, 0], tokens[0, 20, 1] = 5, 3
+    for step in (1, 2, 3):
+        moved, _ = passed(tokens, path, step, holds=True)
+        assert moved[0, 0].tolist() == [5, 0]
+    assert passed(tokens, path, 3)[0][0, 0].tolist() == [0, 0]
+    onto_one, _ = passed(tokens, path, 20, holds=True)
+    assert onto_one[0, 0].tolist() == [5, 3]
+
+
+def test_gaze_is_left_to_kinematics(told):
+    for plan in plans_of(told, speech(30), events=[NOD]).values():
+        assert (plan.frames[:, GAZE] == 0).all()
+        assert np.abs(plan.frames[:, :6]).max() > 0
+
+
+def test_the_head_sways_from_rest_and_each_stream_its_own_way(told):
+    one, other = plans_of(told, speech(90), seed=1), plans_of(told, speech(90), seed=2)
+    assert not np.array_equal(one[80].frames[:, :6], other[80].frames[:, :6])
+    still = told.with_sway(torch.zeros(1, 90, 58), told.start(1).sway[None], 0) - told.model.motion_mean
+    assert still[0, 0, :6].abs().max() < 1e-4 < still[0, 60:, :6].abs().max()
+    assert not still[..., 6:].any()
+
+
+def context(told, control: torch.Tensor) -> Context:
+    memory = told.start(0)
+    s = memory.speaker
+    return Context(s.face[None], s.face_known[None], s.voice[None], s.heard[None], s.phase[None],
+                   memory.tokens[None], control)  # fmt: skip
+
+
+def test_every_told_number_has_a_gradient_and_so_has_every_weight():
+    predictor = told_listener().model.predictor
+    control = torch.rand(1, 48, len(COLUMNS), requires_grad=True)
+    target = torch.randint(0, 7, (1, 8, 2))
+    out = predictor.teacher_forced(context(told_listener(), control), target)
+    out[out.isfinite()].square().sum().backward()
+    assert control.grad is not None and (control.grad != 0).all()
+    told_weights = [weight for name, weight in predictor.named_parameters() if name.startswith("control_in")]
+    assert len(told_weights) == 4 and all((weight.grad != 0).any() for weight in told_weights)
+
+
+@torch.no_grad()
+def test_what_is_told_of_a_later_frame_changes_the_tokens_before_it_only_through_the_plan(told):
+    """A plan may prepare for what it is told; what has been played is not its to change."""
+    quiet = torch.zeros(1, 48, len(COLUMNS))
+    loud = quiet.clone()
+    loud[:, 44:] = 1.0
+    a, b = (told.model.predictor(context(told, control)) for control in (quiet, loud))
+    assert not torch.equal(a[:, 4:], b[:, 4:])
+
+
+@pytest.mark.parametrize(
+    "control, text",
+    [
+        (None, r"control \(48, 36\) is missing"),
+        (np.zeros((47, 36), np.float32), r"control has shape \(47, 36\), not 1 times \(48, 36\)"),
+        (np.zeros((48, 35), np.float32), r"control has shape \(48, 35\)"),
+    ],
+)
+def test_control_of_another_shape_is_refused(told, control, text):
+    with pytest.raises(ValueError, match=text):
+        told.step(speech(1)[0], told.start(1), control)
+
+
+def test_one_that_is_not_told_takes_none(tiny):
+    assert tiny.control_frames == (0, 0)
+    with pytest.raises(ValueError, match=r"control has shape \(48, 36\)"):
+        tiny.step(speech(1)[0], tiny.start(1), np.zeros((48, 36), np.float32))
+
+
+def test_graphs_make_the_same_plans():
+    speaker = speech(50)
+    before, after = (
+        plans_of(one, speaker, events=[NOD, SMILE]) for one in (told_listener(), told_listener().build_graphs())
+    )
+    for index, plan in before.items():
+        np.testing.assert_allclose(after[index].frames, plan.frames, atol=1e-5)
+
+
+NECK = {"channels": POSE_CHANNELS, "levels": (3, 2)}
+FACE = {"channels": [name for name in BLENDSHAPES if not name.startswith("eyeLook")], "levels": (2, 4)}
+
+
+@pytest.mark.parametrize(
+    "changes, text",
+    [
+        ({"events": False, "sway": True, "placement": "exact",
+          "groups": {"neck": NECK | {"keyframes": 3}, "face": FACE | {"channels": BLENDSHAPES, "keyframes": 3}}},
+         "sway: without events a nod cannot be told from it"),
+        ({"groups": {"neck": NECK | {"keyframe_cost": 1}, "face": FACE | {"channels": GAZE_NAMES, "keyframe_cost": 1}}},
+         "'eyeLookDownLeft' is not a channel"),
+        ({"groups": {"neck": NECK | {"keyframes": 3}, "face": FACE | {"keyframe_cost": 1}}},
+         "groups.neck: placement penalised takes keyframe_cost, not keyframes"),
+        ({"placement": "exact", "groups": {"neck": NECK | {"keyframe_cost": 3}, "face": FACE | {"keyframes": 1}}},
+         "groups.neck: placement exact takes keyframes, not keyframe_cost"),
+    ],
+)  # fmt: skip
+def test_a_configuration_that_contradicts_itself_is_refused(changes, text):
+    with pytest.raises(ConfigError, match=text):
+        told_listener(**changes)

@@ -1,0 +1,149 @@
+"""When and how together: streams side by side, each event told once, the eyes at the person, a memory that ends."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_sfms import speech, told_listener
+
+from sfms_robot.config import Calmness
+from sfms_robot.frames import EVENT_KINDS, FRAME_S, SpeakerFrame
+from sfms_robot.listeners.eventful import EventfulListener, frame_of, target_at
+from sfms_robot.listeners.events.model import LEAD_FRAMES, EventModel
+from sfms_robot.signals.control import COLUMNS
+from sfms_robot.signals.eye_angles import directions
+
+LIVELY = Calmness(nod=40, shake=10, tilt=10, smile=20, brow_raise=20, blink=40, gaze_shift=30, addressed="assume")
+NOTHING = Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))
+EYES_RAD = np.radians([30.0, 20.0])
+
+
+@pytest.fixture(scope="module")
+def when():
+    return EventModel.load()
+
+
+@pytest.fixture(scope="module")
+def lively(when):
+    return EventfulListener(told_listener(hop=2), when, LIVELY)
+
+
+def plans_of(listener, speaker, seed=1):
+    memory, plans = listener.start(seed), []
+    for frame in speaker:
+        plan, memory = listener.step(frame, memory)
+        plans += [] if plan is None else [plan]
+    return plans, memory
+
+
+def test_streams_side_by_side_are_each_one_alone(lively):
+    speaker, seeds = speech(80), (1, 2, 3)
+    alone = [plans_of(lively, speaker, seed)[0] for seed in seeds]
+    memories, together = [lively.start(seed) for seed in seeds], [[] for _ in seeds]
+    for frame in speaker:
+        plans, memories = lively.step_many(frame, memories)
+        for row, plan in enumerate(plans):
+            together[row].append(plan)
+    for one, many in zip(alone, together, strict=True):
+        assert [plan.events for plan in one] == [plan.events for plan in many]
+        for plan, other in zip(one, many, strict=True):
+            np.testing.assert_allclose(plan.frames, other.frames, atol=1e-5)
+    assert alone[0][-1].made_at_s == alone[1][-1].made_at_s
+    assert [plan.events for plan in alone[0]] != [plan.events for plan in alone[1]]
+
+
+def test_each_event_is_told_once_before_it_begins_and_with_why(lively):
+    plans, _ = plans_of(lively, speech(500))
+    events = [event for plan in plans for event in plan.events]
+    assert len(events) > 10 and len({(event.kind, event.start_s) for event in events}) == len(events)
+    for plan in plans:
+        assert all(
+            plan.made_at_s < event.start_s <= plan.made_at_s + (LEAD_FRAMES + 1) * FRAME_S for event in plan.events
+        )
+        assert set(plan.hazards_hz) == set(EVENT_KINDS) and np.isfinite(list(plan.hazards_hz.values())).all()
+    drawn = [event for event in events if event.draw is not None]
+    assert drawn and all(event.draw < event.probability and event.evidence for event in drawn)
+
+
+def test_the_same_frames_are_the_same_plans_and_a_step_changes_no_memory(lively):
+    speaker = speech(60)
+    (plans, memory), (again, _) = plans_of(lively, speaker), plans_of(lively, speaker)
+    for plan, other in zip(plans, again, strict=True):
+        np.testing.assert_array_equal(plan.frames, other.frames)
+    frame = SpeakerFrame(61 * FRAME_S, speaker[0].audio)
+    first, second = lively.step(frame, memory)[0], lively.step(frame, memory)[0]
+    assert (first is None) == (second is None) and (first is None or np.array_equal(first.frames, second.frames))
+
+
+def test_eyes_stay_at_the_person_when_nothing_is_decided_whatever_the_head_does(when):
+    how = told_listener(hop=2)
+    how.model.motion_std.mul_(0.02)  # untrained, it would turn the head farther than eyes go
+    plans, memory = plans_of(EventfulListener(how, when, NOTHING), speech(200))
+    assert not any(plan.events for plan in plans) and not memory.events
+    shown = np.concatenate([plan.frames[:2] for plan in plans])
+    gaze = shown[:, [2, 1]] + directions(shown, EYES_RAD).mean(axis=1)
+    assert np.ptp(np.degrees(shown[:, 1:3]), axis=0).max() > 0.5 and np.degrees(np.abs(gaze)).max() < 3.0
+
+
+def test_eyes_go_where_a_gaze_shift_says(lively):
+    plans, _ = plans_of(lively, speech(600))
+    events = [event for plan in plans for event in plan.events]
+    away = [event for event in events if event.kind == "gaze_shift" and np.hypot(*event.target_rad) > 0.1]
+    assert away
+    shown = {
+        round(time_s / FRAME_S): row
+        for plan in plans
+        for time_s, row in zip(plan.times_s[:2], plan.frames, strict=False)
+    }
+    for shift in away:
+        following = [event.start_s for event in events if event.kind == "gaze_shift" and event.start_s > shift.start_s]
+        looks_s = min([*following, 24.0]) - shift.start_s
+        row = shown.get(round((shift.start_s + min(looks_s, 0.4)) / FRAME_S))
+        if looks_s > 0.3 and row is not None and np.abs(row[[2, 1]]).max() < 0.2:
+            gaze = row[[2, 1]] + directions(row[None], EYES_RAD)[0].mean(axis=0)
+            assert np.degrees(np.abs(gaze - shift.target_rad)).max() < 4.0
+
+
+def test_memory_holds_what_is_under_way_and_no_more(lively):
+    memory, longest = lively.start(0), 0
+    for frame in speech(1500):
+        _, memory = lively.step(frame, memory)
+        longest = max(longest, len(memory.events))
+    past, _ = lively.how.control_frames
+    assert longest < 40 and len(memory.gaze) <= lively.horizon + 1
+    kept_s = 1500 * FRAME_S - past * FRAME_S
+    assert sum(event.target_rad is not None and event.start_s <= kept_s for event in memory.events) <= 1
+    assert target_at(memory.events, 61.0).shape == (2,)
+
+
+def test_a_stream_that_begins_late_in_a_run_tells_times_of_the_run(lively):
+    later = [replace(frame, time_s=frame.time_s + 100.0) for frame in speech(200)]
+    plans, _ = plans_of(lively, later)
+    events = [event for plan in plans for event in plan.events]
+    assert events and all(100.0 < event.start_s < 108.2 for event in events)
+    assert frame_of(later[0]) == 2500
+
+
+def test_calmness_may_change_while_it_runs(lively):
+    memory, told = lively.start(5), []
+    for index, frame in enumerate(speech(600)):
+        if index == 300:
+            memory = lively.calmed(memory, NOTHING)
+        plan, memory = lively.step(frame, memory)
+        told += [] if plan is None else [(index, event) for event in plan.events]
+    assert any(index < 300 for index, _ in told)
+    assert not [event for index, event in told if index > 302 and event.draw is not None]
+
+
+def test_at_hop_plans_as_often_and_decides_the_same(lively):
+    speaker = speech(240)
+    two, four = plans_of(lively, speaker)[0], plans_of(lively.at_hop(4), speaker)[0]
+    assert len(two) == 2 * len(four)
+    events = [[(e.kind, e.start_s) for plan in plans for e in plan.events] for plans in (two, four)]
+    assert events[0][: len(events[1])] == events[1] and events[1]
+
+
+def test_control_rows_are_those_the_model_asks_for(lively):
+    past, ahead = lively.how.control_frames
+    memory = lively.start(0)
+    assert lively._control(SpeakerFrame(0.04, np.zeros(0, np.float32)), memory).shape == (past + ahead, len(COLUMNS))
