@@ -30,7 +30,7 @@ def root(folder: Path) -> Path | None:
 
 
 def splits(place: Path) -> Mapping[str, str]:
-    found = {split: split for split in SPLITS if next((place / split).glob("*.npz"), None)}
+    found: dict[str, str] = {split: split for split in SPLITS if next((place / split).glob("*.npz"), None)}
     return found or {"train": "."}
 
 

@@ -4,7 +4,7 @@ The eyes leave first and are there 40 to 120 ms later (the main sequence of sacc
 which hardly exists below 8 degrees and grows with how far aside the target is, on the way of least jerk (bell-shaped
 speed), and ends later. All the while the eyes make up for the head (vestibulo-ocular reflex): eye in head is gaze less
 head, also while the head nods or sways. On a target, the eyes wander over it in fixations of 228 ms (median) whose
-steps have 0.9 degrees (median), as people's do while they listen; what is larger is a gaze shift and somebody else's to decide.
+steps have 0.9 degrees (median), as people's do while they listen; what is larger is a gaze shift, decided elsewhere.
 
 Laws: N frames at once are the N frames one by one. Gaze (head and eyes together) is within 3 degrees of the target
 200 ms after a shift of up to 30 degrees between targets that eyes can reach, and within 1.5 degrees during a nod of 8.

@@ -177,7 +177,7 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str,
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         tasks: dict[str, TaskID] = {}
 
-        def told(name: str, done: float, wanted: float) -> None:
+        def told(name: str, wanted: float, done: float) -> None:
             if name not in tasks:
                 tasks[name] = progress.add_task(f"composing {name}", total=wanted)
             progress.update(tasks[name], completed=done)

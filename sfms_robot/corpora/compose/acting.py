@@ -1,8 +1,8 @@
 """From a score of events to a listener's motion: recorded primitives, stretched and laid where things happened.
 
 Everything is added to a head and a face that never stand still. Layers are joined so that neither value nor speed
-jumps: primitives start and end at rest, looks go by `signals.gaze_kinematics`, loops are crossfaded. What was laid, when
-and how large, comes back as events: they are in the motion, and nothing else of their kind is put there.
+jumps: primitives start and end at rest, looks go by `signals.gaze_kinematics`, loops are crossfaded. What was laid,
+when and how large, comes back as events. Nothing else of their kind is put there, but for what a head does that speaks.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def mirrored(motion: Floats) -> Floats:
 
 
 def _mirror_image(acted: Acted) -> Acted:
-    head = acted.head_of_gaze_rad * np.float32([-1, 1, -1])
+    head = acted.head_of_gaze_rad * np.array([-1, 1, -1], np.float32)
     events = tuple(
         event
         if event.target_rad is None
@@ -263,7 +263,7 @@ class NodHabit:
 
 @dataclass(frozen=True)
 class NodManner:
-    """One nod: size [rad, peak to peak] of its first swing, how many there are, how long all take, how they die away."""
+    """One nod: size [rad, peak to peak] of its first swing, how many swings, how long all take, how they die away."""
 
     size_rad: float
     swings: int
@@ -299,7 +299,7 @@ def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> 
 
 def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
     habit, events = nod_habit(rng), []
-    for start, end in spans:
+    for start, end in spans.tolist():
         manner = nod_manner(habit, end - start, rng)
         curve = nod_curve(manner, _pick(motions.nods, rng), start, len(pose))
         pose[:, 1] += curve
@@ -311,7 +311,7 @@ def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Gener
     """Nods, shakes and tilts, added to a pose (N, 6)."""
     events = _nod(pose, score.nods, motions, rng)
     habit = nod_habit(rng)
-    for start, end in score.shakes:
+    for start, end in score.shakes.tolist():
         manner = nod_manner(habit, end - start, rng)
         curve = 0.8 * nod_curve(manner, _pick(motions.shakes, rng), start, len(pose))
         pose[:, 2] += rng.choice([-1, 1]) * curve
@@ -481,7 +481,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
         said = said + _placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
     np.copyto(shapes, _over(shapes, said))
     events = []
-    for start, end in score.mm_hms:
+    for start, end in score.mm_hms.tolist():
         low, high = max(0, _first(start)), max(_first(start) + 1, _first(end))
         jaw = float(said[low:high, SHAPE["jawOpen"]].max(initial=0.0))
         events.append(ListenerEvent("mm_hm", start, end - start, min(1.0, jaw)))

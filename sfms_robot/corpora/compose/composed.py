@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
@@ -60,7 +61,13 @@ _SOUNDS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", 
 _FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
 _FACELESS: Final = 0.25  # share of those in which the speaker is heard only
 _FLOOR_S: Final = 1.0  # a shorter phrase does not take the floor
-_WEIGHTS: Final = (4.0, 3.0, 2.0, 3, 30.0)  # base + nods a minute, up to + a nod after a phrase, up to + addressed time
+_WEIGHTS: Final = (
+    4.0,
+    3.0,
+    2.0,
+    3,
+    100.0,
+)  # base + nods a minute, up to + a nod after a phrase, up to + addressed time
 
 _FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # Stretch.name
 
@@ -144,7 +151,7 @@ def compose_folder(
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
     ami_audio_clips/, the clips beside the tables) and those of further folders. Dyads of an earlier run are removed
     from `out` once the new ones are written, so that two sets never mix. `told` hears of every dyad: the set, the
-    minutes written of it, the minutes wanted. Returns the minutes written per split. Raises ConfigError.
+    minutes wanted of it, the minutes written. Returns the minutes written per split. Raises ConfigError.
     """
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
@@ -155,27 +162,23 @@ def compose_folder(
         "interaction": (out / "interaction", SHARES["interaction"] * minutes, conversations),
         "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),
     }
-    written = {}
+    written: dict[str, float] = {}
     for name, (folder, wanted, make) in sets.items():
-        whole = wanted * (1 + 2 * HELD_OUT_SHARE)
-
-        def each(done: float, name: str = name, whole: float = whole) -> None:
-            if told:
-                told(name, done, whole)
-
+        each = partial(told, name, wanted * (1 + 2 * HELD_OUT_SHARE)) if told else None
         found = _write(make(material, seed, wanted), folder, each)
         written |= found if name == "listening" else {f"{name}_{split}": value for split, value in found.items()}
     return written
 
 
-def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float], None]) -> dict[str, float]:
+def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float], None] | None) -> dict[str, float]:
     """Write a set and remove what an earlier one left; minutes per split."""
     written, fresh = dict.fromkeys(SPLITS, 0.0), set()
     for split, dyad in made:
         save(out / split, [dyad])
         fresh.add(out / split / f"{dyad.name}.npz")
         written[split] += len(dyad.listener) * FRAME_S / 60
-        each(sum(written.values()))
+        if each:
+            each(sum(written.values()))
     for split in SPLITS:
         for stale in {file for pattern in _FILES for file in (out / split).glob(pattern)} - fresh:
             stale.unlink()

@@ -69,7 +69,7 @@ def find_voices(folders: Sequence[Path]) -> list[Voice]:
 
 
 def split_voices(voices: Sequence[Voice]) -> dict[Split, list[Voice]]:
-    """Whole recordings by part (`splits.VOICES`). A part that has none uses all there are: bring more, and none does."""
+    """Whole recordings by part (`splits.VOICES`); a part that has none uses all there are."""
     parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
     return {split: parts[split] or list(voices) for split in SPLITS}
 
