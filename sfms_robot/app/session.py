@@ -449,10 +449,10 @@ def run(
             server = stack.enter_context(closing(StatusServer(options.status)))
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
-        opening = _opening(options, stack) if source is None else None
+        opening = _opening(options, stack) if source is None else _opened(source)
         opened = stack.enter_context(open_head(options.servos))
-        source = source if opening is None else opening.result()
-        duration_s = source.duration_s if options.duration_s is None else options.duration_s
+        person = opening.result()
+        duration_s = person.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
             raise ConfigError("--fast without a recording never ends: give it a --duration")
         if feed is None:
@@ -460,7 +460,7 @@ def run(
         if isinstance(feed, ListenerProcess):
             feed.wait_loaded()
             tick_s = 1.0 / opened.rate_hz
-            feed.choose_hop_by(lambda: source.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
+            feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
         live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
         recorder = _recorder(options, opened.config)
         log = run_log(opened)
@@ -473,7 +473,7 @@ def run(
             facts,
             lambda: {
                 **figures_so_far(log, opened.rate_hz, real=not options.fast),
-                "source": dict(source.statistics()),
+                "source": dict(person.statistics()),
                 "listener_state": dict(feed.statistics()),
                 "intensity": live.values["intensity"],
             },
@@ -482,14 +482,14 @@ def run(
             stack.callback(recorder.close)
         if panel is not None:
             stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
-        tellers = [RunTeller(outlet) for outlet in source.outlets]
+        tellers = [RunTeller(outlet) for outlet in person.outlets]
         for teller in tellers:
             stack.callback(teller.close)
         if server is not None:
             server.serve(status.document)
             logger.warning("status: %s", server)
         programme = Programme(
-            source, feed, duration_s,
+            person, feed, duration_s,
             life=Life(opened.config.life, options.seed, opened.config.camera),
             knobs=lambda: live.now,
             overlay=overlay,
@@ -505,7 +505,7 @@ def run(
         )  # fmt: skip
         report["exit_code"] = drove.exit_code
         report["limitation"] = limited
-        report["source"] = dict(source.statistics())
+        report["source"] = dict(person.statistics())
         if recorder is not None:
             recorder.close()
             report["recording"] = recorder.statistics()
@@ -514,6 +514,13 @@ def run(
     if options.record is not None:
         write_report(options.record, report)
     return report
+
+
+def _opened(source: Source) -> Future[Source]:
+    """One that need not be opened."""
+    opened: Future[Source] = Future()
+    opened.set_result(source)
+    return opened
 
 
 def _opening(options: RunOptions, stack: ExitStack) -> Future[Source]:

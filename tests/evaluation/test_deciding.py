@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+from sfms_robot.listeners.events.hazards import EventTables
+from sfms_robot.listeners.events.model import EventModel
 
 from sfms_robot.evaluation import timing
 from sfms_robot.evaluation.deciding import decisions, forced_hazards, sensed, spans_of
 from sfms_robot.evaluation.listener_meetings import ListenerMeeting, shifted
 from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_SAMPLES
-from sfms_robot.listeners.events.hazards import EventTables
-from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.signals.events import runs
 
 MINUTES = 6
