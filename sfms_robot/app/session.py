@@ -428,7 +428,7 @@ def run(
 
     Raises RobotError before torque came on.
     """
-    prepare_head(options.servos)
+    head = prepare_head(options.servos)
     if options.fast and split_kind(options.hears)[0] == "mic":
         raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
     if options.fast and options.play is not None:
@@ -444,9 +444,12 @@ def run(
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
+        facts = {"head": head.name, "port": options.port, "listener": Path(options.listener).name}
         server = None
         if options.status is not None:  # a port that is taken is found before a listener is loaded
             server = stack.enter_context(closing(StatusServer(options.status)))
+            server.serve(RunStatus((), facts).document)
+            logger.warning("status: %s", server)
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         opening = _opening(options, stack) if source is None else _opened(source)
@@ -464,13 +467,9 @@ def run(
         live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
         recorder = _recorder(options, opened.config)
         log = run_log(opened)
-        facts = {
-            "head": opened.config.name, "port": options.port, "listener": Path(options.listener).name,
-            "duration_s": duration_s,
-        }  # fmt: skip
         status = RunStatus(
             list(opened.config.joints),
-            facts,
+            {**facts, "duration_s": duration_s},
             lambda: {
                 **figures_so_far(log, opened.rate_hz, real=not options.fast),
                 "source": dict(person.statistics()),
@@ -487,7 +486,6 @@ def run(
             stack.callback(teller.close)
         if server is not None:
             server.serve(status.document)
-            logger.warning("status: %s", server)
         programme = Programme(
             person, feed, duration_s,
             life=Life(opened.config.life, options.seed, opened.config.camera),

@@ -21,7 +21,7 @@ from sfms_robot.sources.playout import Playout, Silence
 from sfms_robot.sources.sound_devices import SoundDevice, choose_device, playing_devices, portaudio, why_not_opened
 
 FLAG: Final = "--play"
-LOST_S: Final = 0.2
+LOST_S: Final = 0.5  # a busy computer is none that is gone
 STATISTICS_S: Final = 1.0
 TURN_S: Final = 0.02  # between two looks at what the parent tells
 _BLOCK_S: Final = 0.01

@@ -1,6 +1,8 @@
 """The status document over HTTP: on loopback, whole, and a port that is taken is said in one line."""
 
 import json
+import socket
+import threading
 from contextlib import closing
 from urllib.error import HTTPError
 from urllib.request import urlopen
@@ -22,6 +24,31 @@ def test_the_document_is_served_as_it_is_at_that_moment() -> None:
                 assert json.load(answer) == {"state": state}
         with pytest.raises(HTTPError, match="404"):
             urlopen(f"{server.url}etc/passwd", timeout=5)
+
+
+def test_another_document_takes_the_place_of_the_first() -> None:
+    with closing(StatusServer("0")) as server:
+        for state in ("starting", "listening"):
+            server.serve(lambda state=state: {"state": state})
+            with urlopen(server.url, timeout=5) as answer:
+                assert json.load(answer) == {"state": state}
+
+
+def test_who_does_not_wait_for_the_answer_is_nobodys_trouble(capfd) -> None:
+    asked = threading.Event()
+
+    def slow() -> dict[str, str]:
+        asked.wait()
+        return {"long": 10_000_000 * "x"}
+
+    with closing(StatusServer("0")) as server:
+        server.serve(slow)
+        with socket.create_connection(("127.0.0.1", server.port)) as gone:
+            gone.sendall(b"GET / HTTP/1.0\r\n\r\n")
+        asked.set()
+        with urlopen(server.url, timeout=60) as answer:  # served by another thread
+            assert len(answer.read()) > 10_000_000
+    assert capfd.readouterr().err == ""
 
 
 def test_a_port_that_is_in_use_is_refused_in_one_line() -> None:

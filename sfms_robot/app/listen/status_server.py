@@ -8,6 +8,7 @@ Read only: who can read it can change nothing.
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -25,7 +26,7 @@ Document = Callable[[], Mapping[str, Any]]
 
 
 class StatusServer:
-    """Holds its port from construction until `close`; whoever asks waits until `serve`.
+    """Holds its port from construction until `close`; whoever asks before `serve` waits.
 
     Args:
         wanted: a port, "0" for any that is free, or `AUTO`.
@@ -49,10 +50,11 @@ class StatusServer:
         return self.url + self._taken
 
     def serve(self, document: Document) -> None:
-        """Answer from now on, in threads of its own. Once."""
+        """Answer with this document from now on, in threads of its own."""
         self._server.document = document
-        self._thread = threading.Thread(target=self._server.serve_forever, name="status", daemon=True)
-        self._thread.start()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._server.serve_forever, name="status", daemon=True)
+            self._thread.start()
 
     def close(self) -> None:
         """Give the port back. Idempotent."""
@@ -69,6 +71,10 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, port: int) -> None:
         super().__init__((LOOPBACK, port), _Handler)
         self.document: Document = dict
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exception(), ConnectionError):  # who has gone without waiting for the answer
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
