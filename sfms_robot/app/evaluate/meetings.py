@@ -101,7 +101,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     """
     where = Path(options.listener) if options.listener.endswith(".yaml") else None
     where = where or find("listeners", options.listener, "config.yaml")
-    _listener(where, options.hop)  # what is wrong with it is said here, not by a process
+    heard_by = _listener(where, options.hop)  # what is wrong with it is said here, not by a process
     everybody = read_people(tables(options.data))
     chosen = spread(people_of(everybody, options.split, options.allow_training), options.meetings)
     tasks = list(_tasks(options, where, everybody, chosen))
@@ -117,7 +117,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "minutes": round(sum(one.minutes for one in played), 2),
         "minutes_of_motion_each": options.minutes,
         "seeds": options.seeds,
-        "hop": heard_by.hop,
+        "hop": None if isinstance(heard_by, EventModel) else heard_by.hop,
         **{name: _rounded(one.value) for name, one in found.items()},
         "people_smiles_per_minute": None,
         "people_blinks_per_minute": None,
