@@ -12,12 +12,13 @@ import pytest
 
 from sfms_robot.corpora.compose.ami import Person, phrases
 from sfms_robot.corpora.meeting_evidence import meeting_evidence
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.learning.events import event_rollout, logistic
 from sfms_robot.learning.events.event_trainer import GROUPS, hazard, inputs, ranked, student, teach
 from sfms_robot.learning.events.labels import lesson, looks_of
 from sfms_robot.listeners.events.evidence import AT, Scene, counts_in
-from sfms_robot.listeners.events.hazards import HazardBank
+from sfms_robot.listeners.events.hazards import HazardBank, load_tables
 from sfms_robot.listeners.events.model import EventModel
 
 NONE = np.zeros((0, 2))
@@ -155,6 +156,26 @@ def test_counts_of_a_person_are_his_own():
     assert found.listening[0] == len(answering())
     assert found.ratio > 3 or np.isnan(found.ratio)
     assert event_rollout.interval_distance(found, found) == 0
+
+
+@pytest.mark.parametrize(
+    ("data", "out", "problem"), [("none", "a.yaml", "no such folder"), (".", "gone/a.yaml", "--out")]
+)
+def test_a_folder_that_is_not_there_is_one_line(tmp_path, data, out, problem):
+    from sfms_robot.app.train.event_training import train_events
+
+    with pytest.raises(ConfigError, match=problem) as raised:
+        train_events(tmp_path / data, tmp_path / out, False, 1)
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    from sfms_robot.app.train.event_training import save
+
+    shipped = EventModel.load().tables
+    save(tmp_path / "events.yaml", shipped)
+    assert load_tables(tmp_path / "events.yaml") == shipped
+    assert "Carletta" in (tmp_path / "events.yaml").read_text()
 
 
 # --- the meetings themselves ------------------------------------------------------------------------------------
