@@ -163,7 +163,8 @@ class SpeakerFrame:
         audio: (n,) mono 16 kHz, -1..1; empty when there is no microphone.
         face: the person's face, or None: a missing modality is normal.
         agent_audio: (n,) what the robot itself says, or None.
-        attention, place_m: see `Sighting`; None without a face.
+        attention, place_m: see `Sighting`; None without a face. In a meeting that is played back an attention may be
+            NaN: several people are there, and nobody wrote down whom this one looks at.
     """
 
     time_s: float

@@ -23,12 +23,11 @@ class Voice(Protocol):
     """Somebody's voice, cut into frames: frame i is the 640 samples of 16 kHz of loop time (i x 0.04, (i + 1) x 0.04].
 
     Live voices are filled from another thread or process, whose time stamps are those of `time.monotonic`.
-
-    Attributes:
-        lost: it has told something, and tells nothing any more: a device that is away.
     """
 
-    lost: bool
+    @property
+    def lost(self) -> bool:
+        """It has told something, and tells nothing any more: a device that is away."""
 
     @property
     def duration_s(self) -> float | None:
@@ -51,13 +50,11 @@ class Voice(Protocol):
 
 
 class Sight(Protocol):
-    """What a camera or a phone sees of a person. Time stamps as `Voice`.
+    """What a camera or a phone sees of a person. Time stamps as `Voice`."""
 
-    Attributes:
-        lost: as of `Voice`. Nobody in the picture is no loss.
-    """
-
-    lost: bool
+    @property
+    def lost(self) -> bool:
+        """As of `Voice`. Nobody in the picture is no loss."""
 
     @property
     def duration_s(self) -> float | None:

@@ -1,4 +1,4 @@
-"""What there is to choose from: listeners, recorded people, serial ports, microphones. Each row has a name and a
+"""What there is to choose from: listeners, recorded people, serial ports, sound devices. Each row has a name and a
 description.
 """
 
@@ -9,6 +9,7 @@ from typing import Any
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.servo.discovery import ports_data
+from sfms_robot.sources.sound_devices import SoundDevice
 from sfms_robot.sources.speakers import shipped_speaker, speakers
 
 
@@ -62,12 +63,25 @@ def microphones() -> list[dict[str, Any]]:
 
     return [
         {
-            "name": device.name,
-            "number": None if device.server_source else str(device.number),
-            "default": device.default,
-            "channels": device.inputs,
-            "rate_hz": round(device.rate_hz),
+            **_row(device),
             "description": f"--agent-audio device:{device.name}" if device.monitor else f"--audio mic:{device.name}",
         }
-        for device in sound_devices()
+        for device in sound_devices("recording")
     ]
+
+
+def loudspeakers() -> list[dict[str, Any]]:
+    """As `microphones`; `name` is what to give to --play NAME."""
+    from sfms_robot.sources.microphone import sound_devices
+
+    return [{**_row(device), "description": f"--play {device.name}"} for device in sound_devices("playing")]
+
+
+def _row(device: SoundDevice) -> dict[str, Any]:
+    return {
+        "name": device.name,
+        "number": None if device.server else str(device.number),
+        "default": device.default,
+        "channels": device.channels,
+        "rate_hz": round(device.rate_hz),
+    }

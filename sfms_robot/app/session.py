@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.calibrated_head import calibrated_head
-from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import figures_so_far, run_report
 from sfms_robot.app.listen.run_facts import run_facts
 from sfms_robot.app.listen.run_teller import RunTeller
-from sfms_robot.app.listen.status_server import status_server
+from sfms_robot.app.listen.status_server import StatusServer
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import Calmness, Head, Joint, load_head
@@ -68,7 +68,8 @@ SIM_READ_DEADLINE_S: Final = 0.02  # an emulator shares the computer's cores: it
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 INTERRUPTED: Final = 130
 
-Panel = Callable[[Callable[[], Mapping[str, Any]], Interrupt, HaltLatch], AbstractContextManager[object]]
+Document = Callable[[], Mapping[str, Any]]
+Panel = Callable[[Document, Interrupt, HaltLatch, Callable[[float], None]], AbstractContextManager[object]]
 
 
 # --- a head and its servos ------------------------------------------------------------------------------------------
@@ -383,8 +384,9 @@ class RunOptions:
     style: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     halt_on: str | None = None
-    status: int | None = None
+    status: str | None = None
     calmness: Calmness | None = None
+    play: str | None = None
 
     @property
     def hears(self) -> str:
@@ -404,7 +406,7 @@ def run(
     source: Source | None = None,
     feed: PlanFeed | None = None,
     observers: Sequence[Observer] = (),
-    knobs: Callable[[HeadRetargeter], Callable[[], Any]] | None = None,
+    knobs: LiveKnobs | None = None,
     overlay: Callable[[Floats, Doubles], Floats] | None = None,
     interrupt: Interrupt | None = None,
     halt: HaltLatch | None = None,
@@ -416,18 +418,21 @@ def run(
     torque came on nothing is raised any more: the report says `"exit": "failed"` and why, the head is at rest.
 
     Args:
-        panel: from the status document, what ends and what halts the run: shows it, and takes keys, while inside.
+        panel: from the status document, what ends, what halts the run and what turns the face up: shows it, and takes
+            keys, while inside.
         source, feed: instead of those that the options name.
-        knobs: from the retargeter of the opened head, what is asked at every tick; None: the options' own.
+        knobs: instead of those that the options name.
         observers, overlay: see `Programme`.
         interrupt: asked to end the run from another thread.
         halt: closed and opened from other threads.
 
     Raises RobotError before torque came on.
     """
-    prepare_head(options.servos)
+    head = prepare_head(options.servos)
     if options.fast and split_kind(options.hears)[0] == "mic":
         raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
+    if options.fast and options.play is not None:
+        raise ConfigError(f"--play {options.play}: what is heard of a loudspeaker takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
@@ -439,12 +444,18 @@ def run(
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
+        facts = {"head": head.name, "port": options.port, "listener": Path(options.listener).name}
+        server = None
+        if options.status is not None:  # a port that is taken is found before a listener is loaded
+            server = stack.enter_context(closing(StatusServer(options.status)))
+            server.serve(RunStatus((), facts).document)
+            logger.warning("status: %s", server)
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
-        opening = _opening(options, stack, source)
+        opening = _opening(options, stack) if source is None else _opened(source)
         opened = stack.enter_context(open_head(options.servos))
-        source = opening.result()
-        duration_s = source.duration_s if options.duration_s is None else options.duration_s
+        person = opening.result()
+        duration_s = person.duration_s if options.duration_s is None else options.duration_s
         if options.fast and duration_s is None:
             raise ConfigError("--fast without a recording never ends: give it a --duration")
         if feed is None:
@@ -452,37 +463,33 @@ def run(
         if isinstance(feed, ListenerProcess):
             feed.wait_loaded()
             tick_s = 1.0 / opened.rate_hz
-            feed.choose_hop_by(lambda: source.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
-        turned_knobs = turned(opened.motion.retargeter, options.intensity, options.style)
+            feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
+        live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
         recorder = _recorder(options, opened.config)
         log = run_log(opened)
-        facts = {
-            "head": opened.config.name, "port": options.port, "listener": Path(options.listener).name,
-            "duration_s": duration_s,
-        }  # fmt: skip
         status = RunStatus(
             list(opened.config.joints),
-            facts,
+            {**facts, "duration_s": duration_s},
             lambda: {
                 **figures_so_far(log, opened.rate_hz, real=not options.fast),
-                "source": dict(source.statistics()),
+                "source": dict(person.statistics()),
                 "listener_state": dict(feed.statistics()),
+                "intensity": live.values["intensity"],
             },
         )
         if recorder is not None:
             stack.callback(recorder.close)
         if panel is not None:
-            stack.enter_context(panel(status.document, interrupt, halt))
-        tellers = [RunTeller(outlet) for outlet in source.outlets]
+            stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
+        tellers = [RunTeller(outlet) for outlet in person.outlets]
         for teller in tellers:
             stack.callback(teller.close)
-        if options.status is not None:
-            port = stack.enter_context(status_server(options.status, status.document))
-            logger.warning("status: http://127.0.0.1:%d/", port)
+        if server is not None:
+            server.serve(status.document)
         programme = Programme(
-            source, feed, duration_s,
+            person, feed, duration_s,
             life=Life(opened.config.life, options.seed, opened.config.camera),
-            knobs=(lambda: turned_knobs) if knobs is None else knobs(opened.motion.retargeter),
+            knobs=lambda: live.now,
             overlay=overlay,
             answers=True,
             halt=halt,
@@ -496,7 +503,7 @@ def run(
         )  # fmt: skip
         report["exit_code"] = drove.exit_code
         report["limitation"] = limited
-        report["source"] = dict(source.statistics())
+        report["source"] = dict(person.statistics())
         if recorder is not None:
             recorder.close()
             report["recording"] = recorder.statistics()
@@ -507,16 +514,20 @@ def run(
     return report
 
 
-def _opening(options: RunOptions, stack: ExitStack, given: Source | None) -> Future[Source]:
-    """The person, being opened in a thread: a microphone takes a second, and so does the head. One given is open."""
-    opening: Future[Source] = Future()
-    if given is not None:
-        opening.set_result(given)
-        return opening
+def _opened(source: Source) -> Future[Source]:
+    """One that need not be opened."""
+    opened: Future[Source] = Future()
+    opened.set_result(source)
+    return opened
+
+
+def _opening(options: RunOptions, stack: ExitStack) -> Future[Source]:
+    """The person, being opened in a thread: a microphone takes a second, and so does the head."""
     worker = ThreadPoolExecutor(1, "source")
     opening = worker.submit(
-        open_source, options.hears, options.face, options.duration_s, agent_audio=options.agent_audio
-    )
+        open_source, options.hears, options.face, options.duration_s, agent_audio=options.agent_audio,
+        play=options.play,
+    )  # fmt: skip
     worker.shutdown(wait=False)
     stack.callback(lambda: None if opening.exception() else opening.result().close())
     return opening

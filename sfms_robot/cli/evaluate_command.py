@@ -39,6 +39,7 @@ class Part(StrEnum):
 
 LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 JSON = typer.Option(False, "--json", help="Print one JSON object.")
+HOP = typer.Option(None, min=1, help="Frames between plans, as a run chooses them; default: what its config.yaml says.")
 
 
 @app.command()
@@ -86,6 +87,7 @@ def listener_(
     config: Path | None = typer.Option(None, help="How ablations are trained: configs/training/arig.yaml."),
     steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    hop: int | None = HOP,
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
@@ -94,18 +96,18 @@ def listener_(
     from sfms_robot.cli.show_learning import print_figures, print_listener_table, show
 
     if table is None:
-        show(evaluate_listener(listener, data, seed, order.value if order else None), json, print_figures)
+        show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json, print_figures)
         return
     if table.value.startswith("arig"):
-        if order is not None:
-            raise typer.BadParameter("--order is for --table 1 and 2, or none")
+        if order is not None or hop is not None:
+            raise typer.BadParameter("--order and --hop are for --table 1 and 2, or none")
         from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json, print_figures)
         return
-    result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None)
+    result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None, hop)
     show(result, json, print_listener_table)
 
 
@@ -122,13 +124,14 @@ def timing(
     seeds: int = typer.Option(8, min=1, help="How often each meeting is played."),
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices, sampling and intervals."),
     jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    hop: int | None = HOP,
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
     from sfms_robot.app.evaluate.meetings import TimingOptions, evaluate_timing
     from sfms_robot.cli.show_learning import print_timing, show
 
-    options = TimingOptions(listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs)
+    options = TimingOptions(listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop)
     show(evaluate_timing(options), json, print_timing)
 
 

@@ -8,7 +8,7 @@ import typer
 
 listener = typer.Typer(help="Listeners: list.", no_args_is_help=True)
 speaker = typer.Typer(help="Recorded people: list.", no_args_is_help=True)
-port = typer.Typer(help="Serial ports and microphones: list.", no_args_is_help=True)
+port = typer.Typer(help="Serial ports and sound devices: list.", no_args_is_help=True)
 JSON = typer.Option(False, "--json", help="Print as one JSON object.")
 
 
@@ -38,22 +38,23 @@ def list_speakers(json: bool = JSON) -> None:
 
 @port.command("list")
 def list_ports(json: bool = JSON) -> None:
-    """Serial ports that servos may hang on, with what speaks against using them; and devices that record sound."""
-    from sfms_robot.app.catalogue import microphones, serial_ports
+    """Serial ports that servos may hang on, with what speaks against using them; devices that record, or play."""
+    from sfms_robot.app.catalogue import loudspeakers, microphones, serial_ports
     from sfms_robot.cli.show import print_list, screen
     from sfms_robot.errors import RobotError
 
     ports, problem = serial_ports(), None
     try:
-        devices = microphones()
+        record, play = microphones(), loudspeakers()
     except RobotError as error:
-        devices, problem = [], str(error)
+        record, play, problem = [], [], str(error)
     if json:
-        told = {"version": 1, "ports": ports, "microphones": devices, "microphone_problem": problem}
-        print(json_module.dumps(told))
+        found = {"ports": ports, "microphones": record, "loudspeakers": play}
+        print(json_module.dumps({"version": 1, **found, "microphone_problem": problem}))
         return
     print_list("serial ports", ports, json=False)
     if problem:
         screen(highlight=False).print(problem, style="dim")
     else:
-        print_list("microphones", devices, json=False)
+        print_list("microphones", record, json=False)
+        print_list("loudspeakers", play, json=False)

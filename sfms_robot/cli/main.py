@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     verbose = [word for word in words if word in ("-v", "--verbose")]
     with _endings_as_interrupts():
-        code, problem = _outcome(verbose + [word for word in words if word not in verbose])
+        code, problem = _outcome(verbose + _completed([word for word in words if word not in verbose]))
     if problem is not None and "--json" in words:
         ended = "interrupted" if code == INTERRUPTED else "failed"
         told = {"version": 1, "exit": ended, "error": problem, "exit_code": code}
@@ -147,6 +147,16 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
         usage()
         return ConfigError.exit_code, str(error.format_message())  # type: ignore[attr-defined]
     return 0, None
+
+
+def _completed(words: Sequence[str]) -> list[str]:
+    """The words, with the value that it stands for behind every option that may stand alone and does."""
+    completed = []
+    for word, following in zip(words, [*words[1:], "-"], strict=False):
+        completed.append(word)
+        if word in run_command.OPTIONAL and following.startswith("-"):
+            completed.append(run_command.OPTIONAL[word])
+    return completed
 
 
 def _said(code: int, problem: str) -> tuple[int, str]:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
+OPTIONAL = {"--play": "default", "--status": "auto"}  # options that may stand alone, and what they mean then
 
 
 def run(
@@ -54,6 +55,12 @@ def run(
         metavar="FILE.wav|device:DEVICE|NAME|tcp[:[HOST:]PORT]|none",
         help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, a "
         "program of yours, 'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
+    ),
+    play: str | None = typer.Option(
+        None,
+        metavar="[DEVICE]",
+        rich_help_panel=PERSON,
+        help="Play what the robot says, on a device (by number, name or part of it: `port list`; alone: the default).",
     ),
     duration: float | None = typer.Option(
         None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."
@@ -98,13 +105,11 @@ def run(
     check: bool = typer.Option(
         False, "--check", rich_help_panel=PERSON, help="Say how good the sound of --audio is, for 3 s; no servo moves."
     ),
-    status: int | None = typer.Option(
+    status: str | None = typer.Option(
         None,
-        min=0,
-        max=65535,
-        metavar="PORT",
+        metavar="[PORT]",
         rich_help_panel=OUTPUT,
-        help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port).",
+        help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
     ),
     dry_run: bool = typer.Option(
         False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
@@ -131,7 +136,7 @@ def run(
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
     from sfms_robot.app.listen.preflight import begin_listening, check_names
 
-    check_names(head, listener, port, audio, face, agent_audio)
+    check_names(head, listener, port, audio, face, agent_audio, play, status)
     calm = _calmness(calmness, addressed) if calmness or addressed != "sense" else None
     if check:
         _check(audio, duration, json)
@@ -144,7 +149,7 @@ def run(
 
         options = session.RunOptions(
             head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
-            tuple(intensity), tuple(style), tuple(without), halt_on, status, calm,
+            tuple(intensity), tuple(style), tuple(without), halt_on, status, calm, play,
         )  # fmt: skip
         report = session.run(options, None if json else live_panel, feed=feed)
     if json:

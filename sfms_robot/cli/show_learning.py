@@ -78,7 +78,7 @@ def print_timing(result: Mapping[str, Any]) -> None:
     console.print(
         f"{result['people']} people of {result['split']}, {result['meetings']} meetings, "
         f"{result['minutes']:g} minutes, {result['seeds']} seeds; in brackets 95 % intervals over people. "
-        + "; ".join((*result["notes"], "")),
+        f"{'; '.join(result['notes'])}.",
         soft_wrap=True,
     )
 
@@ -90,7 +90,9 @@ def print_robustness(result: Mapping[str, Any]) -> None:
         f"{name.replace('_', ' ')} {low:g} to {high:g}" for name, (low, high) in result["people"].items()
     )
     screen().print(
-        f"people: {ranges}; {len(result['outside'])} of {len(result['rows'])} rows are outside.", soft_wrap=True
+        f"people: {ranges}; {len(result['outside'])} of {len(result['rows'])} rows are outside. Variance over mean of "
+        f"nods, median: {cell(result['nods_variance_over_mean'])}.",
+        soft_wrap=True,
     )
 
 

@@ -62,8 +62,8 @@ def speaker_frames(
 ) -> list[SpeakerFrame]:
     """Sound (N * 640,) and face (N, 58) as a source gives them, and the agent's own voice (N * 640,) one frame early.
 
-    A face of NaN is None, and so is an attention (N,) of NaN, or of a face that is not seen; no sound at all is no
-    microphone.
+    A face of NaN is None, and so is the attention (N,) of a face that is not seen; an attention of NaN stays: nobody
+    knows. No sound at all is no microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
     frames = []
@@ -74,7 +74,9 @@ def speaker_frames(
         if said is not None and len(said) < FRAME_SAMPLES:
             said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
         seen = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
-        looks = None if attention is None or seen is None or np.isnan(attention[index]) else float(attention[index])
+        looks = None if attention is None else float(attention[index])
+        if looks is not None and seen is None and not np.isnan(looks):
+            looks = None
         frames.append(SpeakerFrame(time_s, heard[now], seen, said, looks))
     return frames
 

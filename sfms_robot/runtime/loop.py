@@ -91,7 +91,7 @@ class State:
     Attributes:
         held_rad, since_s: (J,) the pose torque came on in, and when.
         before_rad, here_rad: (J,) two samples of the reference.
-        goals_rad: (J,) the last command.
+        goals_rad: (J,) the last command; `motion` (58,) the face behind it.
         run: the state of the run; `presence` and `lost_joints` are what it is judged by.
         answer: how much of the listener's answer shows.
         released: the halt has let go of the joints that it does not hold.
@@ -112,6 +112,7 @@ class State:
     lost_joints: tuple[str, ...] = ()
     answer: Fade = Fade()
     released: bool = False
+    motion: Floats = field(default_factory=lambda: np.zeros(MOTION_DIM, np.float32))
 
 
 def drive(
@@ -168,7 +169,8 @@ def drive(
             state = _ending(log, clock.now_s() - start_s, state)
             if parts.halt.by is None:  # a head that was halted moves no more
                 way = tick_times(clock, rate_hz, start_s)
-                come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log)
+                seen = partial(_seen_on_the_way, observers, state)
+                come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log, seen)
             log.state = state
     finally:
         parts.bus.stop(stop)
@@ -232,6 +234,14 @@ def _ending(log: RunLog, now_s: float, state: State) -> State:
     return replace(state, run=run)
 
 
+def _seen_on_the_way(
+    observers: Observers, state: State, now_s: float, ahead: float, goals_rad: Doubles, readings: Mapping[str, Reading]
+) -> None:
+    """A tick of the way to rest, of which the share `ahead` is still to go: the last face fades with it."""
+    motion = state.motion * np.float32(ahead)
+    observers.tick(Tick(now_s, motion, goals_rad, readings, state.run.name, state.run.why))
+
+
 def turned_by_hand(planned: Floats, asked: Floats) -> bool:
     """Whether what is asked (N, 58) turns head or eyes otherwise than what was planned (N, 58)."""
     return asked is not planned and not np.array_equal(asked[:, _TURNING], planned[:, _TURNING])
@@ -276,7 +286,7 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)
     state = replace(
         state, timeline=timeline, limiter=limiter, before_rad=state.here_rad, here_rad=ahead_rad, goals_rad=goals_rad,
-        life=life, retargeter=retargeter, answer=answer,
+        life=life, retargeter=retargeter, answer=answer, motion=motion[0],
     )  # fmt: skip
     return state, Command(goals_rad, reference[0], motion[0], float(times_s.max()))
 

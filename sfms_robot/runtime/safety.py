@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final, TypeVar
@@ -27,6 +27,7 @@ FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
 SWITCH_S: Final = 0.0001  # a tick waits that long for another thread; Python's own 5 ms is half a tick
 
 T = TypeVar("T", float, Doubles)
+Seen = Callable[[float, float, Doubles, Mapping[str, Reading]], None]  # time, share of the way ahead, goals, readings
 logger = logging.getLogger(__name__)
 
 
@@ -37,14 +38,22 @@ def smooth(u: T) -> T:
 
 
 def come_to_rest(
-    bus: Bus, limiter: Limiter, state: Any, from_rad: Doubles, rest_rad: Doubles, ticks: Iterable[TickTime], log: RunLog
+    bus: Bus,
+    limiter: Limiter,
+    state: Any,
+    from_rad: Doubles,
+    rest_rad: Doubles,
+    ticks: Iterable[TickTime],
+    log: RunLog,
+    seen: Seen,
 ) -> None:
     """Ease every joint to its rest angle under the limits; blocks for at least `EASE_S` and at most `REST_LIMIT_S`.
 
     Takes as long as the limiter needs to bring its goals there, so that no joint loses its torque on the way. It needs
     time of its own ticks, so a computer that is late for some takes longer. Once the goals have arrived, servos have
     `FOLLOW_S` to follow, whether they move or not. A tick that raises (a bus that fails, a goal that is refused) is
-    said once and left out; after `FAILURES` in a row it gives up. Never raises an Exception.
+    said once and left out; after `FAILURES` in a row it gives up. `seen` is told of every other one. Never raises an
+    Exception.
     """
     span = rest_rad - from_rad
     began_s: float | None = None
@@ -62,6 +71,7 @@ def come_to_rest(
             log.ease(tick, goals_rad, reference[0])
             bus.write(goals_rad, tick.time_s)
             readings, failed = bus.poll(tick.time_s), 0
+            seen(tick.time_s, 1.0 - angle, goals_rad, readings)
             if bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD)):
                 arrived_s = tick.time_s if arrived_s is None else arrived_s
                 stand = _stand(bus.joints, readings, rest_rad)

@@ -6,6 +6,7 @@ round: `live-link:11111,flip=yaw+roll`.
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from dataclasses import dataclass
 from typing import Final
@@ -16,6 +17,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Floats
 
 _OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
+LOOPBACK: Final = "127.0.0.1"
 _HIGHEST_PORT: Final = 65535
 
 
@@ -47,12 +49,24 @@ def parse_face_argument(kind: str, argument: str) -> FaceArgument:
     return FaceArgument(place, flip)
 
 
-def parse_endpoint(kind: str, place: str, host: str, port: int) -> tuple[str, int]:
-    """PORT or HOST:PORT ([HOST]:PORT for IPv6) -> host and port, those given where PLACE is "". Raises ConfigError."""
+def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:
+    """PORT, HOST:PORT ([HOST]:PORT for IPv6) or an address alone -> host and port; loopback and `port` where PLACE does
+    not say. Raises ConfigError.
+    """
     if not place:
-        return host, port
+        return LOOPBACK, port
+    if _is_address(place.strip("[]")):
+        return place.strip("[]"), port
     named, colon, number = place.rpartition(":")
     if not (number.isascii() and number.isdigit() and 0 < int(number) <= _HIGHEST_PORT) or (colon and not named):
-        choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT; PORT 1 to {_HIGHEST_PORT}"
+        choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT, {kind}:ADDRESS; PORT 1 to {_HIGHEST_PORT}"
         raise ConfigError(f"--face {kind}:{place}: {place!r} is no UDP port ({choices})")
-    return (named.strip("[]") if colon else host), int(number)
+    return (named.strip("[]") if colon else LOOPBACK), int(number)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True

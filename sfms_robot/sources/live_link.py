@@ -1,4 +1,4 @@
-"""Live Link Face, Epic's app for iPhones with a depth camera: `--face live-link[:[HOST:]PORT]`.
+"""Live Link Face, Epic's app for iPhones with a depth camera: `--face live-link[:PORT|:HOST[:PORT]]`.
 
 One packet a frame, big-endian:
 
@@ -15,6 +15,7 @@ What the signs of the head's angles mean is in `signals.tracks.SOURCES`.
 
 from __future__ import annotations
 
+import ipaddress
 import struct
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
@@ -26,7 +27,7 @@ from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
 from sfms_robot.signals.tracks import SOURCES
 from sfms_robot.sources.face_argument import parse_endpoint, parse_face_argument
 from sfms_robot.sources.live_face import LiveFace
-from sfms_robot.sources.udp_sight import DatagramSocket, UdpSight, addresses_of_this_machine
+from sfms_robot.sources.udp_sight import ANY, DatagramSocket, UdpSight, addresses_of_this_machine, flag_for_others
 
 PORT: Final = 11111  # what the app suggests
 VERSION: Final = 6
@@ -189,14 +190,23 @@ class LiveLinkDecoder:
 
 
 def open_live_link(argument: str) -> UdpSight:
-    """`[[HOST:]PORT][,flip=...]`; a phone is another machine, so every address of this one is listened on by default.
+    """`[PORT|HOST[:PORT]][,flip=...]`. This machine alone is heard, unless HOST says otherwise. A phone is another one,
+    so what to type for it is said, and the address that its app is to be given.
 
     Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
     """
     given = parse_face_argument("live-link", argument)
-    host, port = parse_endpoint("live-link", given.place, "0.0.0.0", PORT)
+    host, port = parse_endpoint("live-link", given.place, PORT)
     opened = DatagramSocket("live-link", host, port)
-    own = addresses_of_this_machine() if host in ("0.0.0.0", "::") else [host]
-    target = f"{' or '.join(own) or 'this machine'}, port {opened.address[1]}"
-    hint = f"in the app, capture mode Live Link (ARKit), enter the target {target}"
-    return UdpSight("live-link", opened, LiveLinkDecoder(), LiveFace(given.signs), hint)
+    return UdpSight("live-link", opened, LiveLinkDecoder(), LiveFace(given.signs), _hint(*opened.address))
+
+
+def _hint(host: str, port: int) -> str:
+    """What to do so that it hears a phone."""
+    only_this = ipaddress.ip_address(host).is_loopback
+    own = addresses_of_this_machine() if only_this or host in ANY else [host]
+    target = f"{' or '.join(own) or 'the address of this machine'}, port {port}"
+    app = f"in the app, capture mode Live Link (ARKit), enter the target {target}"
+    if not only_this:
+        return app
+    return f"{host}, port {port}, this machine alone; for a phone {flag_for_others('live-link', port, PORT)}, and {app}"

@@ -9,11 +9,11 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
 from sfms_robot.ports import Voice
 from sfms_robot.sources.front_end import Heard
 from sfms_robot.sources.microphone_worker import Opened, Recording, Told, listen
@@ -130,11 +130,17 @@ class Microphone:
 
 
 class OwnVoice:
-    """`ports.Voice` around what the robot says: the microphone is told of it as soon as the grid is."""
+    """`ports.Voice` around what the robot says: the microphone is told of it as soon as the grid is.
+
+    Attributes:
+        outlet: the programs behind it.
+    """
 
     def __init__(self, inner: Voice) -> None:
         self._inner = inner
         self.duration_s, self.latency_s = inner.duration_s, inner.latency_s
+        self.outlet = getattr(inner, "outlet", None)
+        self._early = round(getattr(inner, "early_s", 0.0) * AUDIO_HZ)
         self._frames: dict[int, Floats | None] = {}
         self._asked = 0  # frame
 
@@ -154,10 +160,13 @@ class OwnVoice:
         return self._asked > before
 
     def newest(self) -> tuple[int, Floats]:
-        """The first of the newest frames, and their samples; silence where nothing was said."""
+        """The first of the newest frames, and their samples; silence where nothing was said. Of a voice that is to be
+        told early they come so much sooner, and the last of them are still to be known: silence.
+        """
         indices = range(max(0, self._asked + 1 - TOLD_FRAMES), self._asked + 1)
         frames = [self._frames.get(index) for index in indices]
-        return indices[0], np.concatenate([_SILENCE if frame is None else frame for frame in frames])
+        samples = np.concatenate([_SILENCE if frame is None else frame for frame in frames])
+        return indices[0], np.concatenate([samples[self._early :], _SILENCE[: self._early]])
 
     def take(self, index: int) -> Floats | None:
         self.ask(index)
@@ -229,9 +238,9 @@ def open_loudspeaker(argument: str) -> Loudspeaker:
     return Loudspeaker(_opened(Recording(_by_name(argument, DEVICE_FLAG), DEVICE_FLAG)), beside=False)
 
 
-def sound_devices() -> list[SoundDevice]:
-    """Devices that record. Blocks for a second. Raises ConfigError without PortAudio."""
-    worker = SourceWorker("sound devices", tell_devices, None)
+def sound_devices(what: Literal["recording", "playing"] = "recording") -> list[SoundDevice]:
+    """Devices that record, or those that play. Blocks for a second. Raises ConfigError without PortAudio."""
+    worker = SourceWorker("sound devices", tell_devices, what)
     try:
         worker.wait()
         return list(worker.messages(time.monotonic())[0])

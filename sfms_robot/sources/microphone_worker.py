@@ -19,7 +19,7 @@ from sfms_robot.errors import PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.sources.front_end import FrontEnd, Heard, ToldSpeech
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.sound_devices import SoundDevice, choose_device, portaudio, recording_devices
+from sfms_robot.sources.sound_devices import SoundDevice, choose_device, portaudio, recording_devices, why_not_opened
 
 LOST_S: Final = 0.2
 STATISTICS_S: Final = 1.0
@@ -206,7 +206,7 @@ def open_capture(wanted: str, flag: str) -> Capture:
             if capture.start():
                 return capture
     except sounddevice.PortAudioError as error:
-        raise PortError(f"{flag}: {device.name} cannot be opened, {_reason(error)}") from error
+        raise PortError(f"{flag}: {device.name} cannot be opened, {why_not_opened(error)}") from error
     raise PortError(f"{flag}: {device.name} is open, but gives no sound ({_others(devices, device)})")
 
 
@@ -214,7 +214,7 @@ def _format(device: SoundDevice) -> tuple[float, int]:
     """Rate and channels that it takes. Raises PortAudioError: it takes none."""
     import sounddevice
 
-    wishes = [(rate, channels) for rate in (AUDIO_HZ, device.rate_hz) for channels in (1, device.inputs)]
+    wishes = [(rate, channels) for rate in (AUDIO_HZ, device.rate_hz) for channels in (1, device.channels)]
     with device.selected():
         for rate_hz, channels in wishes[:-1]:
             try:
@@ -223,13 +223,6 @@ def _format(device: SoundDevice) -> tuple[float, int]:
             except (sounddevice.PortAudioError, ValueError):
                 continue
     return wishes[-1]
-
-
-def _reason(error: Exception) -> str:
-    """PortAudio's own word, and what it mostly means."""
-    text = str(error.args[0] if error.args else error).rpartition(": ")[2].partition(" [")[0]
-    busy = "unavailable" in text.casefold() or "busy" in text.casefold()
-    return "another program holds it, or it was unplugged" if busy else text
 
 
 def _others(devices: Sequence[SoundDevice], device: SoundDevice) -> str:

@@ -20,6 +20,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Sighting
 from sfms_robot.signals.audio import Resampler
 from sfms_robot.sources.live_voice import LiveVoice, check_rate
+from sfms_robot.sources.spoken import Player
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 
@@ -148,6 +149,7 @@ class PushedSpeech:
         self._taken = 0  # up to here it has been asked for
         self._speaks = False
         self._counts = {"dropped": 0, "late": 0, "not_finite": 0}
+        self._player: Player | None = None
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
         """What it says, as `PushedVoice.hear`.
@@ -164,6 +166,8 @@ class PushedSpeech:
             raise ConfigError(f"at_s = {at_s!r} is no time")
         samples = as_floats(pcm)
         finite = np.isfinite(samples)
+        if at_s is not None and self._player is not None:
+            at_s -= self._player.delay_s
         soonest = _place(self._now()) + FRAME_SAMPLES
         with self._saying:
             at = max(soonest, self._end) if at_s is None else _place(at_s)
@@ -175,12 +179,20 @@ class PushedSpeech:
             self._given += len(samples)
             self._counts["not_finite"] += int(samples.size - finite.sum())
             self._append(self._resampler.push(np.clip(np.where(finite, samples, np.float32(0)), -1.0, 1.0)))
+        if self._player is not None:
+            self._player.said()
 
     def hush(self) -> None:
         """What is still to be played from now on will not be."""
         with self._saying:
             self._resampler, self._began, self._given = None, _place(self._now()), 0
             self._cut(self._began)
+        if self._player is not None:
+            self._player.hushed()
+
+    def played_by(self, player: Player) -> None:
+        """What is said without a time leaves as soon as `player` can; `at_s` is when it leaves the loudspeaker."""
+        self._player = player
 
     def start(self, origin_s: float) -> None:
         """Loop time 0 is `origin_s` of `time.monotonic`."""
@@ -196,19 +208,18 @@ class PushedSpeech:
                     self._finish()  # who plays it has no more either
             finally:
                 self._saying.release()
-        frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
         with self._lock:
             if not self._speaks:
                 return None
             while self._pieces and self._pieces[0][0] + len(self._pieces[0][1]) <= begin:
                 self._pieces.popleft()
-            for place, piece in self._pieces:
-                if place >= begin + FRAME_SAMPLES:
-                    break
-                first, last = max(place, begin), min(place + len(piece), begin + FRAME_SAMPLES)
-                frame[first - begin : last - begin] = piece[first - place : last - place]
             self._taken = begin + FRAME_SAMPLES
-        return frame
+            return self._frame(begin)
+
+    def upcoming(self, index: int) -> Floats | None:
+        """See `Spoken`."""
+        with self._lock:
+            return self._frame(self._origin + index * FRAME_SAMPLES) if self._speaks else None
 
     def statistics(self) -> Mapping[str, Any]:
         """Samples to be played in more than two minutes (dropped), said too late to be played, or not finite."""
@@ -222,6 +233,17 @@ class PushedSpeech:
     def _end(self) -> int:
         """Where the stretch ends, with what its resampler still holds."""
         return self._began + round(self._given * AUDIO_HZ / self._rate_hz)
+
+    def _frame(self, begin: int) -> Floats:
+        """The (640,) from place `begin` on."""
+        frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+        for place, piece in self._pieces:
+            if place >= begin + FRAME_SAMPLES:
+                break
+            first, last = max(place, begin), min(place + len(piece), begin + FRAME_SAMPLES)
+            if first < last:
+                frame[first - begin : last - begin] = piece[first - place : last - place]
+        return frame
 
     def _begin(self, at: int, rate_hz: float) -> None:
         self._finish()

@@ -15,6 +15,7 @@ import numpy as np
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, Sighting
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.tracks import Track, resample
+from sfms_robot.sources.spoken import Player
 
 _PAUSE_FRAMES = FRAME_HZ  # silence before a recording starts again
 _EPS_FRAMES = 1e-6
@@ -37,6 +38,7 @@ class RecordedVoice:
         self._audio = audio
         self._loop = loop
         self._next = 0
+        self._ahead: dict[int, Floats] = {}
         self.frames = math.ceil((audio.length if isinstance(audio, AudioFile) else len(audio)) / FRAME_SAMPLES)
         self.duration_s: float | None = self.frames * FRAME_S
 
@@ -45,12 +47,17 @@ class RecordedVoice:
 
     def take(self, index: int) -> Floats:
         """The samples (640,) of any frame; in order is fastest."""
-        frame = index % (self.frames + _PAUSE_FRAMES) if self._loop else index
-        out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-        if frame < self.frames:
-            part = self._part(frame)
-            out[: len(part)] = part
-        return out
+        known = self._ahead.pop(index, None)
+        return self._frame(index) if known is None else known
+
+    def upcoming(self, index: int) -> Floats:
+        """See `Spoken`; kept until it is taken."""
+        if index not in self._ahead:
+            self._ahead[index] = self._frame(index)
+        return self._ahead[index]
+
+    def played_by(self, player: Player) -> None:
+        """What is recorded does not change."""
 
     def statistics(self) -> Mapping[str, Any]:
         return {}
@@ -59,6 +66,14 @@ class RecordedVoice:
         """Give the file back. Idempotent."""
         if isinstance(self._audio, AudioFile):
             self._audio.close()
+
+    def _frame(self, index: int) -> Floats:
+        frame = index % (self.frames + _PAUSE_FRAMES) if self._loop else index
+        out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+        if frame < self.frames:
+            part = self._part(frame)
+            out[: len(part)] = part
+        return out
 
     def _part(self, frame: int) -> Floats:
         if not isinstance(self._audio, AudioFile):

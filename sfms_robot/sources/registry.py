@@ -20,6 +20,7 @@ from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, speakers, voi
 
 if TYPE_CHECKING:
     from sfms_robot.ports import Source, Voice
+    from sfms_robot.sources.spoken import Spoken
 
 GROUP: Final = "sfms_robot.sources"
 _HERE: Final = "sfms_robot.sources"
@@ -65,13 +66,22 @@ def split_kind(value: str) -> tuple[str, str]:
 
 
 def check_source(
-    audio: str = "default", face: str = "auto", agent_audio: str = "none", kinds: SourceKinds | None = None
+    audio: str = "default",
+    face: str = "auto",
+    agent_audio: str = "none",
+    kinds: SourceKinds | None = None,
+    play: str | None = None,
 ) -> None:
-    """Are there such kinds, or such files? Imports and opens nothing. Raises ConfigError with the choices."""
+    """Are there such kinds, or such files, and something to play? Imports and opens nothing. Raises ConfigError with
+    the choices.
+    """
     known = source_kinds() if kinds is None else kinds
     _check("--audio", audio, known.voices, voice_file(audio), ["FILE.wav", "none", "default", *speakers()])
     _check("--face", face, known.sights, _existing(face), ["FILE.csv", "FILE.csv.gz", "none", "auto"])
     _check("--agent-audio", agent_audio, known.agent_voices, voice_file(agent_audio), ["FILE.wav", "none", *speakers()])
+    if play is not None and (agent_audio == "none" or split_kind(agent_audio)[0] == "device"):
+        choices = ", ".join(["FILE.wav", "tcp", *speakers()])
+        raise ConfigError(f"--play {play}: nothing is played of --agent-audio {agent_audio} ({choices})")
 
 
 def open_source(
@@ -81,26 +91,30 @@ def open_source(
     loop: bool = True,
     agent_audio: str = "none",
     kinds: SourceKinds | None = None,
-    agent: Voice | None = None,
+    agent: Spoken | None = None,
+    play: str | None = None,
 ) -> Source:
     """A person by what a run is told of them.
 
     An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
     own, else none. `loop`: recordings start again when they end before `duration_s` does. `agent` is what the robot
-    says, instead of `agent_audio`.
+    says, instead of `agent_audio`. `play`: the device that plays it; None: somebody else does.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
     from sfms_robot.sources.paired import JudgedSource, PairedSource
 
     known = source_kinds() if kinds is None else kinds
-    check_source(audio, face, agent_audio, known)
+    check_source(audio, face, agent_audio, known, play if agent is None else None)
     if audio == "default":
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     again = loop and duration_s is not None
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
-        if split_kind(audio)[0] == "mic" and (agent is not None or agent_audio != "none"):
-            voice, agent = _conversation(audio, agent or agent_audio, known, failed)
+        own: Any = agent
+        if play is not None:
+            own = _played(play, agent or _agent(agent_audio, known, failed), failed)
+        if split_kind(audio)[0] == "mic" and (own is not None or agent_audio != "none"):
+            voice, own = _conversation(audio, own or agent_audio, known, failed)
         else:
             voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed)
         voice = voice or _recorded_voice(audio, again)
@@ -112,8 +126,8 @@ def open_source(
         else:
             sight = _opened("--face", face, known.sights, ("face",), failed)
             sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
-            agent = agent or _agent(agent_audio, known, failed)
-            source = PairedSource(voice, sight, agent, duration_s)
+            own = own or _agent(agent_audio, known, failed)
+            source = PairedSource(voice, sight, own, duration_s)
         failed.pop_all()
     return source
 
@@ -166,6 +180,14 @@ def _conversation(audio: str, agent: Voice | str, known: SourceKinds, failed: Ex
 def _agent(value: str, known: SourceKinds, failed: ExitStack) -> Any:
     agent = _opened("--agent-audio", value, known.agent_voices, ("voice",), failed)
     return agent or _recorded_voice(value, False)
+
+
+def _played(device: str, spoken: Spoken, failed: ExitStack) -> Voice:
+    from sfms_robot.sources.playback import open_playback
+
+    played = open_playback(device, spoken)
+    failed.callback(played.close)
+    return played
 
 
 def _recorded_voice(name: str, loop: bool) -> Any:

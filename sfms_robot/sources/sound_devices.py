@@ -1,7 +1,7 @@
-"""Sound devices that record: what PortAudio lists, and the sources of a sound server by the server's own names.
+"""Sound devices, that record or that play: what PortAudio lists, and what a sound server has by the server's own names.
 
-PulseAudio and PipeWire are one device to PortAudio ("pulse"). Which of their sources it opens is the environment
-variable PULSE_SOURCE at that moment; monitors, what a loudspeaker is given, are such sources.
+PulseAudio and PipeWire are one device to PortAudio ("pulse"). Which of their sources and sinks it opens are the
+environment variables PULSE_SOURCE and PULSE_SINK at that moment; monitors, what a loudspeaker is given, are sources.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.sources.speakers import speakers
@@ -21,52 +21,54 @@ from sfms_robot.sources.speakers import speakers
 _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
 _HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # numbers that change when something is plugged in
 _PACTL_LIMIT_S: Final = 5.0
+_VARIABLES: Final = {"source": "PULSE_SOURCE", "sink": "PULSE_SINK"}
 
 
 @dataclass(frozen=True)
 class SoundDevice:
-    """A device that records.
+    """A device that records, or one that plays.
 
     Attributes:
         name: as PortAudio or the sound server calls it.
         number: of PortAudio; another one when something was plugged in.
-        inputs: channels at most.
+        channels: at most.
         rate_hz: that it has without being asked for another.
-        default: the one that records where none is named.
-        server_source: it is this source of the sound server; None: a device of PortAudio's own.
+        default: the one that is taken where none is named.
+        server: what it is of the sound server; None: a device of PortAudio's own.
     """
 
     name: str
     number: int
-    inputs: int
+    channels: int
     rate_hz: float
     default: bool = False
-    server_source: str | None = None
+    server: Literal["source", "sink"] | None = None
 
     @property
     def label(self) -> str:
         """What a person may type for it, number first where it has one of its own."""
-        return self.name if self.server_source else f"{self.number} {self.name}"
+        return self.name if self.server else f"{self.number} {self.name}"
 
     @property
     def monitor(self) -> bool:
         """It records what a loudspeaker is given."""
-        return self.server_source is not None and self.server_source.endswith(".monitor")
+        return self.server == "source" and self.name.endswith(".monitor")
 
     @contextmanager
     def selected(self) -> Iterator[None]:
         """What is opened in here by `number` is this device. Not for several threads."""
-        before = os.environ.pop("PULSE_SOURCE", None)
-        if self.server_source:
-            os.environ["PULSE_SOURCE"] = self.server_source
-        elif before is not None:
-            os.environ["PULSE_SOURCE"] = before
+        if self.server is None:
+            yield
+            return
+        variable = _VARIABLES[self.server]
+        before = os.environ.get(variable)
+        os.environ[variable] = self.name
         try:
             yield
         finally:
-            os.environ.pop("PULSE_SOURCE", None)
+            del os.environ[variable]
             if before is not None:
-                os.environ["PULSE_SOURCE"] = before
+                os.environ[variable] = before
 
 
 def portaudio(flag: str) -> ModuleType:
@@ -84,46 +86,64 @@ def recording_devices(flag: str) -> list[SoundDevice]:
 
     Raises ConfigError without PortAudio.
     """
-    sounddevice = portaudio(flag)
-    default = sounddevice.default.device[0]
-    found = [
-        SoundDevice(each["name"], each["index"], each["max_input_channels"], each["default_samplerate"],
-                    each["index"] == default)
-        for each in sounddevice.query_devices()
-        if each["max_input_channels"] > 0
-    ]  # fmt: skip
-    server = next((device for device in found if device.name == _SERVER), None)
-    if server is not None:
-        found += [replace(server, name=name, default=False, server_source=name) for name in _server_sources()]
-    return found
+    return _devices(flag, "source")
 
 
-def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str) -> SoundDevice:
+def playing_devices(flag: str) -> list[SoundDevice]:
+    """As `recording_devices`."""
+    return _devices(flag, "sink")
+
+
+def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays: bool = False) -> SoundDevice:
     """The device with this number, this name, or the only one with this in its name; "" is the default one.
 
-    Raises PortError where nothing records, ConfigError for a name that is not there or fits several, with the choices.
+    Raises PortError where there are none, ConfigError for a name that is not there or fits several, with the choices.
     """
     if not devices:
-        choices = ", ".join(("FILE.wav", *speakers(), "none"))
-        raise PortError(f"{flag}: this computer has no microphone, or its sound server does not run ({choices})")
+        choices = "leave it out" if plays else ", ".join(("FILE.wav", *speakers(), "none"))
+        missing = "loudspeaker" if plays else "microphone"
+        raise PortError(f"{flag}: this computer has no {missing}, or its sound server does not run ({choices})")
     fitting = _fitting(devices, wanted)
     if len(fitting) == 1:
         return fitting[0]
     problem = "fits several devices" if fitting else "no such device"
     choices = ", ".join(device.label for device in fitting or devices)
-    raise ConfigError(f"{flag}:{wanted}: {problem} ({choices})")
+    raise ConfigError(f"{flag}{' ' if plays else ':'}{wanted}: {problem} ({choices})")
 
 
-def tell_devices(_: Any) -> Generator[list[SoundDevice], Any, None]:
+def why_not_opened(error: Exception) -> str:
+    """PortAudio's own word, and what it mostly means."""
+    text = str(error.args[0] if error.args else error).rpartition(": ")[2].partition(" [")[0]
+    busy = "unavailable" in text.casefold() or "busy" in text.casefold()
+    return "another program holds it, or it was unplugged" if busy else text
+
+
+def tell_devices(what: Literal["recording", "playing"]) -> Generator[list[SoundDevice], Any, None]:
     """For a `SourceWorker`: PortAudio, which prints what it likes, sees the devices of this moment."""
-    yield recording_devices("a microphone")
+    yield recording_devices("a microphone") if what == "recording" else playing_devices("a loudspeaker")
+
+
+def _devices(flag: str, of_server: Literal["source", "sink"]) -> list[SoundDevice]:
+    sounddevice = portaudio(flag)
+    records = of_server == "source"
+    channels, default = "max_input_channels" if records else "max_output_channels", sounddevice.default.device
+    found = [
+        SoundDevice(each["name"], each["index"], each[channels], each["default_samplerate"],
+                    each["index"] == default[0 if records else 1])
+        for each in sounddevice.query_devices()
+        if each[channels] > 0
+    ]  # fmt: skip
+    server = next((device for device in found if device.name == _SERVER), None)
+    if server is not None:
+        found += [replace(server, name=name, default=False, server=of_server) for name in _names(f"{of_server}s")]
+    return found
 
 
 def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
     if not wanted:
         return [device for device in devices if device.default] or list(devices[:1])
     if wanted.isdigit():
-        return [device for device in devices if not device.server_source and device.number == int(wanted)]
+        return [device for device in devices if not device.server and device.number == int(wanted)]
     looks = (
         lambda name: name == wanted,
         lambda name: _HARDWARE.sub("", name) == _HARDWARE.sub("", wanted),
@@ -135,12 +155,11 @@ def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
     return []
 
 
-def _server_sources() -> list[str]:
-    """By name; none where the server's own tool is not installed, or does not answer."""
+def _names(of_server: str) -> list[str]:
+    """Of its sources, or its sinks; none where the server's own tool is not installed, or does not answer."""
+    words = ["pactl", "list", "short", of_server]
     try:
-        told = subprocess.run(
-            ["pactl", "list", "short", "sources"], capture_output=True, text=True, timeout=_PACTL_LIMIT_S, check=True
-        )
+        told = subprocess.run(words, capture_output=True, text=True, timeout=_PACTL_LIMIT_S, check=True)
     except (OSError, subprocess.SubprocessError):
         return []
     return [line.split("\t")[1] for line in told.stdout.splitlines() if "\t" in line]

@@ -25,8 +25,9 @@ logger = logging.getLogger(__name__)
 PACKETS_PER_CALL: Final = 64
 LONGEST_CALL_S: Final = 0.002
 LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
-LOST_S: Final = 1.0
+LOST_S: Final = 0.5  # five packets of one that sends ten a second
 SILENT_S: Final = 2.0  # after so long another sender may take over
+ANY: Final = ("0.0.0.0", "::")  # every address of this machine
 UNHEARD_S: Final = 5.0  # so long into a run without a sender, what to type there is said
 _REASONS_SAID: Final = 4
 
@@ -152,7 +153,7 @@ class UdpSight:
         self._said: set[str] = set()
         self._refusal_said = False
         self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused"), 0)
-        logger.info("%s: %s", kind, hint)
+        logger.warning("%s: %s", kind, hint)
 
     @property
     def address(self) -> tuple[str, int]:
@@ -244,3 +245,8 @@ def addresses_of_this_machine() -> list[str]:
                 continue
             addresses.append(socket.inet_ntoa(answer[20:24]))
     return [address for address in addresses if not address.startswith("127.")]
+
+
+def flag_for_others(kind: str, port: int, usual_port: int) -> str:
+    """What to type so that other machines are heard too."""
+    return f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")

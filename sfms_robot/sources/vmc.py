@@ -1,4 +1,4 @@
-"""Avatar software that speaks the VMC protocol (OSC over UDP): `--face vmc[:[HOST:]PORT]`.
+"""Avatar software that speaks the VMC protocol (OSC over UDP): `--face vmc[:PORT|:HOST[:PORT]]`.
 
 Read (protocol.vmc.info, "Marionette" specification), alone or in bundles:
 
@@ -18,6 +18,7 @@ primitives. Bundles are walked here: python-osc 1.10 never comes back from one t
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import struct
 from collections.abc import Iterator, Mapping
@@ -30,7 +31,7 @@ from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Floats
 from sfms_robot.sources.face_argument import parse_endpoint, parse_face_argument
 from sfms_robot.sources.live_face import LiveFace
-from sfms_robot.sources.udp_sight import DatagramSocket, UdpSight
+from sfms_robot.sources.udp_sight import ANY, DatagramSocket, UdpSight, addresses_of_this_machine, flag_for_others
 
 PORT: Final = 39539  # what the protocol gives those who receive
 
@@ -276,13 +277,20 @@ def _is_number(value: object) -> bool:
 
 
 def open_vmc(argument: str) -> UdpSight:
-    """`[[HOST:]PORT][,flip=...]`; avatar software on this machine by default, on another with `vmc:0.0.0.0:39539`.
+    """`[PORT|HOST[:PORT]][,flip=...]`; avatar software on this machine by default, on another with `vmc:0.0.0.0`.
 
     Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
     """
     given = parse_face_argument("vmc", argument)
-    host, port = parse_endpoint("vmc", given.place, "127.0.0.1", PORT)
+    host, port = parse_endpoint("vmc", given.place, PORT)
     opened = DatagramSocket("vmc", host, port)
-    target = f"{opened.address[0]}, port {opened.address[1]}"
-    hint = f"let the avatar software send VMC to {target} (vmc:0.0.0.0:{port} also hears other machines)"
-    return UdpSight("vmc", opened, VmcDecoder(), LiveFace(given.signs), hint)
+    return UdpSight("vmc", opened, VmcDecoder(), LiveFace(given.signs), _hint(*opened.address))
+
+
+def _hint(host: str, port: int) -> str:
+    """What to do so that it hears avatar software."""
+    own = addresses_of_this_machine() if host in ANY else [host]
+    target = f"let the avatar software send VMC to {' or '.join(own) or 'this machine'}, port {port}"
+    if not ipaddress.ip_address(host).is_loopback:
+        return target
+    return f"{target}; {flag_for_others('vmc', port, PORT)} also hears other machines"

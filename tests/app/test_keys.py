@@ -26,10 +26,16 @@ os.environ["TERM"] = "xterm"
 logging.basicConfig(format="%(message)s")
 interrupt, halt = Interrupt(), HaltLatch()
 
-def document():
-    return {"state": "halted" if halt.by else "listening", "note": sys.argv[2]}
+level = [1.0]
 
-with signals_to(interrupt), live_panel(document, interrupt, halt):
+def document():
+    state = "halted" if halt.by else "listening"
+    return {"state": state, "note": sys.argv[2], "intensity": {"neck": level[0], "eyes": level[0]}}
+
+def turn(by):
+    level[0] = round(level[0] + by, 3)
+
+with signals_to(interrupt), live_panel(document, interrupt, halt, turn):
     while not interrupt():
         threading.Event().wait(0.01)
         if sys.argv[2] == "fails" and halt.by:
@@ -95,6 +101,9 @@ def test_keys_halt_resume_help_and_end():
             shown.until("halt released")
             shown.until(" listening ")  # what was drawn before it is past
         assert shown.single_keys()
+        for key, level in ((b"+", "1.1"), (b"=", "1.2"), (b"-", "1.1")):
+            shown.press(key)
+            shown.until(level)
         shown.press(b"?")
         shown.until("torque off at once")
         shown.press(b"xqq")  # one that is held down asks once

@@ -17,13 +17,14 @@ from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 
-RETARGETER = build_motion(load_head("face28"), 100.0).retargeter
+HEAD = load_head("face28")
+RETARGETER = build_motion(HEAD, 100.0).retargeter
 
 
 def test_a_region_at_intensity_0_rests_and_the_others_do_not_notice():
     face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
     plain, _ = RETARGETER.step(face, RETARGETER.start())
-    without, _ = RETARGETER.step(face, RETARGETER.start(), turned(RETARGETER, ["brows=0"]))
+    without, _ = RETARGETER.step(face, RETARGETER.start(), turned(HEAD, ["brows=0"]).now)
     changed = {name for name, a, b in zip(RETARGETER.joints, plain, without, strict=True) if a != b}
     assert changed and all(name.startswith("brow") for name in changed)
 
@@ -31,7 +32,7 @@ def test_a_region_at_intensity_0_rests_and_the_others_do_not_notice():
 def test_nothing_given_is_what_the_file_says():
     face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
     plain, _ = RETARGETER.step(face, RETARGETER.start())
-    same, _ = RETARGETER.step(face, RETARGETER.start(), turned(RETARGETER))
+    same, _ = RETARGETER.step(face, RETARGETER.start(), turned(HEAD).now)
     assert np.array_equal(plain, same)
 
 
@@ -47,8 +48,22 @@ def test_nothing_given_is_what_the_file_says():
 )
 def test_a_knob_that_is_none_is_refused_in_one_line(given, said):
     with pytest.raises(ConfigError) as caught:
-        turned(RETARGETER, [given])
+        turned(HEAD, [given])
     assert said in str(caught.value)
+
+
+def test_all_regions_are_turned_together_and_none_leaves_its_range():
+    knobs = turned(HEAD, ["neck=0.5", "brows=1.95"])
+    before = knobs.values["intensity"]
+    knobs.turn_all(0.1)
+    assert knobs.values["intensity"] == {region: pytest.approx(min(at + 0.1, 2.0)) for region, at in before.items()}
+    assert knobs.now.intensity.max() == 2.0
+    for _ in range(30):
+        knobs.turn_all(-0.1)
+    assert set(knobs.values["intensity"].values()) == {0.0}
+    face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
+    angles, _ = RETARGETER.step(face, RETARGETER.start(), knobs.now)
+    assert angles == pytest.approx(build_motion(HEAD, 100.0).rest_rad, abs=0.02)
 
 
 def test_a_run_with_the_neck_turned_off_keeps_it_at_rest():
@@ -73,7 +88,7 @@ class Goals(Observer):
 def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():
     head, clock, goals = load_head("op3_head"), VirtualClock(), Goals()
     motion = build_motion(head, 100.0)
-    off, on = turned(motion.retargeter, ["neck=0"]), turned(motion.retargeter)
+    off, on = turned(head, ["neck=0"]).now, turned(head).now
     log = RunLog(motion.retargeter.joints, 0.01, motion.audit)
     with launch(emulated(head)["main"], virtual=True) as chain:
         bus = build_bus(head, {"main": chain}, clock)

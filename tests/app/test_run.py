@@ -67,7 +67,10 @@ def test_a_run_is_recorded_whole(tmp_path):
     done = run(dataclasses.replace(SHORT, record=tmp_path / "run"))
     recording = read_recording(tmp_path / "run")
     assert recording.whole and recording.joints == tuple(load_head("face28").joints)
-    assert len(recording.times_s) == 301
+    assert len(recording.times_s) == done["ticks"] and recording.listened_s == 3.0
+    assert recording.states[-1][1] == "stopping" and recording.duration_s > 4.0
+    rest_rad = [joint.rest_rad for joint in load_head("face28").joints.values()]
+    assert recording.goals_rad[-1] == pytest.approx(rest_rad, abs=1e-3)
     assert (tmp_path / "run" / "report.json").is_file()
     assert done["exit"] == "done"
 

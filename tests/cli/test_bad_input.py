@@ -121,3 +121,19 @@ def test_a_halt_switch_that_cannot_be_one(fails, tmp_path):
     ):
         code, told = fails("run", "--fast", "--duration", "0.2", "--head", "interbotix_wxxms", "--halt-on", where)
         assert code == 2 and f"--halt-on {where}" in told and why in told
+
+
+@pytest.mark.parametrize("words", [["--play"], ["--play", "USB", "--agent-audio", "none"]])
+def test_a_robot_that_says_nothing_is_not_played(fails, words):
+    code, told = fails("run", *words)
+    assert code == 2 and "nothing is played of --agent-audio none" in told and "tcp" in told and "katie" in told
+
+
+def test_what_is_heard_takes_real_time(fails):
+    code, told = fails("run", "--fast", "--duration", "1", "--agent-audio", "katie", "--play")
+    assert code == 2 and "--play default" in told and "--fast has none" in told
+
+
+def test_a_status_port_that_is_none(fails):
+    code, told = fails("run", "--status", "http")
+    assert code == 2 and "--status http: is no TCP port" in told

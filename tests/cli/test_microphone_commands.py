@@ -5,13 +5,14 @@ import pytest
 from sfms_robot.cli.meter import LevelMeter, meter_line
 
 
-def test_port_list_shows_serial_ports_and_what_records(sound_server, command_line):
+def test_port_list_shows_serial_ports_and_what_records_and_plays(sound_server, command_line):
     ended = command_line("port", "list", "--json")
     listed = ended.told
     assert ended.code == 0 and isinstance(listed["ports"], list) and listed["microphone_problem"] is None
     devices = {row["name"]: row for row in listed["microphones"]}
     assert devices["default"]["default"] and devices["default"]["description"] == "--audio mic:default"
     assert devices["person.monitor"]["description"] == "--agent-audio device:person.monitor"
+    assert {row["name"]: row["description"] for row in listed["loudspeakers"]}["person"] == "--play person"
 
 
 def test_a_check_says_what_it_heard_of_nobody(sound_server, command_line):

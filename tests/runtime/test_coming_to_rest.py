@@ -83,10 +83,12 @@ class Watcher:
 
     def __init__(self, raises_at: int | None = None) -> None:
         self.goals: list[Any] = []
+        self.seen: list[Any] = []
         self._raises_at = raises_at
 
     def tick(self, seen: Any) -> None:
         self.goals.append(seen.goals_rad)
+        self.seen.append(seen)
         if len(self.goals) == self._raises_at:
             raise RuntimeError("a browser tab was closed")
 
@@ -165,6 +167,31 @@ def test_an_observer_that_raises_is_detached_and_the_run_goes_on(chain, caplog):
     assert outcome == "done" and len(observer.goals) == 5
     assert log.detached == {"Watcher": "RuntimeError: a browser tab was closed"}
     assert len([line for line in caplog.messages if "Watcher" in line]) == 1
+    assert_at_rest(chain)
+
+
+def test_the_way_to_rest_is_seen_and_the_last_face_fades_with_it(chain):
+    observer = Watcher()
+    outcome, log = driven(chain, VirtualClock(), observer=observer)
+    assert outcome == "done" and len(observer.seen) == log.ticks
+    ways = [tick.state for tick in observer.seen]
+    first = ways.index("stopping")
+    assert len(ways) - first == log.eased >= RATE_HZ and set(ways[first:]) == {"stopping"}
+    times_s = [tick.time_s for tick in observer.seen]
+    assert np.diff(times_s) == pytest.approx(np.full(len(times_s) - 1, 1 / RATE_HZ))
+    yaw = [abs(tick.motion[CHANNEL_INDEX["yaw"]]) for tick in observer.seen[first - 1 :]]
+    assert yaw[0] > 0.1 and yaw[-1] == 0.0 and all(a >= b for a, b in zip(yaw, yaw[1:], strict=False))
+    last = observer.seen[-1]
+    assert set(last.readings) == set(HEAD.joints)
+    assert last.goals_rad == pytest.approx([joint.rest_rad for joint in HEAD.joints.values()], abs=1e-3)
+
+
+@pytest.mark.parametrize("at", [1, 40])
+def test_an_observer_that_raises_on_the_way_to_rest_keeps_nobody_from_it(chain, at):
+    listened = round(SECONDS * RATE_HZ) + 1
+    outcome, log = driven(chain, VirtualClock(), observer=Watcher(raises_at=listened + at))
+    assert outcome == "done" and set(log.detached) == {"Watcher"}
+    assert log.audited.violations == 0
     assert_at_rest(chain)
 
 

@@ -24,13 +24,14 @@ RATE_HZ = max(bus.rate_hz for bus in HEAD.buses.values())
 
 
 class Unplugger:
-    """An observer that pulls one adapter after two seconds, and keeps the goals."""
+    """An observer that pulls one adapter after two seconds, and keeps the goals up to the way to rest."""
 
     def __init__(self, chain):
         self._chain, self.goals, self._pulled = chain, [], False
 
     def tick(self, seen):
-        self.goals.append((seen.time_s, seen.goals_rad))
+        if seen.state != "stopping":
+            self.goals.append((seen.time_s, seen.goals_rad))
         if seen.time_s > 2.0 and not self._pulled:
             self._pulled = True
             self._chain.hang_up()

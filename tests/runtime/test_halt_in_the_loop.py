@@ -161,7 +161,7 @@ def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_i
     stop = halted + round(STOPS_S * RATE_HZ)
     assert np.array_equal(goals[stop], goals[late])  # stands, for as long as it is halted
     assert seen == {joint: joint in NECK for joint in JOINTS}
-    assert "starting" in ran.states[ran.states.index("halted") :] and ran.states[-1] == "listening"
+    assert "starting" in ran.states[ran.states.index("halted") :] and ran.states[-2:] == ["listening", "stopping"]
     after = goals[late + round((EASE_S + 0.5) * RATE_HZ) :]
     assert np.ptp(after, axis=0)[JOINTS.index(NECK[1])] > 0.05  # it nods again
 
@@ -174,13 +174,14 @@ def test_a_head_that_is_halted_at_the_end_moves_no_more(chain):
 
 def test_a_halt_that_is_released_at_once_is_ended_when_the_head_stands(chain):
     ran = run(chain, lambda latch: {150: lambda: latch.close("key"), 151: latch.open}, seconds=4.0)
-    assert ran.states == ["starting", "listening", "halted", "starting", "listening"]
+    assert ran.states == ["starting", "listening", "halted", "starting", "listening", "stopping"]
     assert ran.log.audited.violations == 0
 
 
 def test_a_halt_while_joints_ease_in_and_one_before_the_first_tick(chain):
     ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: latch.open}, seconds=4.0)
-    assert ran.states == ["starting", "halted", "starting", "listening"] and ran.log.audited.violations == 0
+    assert ran.states == ["starting", "halted", "starting", "listening", "stopping"]
+    assert ran.log.audited.violations == 0
 
 
 def test_who_is_gone_is_not_answered_and_who_comes_is_answered_within_half_a_second(chain):

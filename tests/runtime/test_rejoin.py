@@ -40,13 +40,15 @@ class Bow:
 
 
 class Hand:
-    """An observer that does things to the chain at given ticks, and keeps what it sees."""
+    """An observer that does things to the chain at given ticks, and keeps what it sees up to the way to rest."""
 
     def __init__(self, does: dict[int, Callable[[], None]]) -> None:
         self._does = does
         self.ticks: list[Tick] = []
 
     def tick(self, seen: Tick) -> None:
+        if seen.state == "stopping":
+            return
         self.ticks.append(seen)
         if (act := self._does.get(len(self.ticks))) is not None:
             act()

@@ -58,14 +58,16 @@ def test_what_cannot_be_used_is_one_line_with_choices(argument, text):
         parse_face_argument("live-link", argument)
 
 
-def test_endpoints():
-    assert parse_endpoint("vmc", "", "127.0.0.1", 39539) == ("127.0.0.1", 39539)
-    assert parse_endpoint("vmc", "1234", "127.0.0.1", 39539) == ("127.0.0.1", 1234)
-    assert parse_endpoint("vmc", "0.0.0.0:1234", "127.0.0.1", 39539) == ("0.0.0.0", 1234)
-    assert parse_endpoint("vmc", "[::1]:1234", "127.0.0.1", 39539) == ("::1", 1234)
+def test_a_place_that_does_not_say_where_is_this_machine_alone():
+    assert parse_endpoint("vmc", "", 39539) == ("127.0.0.1", 39539)
+    assert parse_endpoint("vmc", "1234", 39539) == ("127.0.0.1", 1234)
+    assert parse_endpoint("vmc", "0.0.0.0", 39539) == ("0.0.0.0", 39539)
+    assert parse_endpoint("vmc", "[::]", 39539) == ("::", 39539)
+    assert parse_endpoint("vmc", "0.0.0.0:1234", 39539) == ("0.0.0.0", 1234)
+    assert parse_endpoint("vmc", "[::1]:1234", 39539) == ("::1", 1234)
 
 
 @pytest.mark.parametrize("place", ["x", "0", "65536", "-1", ":1234", "host:", "host", "1.5", "²"])
 def test_a_port_that_is_none_is_one_line(place):
     with pytest.raises(ConfigError, match="is no UDP port .live-link, live-link:PORT, live-link:HOST:PORT"):
-        parse_endpoint("live-link", place, "0.0.0.0", 11111)
+        parse_endpoint("live-link", place, 11111)

@@ -15,7 +15,7 @@ from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbere
 from sfms_robot.errors import PacketError, PortError
 from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
 from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
-from sfms_robot.sources.udp_sight import Datagram
+from sfms_robot.sources.udp_sight import Datagram, addresses_of_this_machine
 
 PACKETS = recorded_packets()
 DECODED = Path(__file__).parents[1] / "assets" / "live_link_llv.csv.gz"
@@ -281,3 +281,21 @@ def test_a_million_packets_of_noise_never_raise(sight):
     assert counts["packets"] == 1_000_000
     assert 450_000 < counts["malformed"] < 750_000
     assert np.isfinite(sight.at(1e9).face.motion).all()
+
+
+def test_this_machine_alone_is_heard_and_what_a_phone_needs_is_said(caplog):
+    port = free_port()
+    opened = open_live_link(str(port))
+    assert opened.address == ("127.0.0.1", port)
+    opened.close()
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said.startswith(f"live-link: 127.0.0.1, port {port}, this machine alone; for a phone ")
+    assert f"--face live-link:0.0.0.0:{port}, and in the app" in said and said.endswith(f", port {port}")
+
+
+def test_a_phone_is_told_the_addresses_of_this_machine(caplog):
+    port = free_port()
+    open_live_link(f"0.0.0.0:{port}").close()
+    (said,) = [record.getMessage() for record in caplog.records]
+    target = " or ".join(addresses_of_this_machine()) or "the address of this machine"
+    assert said == f"live-link: in the app, capture mode Live Link (ARKit), enter the target {target}, port {port}"

@@ -14,11 +14,11 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.sources.live_voice import LiveVoice
 from sfms_robot.sources.microphone import OwnVoice, open_microphone, sound_devices
-from sfms_robot.sources.microphone_worker import LOST_S, Capture, _reason, captured_s
+from sfms_robot.sources.microphone_worker import LOST_S, Capture, captured_s
 from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.sound_devices import SoundDevice
+from sfms_robot.sources.sound_devices import SoundDevice, why_not_opened
 
 PATIENCE_S = 60.0  # on a computer with nothing to spare
 
@@ -243,7 +243,7 @@ def test_a_device_that_gives_no_more_sound_went_away():
     ],
 )
 def test_why_a_device_cannot_be_opened_is_told_in_words(text, why):
-    assert _reason(OSError(text)).startswith(why)
+    assert why_not_opened(OSError(text)).startswith(why)
 
 
 def test_the_microphone_is_told_of_every_frame_that_the_robot_says():

@@ -14,8 +14,8 @@ BUILT_IN = SoundDevice("HDA Intel PCH: ALC257 Analog (hw:0,0)", 0, 2, 44_100.0)
 USB = SoundDevice("USB PnP Sound Device: Audio (hw:1,0)", 4, 1, 48_000.0)
 ARRAY = SoundDevice("ReSpeaker 4 Mic Array: USB Audio (hw:2,0)", 5, 6, 16_000.0)
 SERVER = SoundDevice("pulse", 8, 32, 44_100.0, default=True)
-SOURCE = SoundDevice("alsa_input.usb-PnP.mono", 8, 32, 44_100.0, server_source="alsa_input.usb-PnP.mono")
-MONITOR = SoundDevice("robot.monitor", 8, 32, 44_100.0, server_source="robot.monitor")
+SOURCE = SoundDevice("alsa_input.usb-PnP.mono", 8, 32, 44_100.0, server="source")
+MONITOR = SoundDevice("robot.monitor", 8, 32, 44_100.0, server="source")
 ALL = [BUILT_IN, USB, ARRAY, SERVER, SOURCE, MONITOR]
 
 

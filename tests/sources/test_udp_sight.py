@@ -6,12 +6,15 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.sources.face_argument import FaceArgument
 from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.udp_sight import (
+    LOST_S,
     PACKETS_PER_CALL,
     SILENT_S,
     UNHEARD_S,
@@ -102,6 +105,36 @@ def test_what_to_do_is_said_when_nobody_sends(sight, caplog):
     sight.at(UNHEARD_S + 1)
     sight.at(UNHEARD_S + 2)
     assert [record.message for record in caplog.records] == ["test: nobody sends yet: call 42"]
+
+
+def test_a_sender_that_falls_silent_is_lost_after_half_a_second_until_it_is_back(sight):
+    feed(sight, FIRST, *np.arange(21) * 0.05)
+    lost = []
+    for frame in range(25, 51):
+        sight.at(frame * 0.04)
+        lost.append(sight.lost)
+    assert lost == [frame * 0.04 - 1.0 > LOST_S for frame in range(25, 51)]
+    assert 0.5 <= LOST_S <= 0.6
+    feed(sight, FIRST, 2.05)
+    sight.at(2.08)
+    assert not sight.lost
+
+
+@given(late_s=st.lists(st.floats(0, 0.08), min_size=60, max_size=60), gaps=st.sets(st.integers(1, 19)))
+def test_one_that_sends_ten_a_second_is_not_lost_for_two_packets_in_a_row(late_s, gaps):
+    sight = UdpSight("test", DatagramSocket("test", "127.0.0.1", 0), Bytes(), LiveFace(FaceArgument("").signs), "call")
+    due_s = [(n, n * 0.1 + late) for n, late in enumerate(late_s) if n // 3 not in gaps or n % 3 == 0]
+    for frame in range(1, 148):
+        time_s = frame * 0.04
+        feed(sight, FIRST, *[at for _, at in due_s if time_s - 0.04 < at <= time_s])
+        sight.at(time_s)
+        assert not sight.lost
+    sight.close()
+
+
+def test_nobody_who_never_sent_is_lost(sight):
+    sight.at(1e6)
+    assert not sight.lost
 
 
 def test_the_newest_face_of_an_instant_or_before_is_seen(sight):

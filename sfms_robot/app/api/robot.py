@@ -17,8 +17,8 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from sfms_robot.app.api.background import Background, Report
-from sfms_robot.app.api.live_knobs import LiveKnobs
 from sfms_robot.app.api.named_head import head_name
+from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.session import RunOptions, prepare_head, run
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head, load_head, parse
@@ -33,6 +33,7 @@ from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.planned_events import EventWatch
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.paired import JudgedSource, PairedSource
+from sfms_robot.sources.playback import open_playback
 from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
 from sfms_robot.sources.registry import open_source, split_kind
 
@@ -50,8 +51,10 @@ class _PushedPerson:
     sight: PushedSight = field(default_factory=PushedSight)
     speech: PushedSpeech = field(default_factory=PushedSpeech)
 
-    def source(self) -> Source:
-        return PairedSource(self.voice, self.sight, self.speech)
+    def source(self, play: str | None) -> Source:
+        """`play`: the device that plays what it says; None: the program does."""
+        own = self.speech if play is None else open_playback(play, self.speech)
+        return PairedSource(self.voice, self.sight, own)
 
 
 class Robot:
@@ -68,6 +71,8 @@ class Robot:
             `Listener`, which is then stepped in a thread of this process.
         audio: "push" for what `hear`, `see` and `say` hand over; else a source that `run --audio` knows.
         face, agent_audio: as `run --face`, `--agent-audio`, beside another source than "push".
+        play: the device that plays what the robot says, by number, name or part of one, or "default"; None: whoever
+            calls `say` plays it.
         source: an object of a class derived from `Source`, instead of `audio`, `face` and `agent_audio`. Its `read` is
             called in the loop: it must not block.
         duration_s: seconds after which it ends by itself; None for that of the source.
@@ -91,6 +96,7 @@ class Robot:
         audio: str = PUSH,
         face: str = "auto",
         agent_audio: str = "none",
+        play: str | None = None,
         source: Source | None = None,
         duration_s: float | None = None,
         fast: bool = False,
@@ -109,12 +115,15 @@ class Robot:
             raise InputError('with audio="push" the face comes by see() and the robot\'s own voice by say()')
         if pushed and fast:
             raise InputError('fast=True needs another source than audio="push": what a program hears takes real time')
+        if play is not None and source is not None:
+            raise InputError(f"play={play!r}: what a source of your own says is not played; leave it out")
         own = listener if not isinstance(listener, (str, Path)) else None
         self._options = RunOptions(
             head=head_name(head), port=port, listener=type(own).__name__ if own is not None else str(listener),
             audio="none" if pushed else audio, face=face, agent_audio=agent_audio, duration_s=duration_s, fast=fast,
             seed=seed, record=None if record is None else Path(record), overwrite=overwrite, yes=yes,
-            without=tuple(without), calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
+            without=tuple(without), play=play,
+            calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
         )  # fmt: skip
         prepare_head(self._options.servos)
         config = load_head(self._options.head)
@@ -209,15 +218,17 @@ class Robot:
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
         """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
 
-        Play it one frame (40 ms) after it is handed over, behind what still waits; or say by `at_s` (`time.monotonic`)
-        when its first sample will be played: that replaces what was to be played from then on. Up to two minutes may
-        wait. Never blocks. With a microphone (`audio="mic"`) it is taken out of what is heard. Raises InputError beside
-        another source.
+        With `play=` it is played here, as soon as it can be. Else play it yourself, one frame (40 ms) after it is
+        handed over, behind what still waits. `at_s` (`time.monotonic`) says when its first sample is played instead:
+        that replaces what was to be played from then on. Up to two minutes may wait. Never blocks. With a microphone
+        (`audio="mic"`) it is taken out of what is heard. Raises InputError beside another source.
         """
         self._spoken("say").say(pcm, rate_hz, at_s)
 
     def hush(self) -> None:
-        """What it still had to say will not be played: you were interrupted. Never blocks."""
+        """What it still had to say will not be played: you were interrupted. With `play=` what is on its way out of the
+        device is the last that is heard. Never blocks.
+        """
         self._spoken("hush").hush()
 
     def _spoken(self, what: str) -> PushedSpeech:
@@ -308,17 +319,20 @@ class Robot:
             self._feed = self._begin_listening()
             if self._feed is not None:
                 stack.callback(self._feed.close)
-            source: Source | None = self._source if self._person is None else self._person.source()
-            if self._person is None and self._speech is not None:
-                asked = self._options
-                source = open_source(asked.hears, asked.face, asked.duration_s, agent=self._speech)
+            source: Source | None = self._source
+            asked = self._options
+            if self._person is not None:
+                source = self._person.source(asked.play)
+                stack.callback(source.close)
+            elif self._speech is not None:
+                source = open_source(asked.hears, asked.face, asked.duration_s, agent=self._speech, play=asked.play)
                 stack.callback(source.close)
             return run(
                 self._options,
                 source=source,
                 feed=self._feed,
                 observers=[progress, self._events],
-                knobs=lambda _: lambda: self._knobs.now,
+                knobs=self._knobs,
                 overlay=self._puppet.overlay,
                 interrupt=interrupt,
                 halt=halt,

@@ -95,6 +95,8 @@ class Onlooker(Observer):
         self.angles_rad: list[Doubles] = []
 
     def tick(self, seen: Tick) -> None:
+        if seen.state == "stopping":  # nothing is followed any more
+            return
         for chain in self._chains.values():
             chain.time_is(self._clock.now_s())
         ticks = [self._chains[joint.bus].state(joint.id)["position"] for joint in self._head.joints.values()]

@@ -49,17 +49,19 @@ def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dic
     }
 
 
-def evaluate_listener(names: Sequence[str], data: Path, seed: int, order: Order | None = None) -> dict[str, Any]:
+def evaluate_listener(
+    names: Sequence[str], data: Path, seed: int, order: Order | None = None, hop: int | None = None
+) -> dict[str, Any]:
     """Stream the held-out speakers of `data` through listeners: their behaviour beside that of the dyads.
 
-    An SFMS listener also says how many keyframes it would have foreseen.
+    An SFMS listener also says how many keyframes it would have foreseen. `hop`: see `load_at_hop`.
     """
+    from sfms_robot.app.evaluate.hop_choice import load_at_hop
     from sfms_robot.corpora.collection import usable
     from sfms_robot.corpora.formats import open_for
     from sfms_robot.corpora.resampling import at_frame_rate
     from sfms_robot.evaluation.behaviour import behaviour
     from sfms_robot.evaluation.rollout import rollouts
-    from sfms_robot.listeners.registry import load_listener
 
     dyads = [at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, "validation", order))]
     if not dyads:
@@ -67,11 +69,11 @@ def evaluate_listener(names: Sequence[str], data: Path, seed: int, order: Order 
     rows: list[dict[str, Any]] = []
     with Progress(console=_stderr()) as progress:
         for name in names:
-            listener = load_listener(find("listeners", name, "config.yaml"))
+            listener = load_at_hop(find("listeners", name, "config.yaml"), hop)
             task = progress.add_task(name, total=len(dyads))
             motions = [one.motion[0] for one in rollouts(listener, dyads, seed, partial(progress.advance, task))]
             figures = asdict(behaviour(motions, dyads)) | _keyframe_scores(listener, dyads)
-            rows.append({"name": name, **_nulls_for_nan(figures)})
+            rows.append({"name": name, "hop": listener.hop, **_nulls_for_nan(figures)})
     rows.append({"name": "dyads", **_nulls_for_nan(asdict(behaviour([dyad.listener for dyad in dyads], dyads)))})
     return {"listeners": list(names), "dyads": len(dyads), "rows": rows}
 
@@ -100,18 +102,20 @@ def listener_table(
     limit: int | None,
     seed: int,
     order: Order | None = None,
+    hop: int | None = None,
 ) -> dict[str, Any]:
     """Table 1 or 2 of the paper for listeners and heuristics, on the validation split of any data set known.
 
-    At most `limit` dyads, spread evenly. Raises ConfigError when the listeners do not share a motion space.
+    At most `limit` dyads, spread evenly; `hop`: see `load_at_hop`. Raises ConfigError when the listeners do not share a
+    motion space.
     """
+    from sfms_robot.app.evaluate.hop_choice import load_at_hop
     from sfms_robot.corpora.formats import open_for
     from sfms_robot.evaluation.paper import listener_clips
     from sfms_robot.evaluation.paper.listener_tables import table
-    from sfms_robot.listeners.registry import load_listener
     from sfms_robot.listeners.sfms.stream import SfmsListener
 
-    listeners = {name: load_listener(find("listeners", name, "config.yaml")) for name in names}
+    listeners = {name: load_at_hop(find("listeners", name, "config.yaml"), hop) for name in names}
     space = listener_clips.shared_space(listeners)
     heard = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
     train, held_out = (listener_clips.spread(open_for(space.name, data, split, order, heard), most) for split, most in

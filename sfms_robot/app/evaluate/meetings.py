@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.app.evaluate.hop_choice import load_at_hop
 from sfms_robot.app.evaluate.task_pool import done_in_processes
 from sfms_robot.app.evaluate.unseen_speakers import voice_folders
 from sfms_robot.config import Calmness, find
@@ -35,7 +36,6 @@ from sfms_robot.evaluation.rollout import rollout
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.registry import load_listener
 from sfms_robot.ports import Listener
 
 _PREFIXES: Final = {"decided": "decided_", "people": "people_", "R2": "r2_"}
@@ -52,6 +52,7 @@ class TimingOptions:
         minutes: of motion from the middle of each meeting; 0: none, which takes minutes instead of hours.
         seeds: how often a listener is left to itself in each.
         jobs: processes; None: as many as there are cores.
+        hop: see `load_at_hop`.
     """
 
     listener: str
@@ -63,6 +64,7 @@ class TimingOptions:
     seeds: int = 8
     seed: int = 1
     jobs: int | None = None
+    hop: int | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     """
     where = Path(options.listener) if options.listener.endswith(".yaml") else None
     where = where or find("listeners", options.listener, "config.yaml")
-    _listener(where)  # what is wrong with it is said here, not by a process
+    heard_by = _listener(where, options.hop)  # what is wrong with it is said here, not by a process
     everybody = read_people(tables(options.data))
     chosen = spread(people_of(everybody, options.split, options.allow_training), options.meetings)
     tasks = list(_tasks(options, where, everybody, chosen))
@@ -115,6 +117,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "minutes": round(sum(one.minutes for one in played), 2),
         "minutes_of_motion_each": options.minutes,
         "seeds": options.seeds,
+        "hop": None if isinstance(heard_by, EventModel) else heard_by.hop,
         **{name: _rounded(one.value) for name, one in found.items()},
         "people_smiles_per_minute": None,
         "people_blinks_per_minute": None,
@@ -175,7 +178,7 @@ def _play(task: _Task) -> _Played:
     options, (voices, laughter, motions) = task.options, _material(task.options.split, task.options.data)
     rng = np.random.default_rng([options.seed, task.number])
     one = listener_meeting(task.person, voices, laughter, motions, rng)
-    listener, alone = _listener(task.where), without_own_voice(one.speaker)
+    listener, alone = _listener(task.where, options.hop), without_own_voice(one.speaker)
     first, frames = middle(one.frames, 0.0 if isinstance(listener, EventModel) else options.minutes)
     played = np.zeros(one.frames, bool)
     played[first : first + frames] = True
@@ -223,8 +226,8 @@ def _by_events(
 
 
 @cache
-def _listener(where: Path) -> Listener | EventModel:
-    return EventModel.load(where) if where.suffix == ".yaml" else load_listener(where)
+def _listener(where: Path, hop: int | None) -> Listener | EventModel:
+    return EventModel.load(where) if where.suffix == ".yaml" else load_at_hop(where, hop)
 
 
 @cache

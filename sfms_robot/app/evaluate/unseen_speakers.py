@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 import numpy as np
@@ -128,7 +129,13 @@ def _listener(folder: Path) -> Listener:
     return load_listener(folder)
 
 
-def _extremes(rows: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
-    """Least and most over all speakers and ways."""
-    names = [f"{kind}s_per_minute" for kind in RANGES]
-    return {name: [min(row[name] for row in rows), max(row[name] for row in rows)] for name in names}
+def _extremes(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Least and most over all speakers and ways, and the median scatter over seeds (None: nothing was done twice)."""
+    found: dict[str, Any] = {}
+    for kind in RANGES:
+        rates = [row[f"{kind}s_per_minute"] for row in rows]
+        scatter = [row[f"{kind}s_variance_over_mean"] for row in rows]
+        known = [value for value in scatter if value is not None]
+        found[f"{kind}s_per_minute"] = [min(rates), max(rates)]
+        found[f"{kind}s_variance_over_mean"] = round(median(known), 3) if known else None
+    return found

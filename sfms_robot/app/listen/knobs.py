@@ -1,18 +1,110 @@
-"""`--intensity` and `--style` REGION=V -> the knobs of a head; `--calmness` KIND=V -> what it does how often."""
+"""How much each region of a head shows, turned while it runs; `--intensity`, `--style` and `--calmness` of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from threading import Lock
+from typing import Final
 
-from sfms_robot.config import Calmness, parse
-from sfms_robot.errors import ConfigError
+from sfms_robot.config import Calmness, Head, parse
+from sfms_robot.errors import ConfigError, InputError
+from sfms_robot.retarget.channel_mapping import ChannelMapping as Face
 from sfms_robot.retarget.channel_mapping import Knobs
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
+
+STEP: Final = 0.1  # of a key
+MOST: Final = 2.0
 
 
-def turned(retargeter: HeadRetargeter, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> Knobs:
-    """Knobs over those of the head's file. Raises ConfigError for an unknown region or a value outside 0..2."""
-    return retargeter.mapping.knobs(_values("--intensity", intensity), _values("--style", style))
+class Knob:
+    """`intensity` and `style` of one region, 0..2, 1 for as it is. What is set holds from the next tick on.
+
+    Setting raises InputError for a value outside 0..2.
+    """
+
+    def __init__(self, knobs: LiveKnobs, region: str) -> None:
+        self._knobs, self._region = knobs, region
+
+    @property
+    def intensity(self) -> float:
+        """How large: 0 nothing, 1 as mapped, 2 twice, within the range of every joint."""
+        return self._knobs.values["intensity"][self._region]
+
+    @intensity.setter
+    def intensity(self, value: float) -> None:
+        self._knobs.set("intensity", self._region, value)
+
+    @property
+    def style(self) -> float:
+        """How small motion comes out: 0 it vanishes, 1 as mapped, 2 doubled; large motion stays as it is."""
+        return self._knobs.values["style"][self._region]
+
+    @style.setter
+    def style(self, value: float) -> None:
+        self._knobs.set("style", self._region, value)
+
+    def __repr__(self) -> str:
+        return f"Knob({self._region!r}, intensity={self.intensity:g}, style={self.style:g})"
+
+
+class LiveKnobs:
+    """Regions of a head by name. May be turned from any thread.
+
+    Attributes:
+        values: region -> value, of "intensity" and of "style".
+        now: what the loop asks for at every tick.
+    """
+
+    def __init__(self, head: Head, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
+        self._face = Face(head)
+        self._lock = Lock()
+        self._regions = tuple(head.regions)
+        self.values = {
+            kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()}
+            for kind in ("intensity", "style")
+        }
+        self.now: Knobs = self._face.knobs()
+        for kind, given in (("intensity", intensity), ("style", style)):
+            for region, value in given.items():
+                self._region(region)
+                self.set(kind, region, value)
+
+    def set(self, kind: str, region: str, value: float) -> None:
+        """Raises InputError for a value outside 0..2."""
+        if not 0 <= value <= MOST:
+            raise InputError(f"{kind} of {region} = {value:g} is not in 0..2")
+        with self._lock:
+            self._turn({**self.values, kind: {**self.values[kind], region: float(value)}})
+
+    def turn_all(self, by: float) -> None:
+        """Intensity of every region up or down; none leaves 0..2."""
+        with self._lock:
+            louder = {name: round(min(max(at + by, 0.0), MOST), 3) for name, at in self.values["intensity"].items()}
+            self._turn({**self.values, "intensity": louder})
+
+    def _turn(self, values: dict[str, dict[str, float]]) -> None:
+        self.values, self.now = values, self._face.knobs(values["intensity"], values["style"])
+
+    def _region(self, name: str) -> str:
+        if name not in self._regions:
+            raise InputError(f"{name!r} is not a region of this head ({', '.join(self._regions) or 'none'})")
+        return name
+
+    def __getitem__(self, region: str) -> Knob:
+        """Raises InputError for a name that is no region."""
+        return Knob(self, self._region(region))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._regions)
+
+    def __len__(self) -> int:
+        return len(self._regions)
+
+
+def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> LiveKnobs:
+    """`--intensity REGION=V` and `--style REGION=V`, over the head's file. Raises ConfigError for an unknown region or
+    a value outside 0..2.
+    """
+    return LiveKnobs(head, _values("--intensity", intensity), _values("--style", style))
 
 
 def calmed(per_minute: Sequence[str] = (), addressed: str = "sense") -> Calmness:

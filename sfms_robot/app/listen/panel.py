@@ -22,6 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sfms_robot.app.listen.keys import ESCAPE, Keyboard, in_background, keyboard, reading_keys
+from sfms_robot.app.listen.knobs import STEP
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
@@ -34,18 +35,23 @@ _COLORS: Final[Mapping[str, str]] = {
     "starting": "cyan", "idle": "blue", "listening": "green", "speaking": "magenta", "degraded": "yellow",
     "halted": "bold white on red", "stopping": "cyan", "stopped": "dim", "fault": "bold red",
 }  # fmt: skip
-_KEYS: Final = "space halt, r resume, q end, ? help"
+_KEYS: Final = "space halt, r resume, + - intensity, q end, ? help"
 _HELP: Final = (
-    "space, h, Esc: emergency stop; r: go on after one; q: come to rest and end; Ctrl-C twice: torque off at once"
+    "space, h, Esc: emergency stop; r: go on after one; + and -: intensity of all regions, a tenth; "
+    "q: come to rest and end; Ctrl-C twice: torque off at once"
 )
 _NO_KEYS: Final = "no keys here: Ctrl-C ends the run"
 
 Document = Callable[[], Mapping[str, Any]]
+Turn = Callable[[float], None]
 
 
 @contextmanager
-def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch) -> Iterator[None]:
-    """Shown while inside; afterwards the terminal is as it was, whatever happens. Main thread only."""
+def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch, turn: Turn) -> Iterator[None]:
+    """Shown while inside; afterwards the terminal is as it was, whatever happens. Main thread only.
+
+    turn: makes the face show more, or less, by so much.
+    """
     console = Console(stderr=True)
     if not console.is_terminal or console.is_dumb_terminal:
         yield
@@ -55,17 +61,19 @@ def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch) -> Ite
         screen = stack.enter_context(_drawing(console, document, interrupt, found is not None))
         stack.enter_context(_suspending(screen, found))  # before the terminal is taken, until it is given back
         if found is not None:
-            stack.enter_context(reading_keys(found, lambda key: _pressed(key, screen, interrupt, halt)))
+            stack.enter_context(reading_keys(found, lambda key: _pressed(key, screen, interrupt, halt, turn)))
         yield
 
 
-def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch) -> None:
+def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch, turn: Turn) -> None:
     if key in (" ", "h", ESCAPE):
         halt.close("key")
     elif key == "r":
         halt.open()
     elif key == "q" and not interrupt():  # a key that is held down asks once, and releases nothing
         interrupt.ask()
+    elif key in "+=-":  # "=": the key of "+", without shift
+        turn(-STEP if key == "-" else STEP)
     elif key == "?":
         screen.help = not screen.help
     screen.look.set()
@@ -204,6 +212,7 @@ def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool 
         ("person", _level(person.get("voice_db"), meter, console) + _attention(person)),
         ("robot", _level(person.get("own_voice_db"), meter, console)),
         ("face", _motion(document.get("motion") or {})),
+        ("intensity", _intensity(document.get("intensity") or {})),
         ("ticks", _ticks(document.get("tick") or {})),
         ("latency", _latency(document.get("latency_ms") or {})),
         ("hottest", _hottest(document.get("hottest"))),
@@ -245,6 +254,13 @@ def _attention(person: Mapping[str, Any]) -> str:
 
 def _motion(motion: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in motion.items())
+
+
+def _intensity(regions: Mapping[str, float]) -> str:
+    """Of the regions that are not as mapped; one number where all are the same."""
+    if len(regions) > 1 and len(set(regions.values())) == 1 and 1.0 not in regions.values():
+        return f"{next(iter(regions.values())):g}"
+    return ", ".join(f"{region} {value:g}" for region, value in regions.items() if value != 1.0)
 
 
 def _ticks(tick: Mapping[str, Any]) -> str:

@@ -26,11 +26,17 @@ def check_names(
     audio: str = "default",
     face: str = "auto",
     agent_audio: str = "none",
+    play: str | None = None,
+    status: str | None = None,
 ) -> None:
-    """Are there such a head, listener, port and files? Raises ConfigError, PortError."""
+    """Are there such a head, listener, port and files, and is the status's port free? Raises ConfigError, PortError."""
     find("heads", head, "head.yaml")
     listener_folder(listener)
-    check_source(audio, face, agent_audio)
+    check_source(audio, face, agent_audio, play=play)
+    if status is not None:
+        from sfms_robot.app.listen.status_server import StatusServer  # http.server: only for who wants it
+
+        StatusServer(status).close()
     for part in port.split(","):
         device = part.rpartition("=")[2]
         if device.startswith("/") and (problem := access_problem(device)):

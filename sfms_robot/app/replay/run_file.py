@@ -72,6 +72,12 @@ class RunRecording:
         return float(self.times_s[-1])
 
     @property
+    def listened_s(self) -> float:
+        """Time of the last tick before the way to rest."""
+        ends_s = min((at_s for at_s, state, _ in self.states if state == "stopping"), default=float("inf"))
+        return float(self.times_s[max(0, int(np.searchsorted(self.times_s, ends_s)) - 1)])
+
+    @property
     def has_voice(self) -> bool:
         """Something was heard."""
         return bool(np.any(self.energy_db > _FLOOR_DB))
@@ -101,7 +107,7 @@ class RunRecording:
         """One line: head, listener, speaker and length."""
         parts = [self.about[key] for key in ("head", "listener", "audio") if self.about.get(key)]
         cut = "" if self.whole else " (the file was cut off)"
-        return "  |  ".join([*parts, f"{self.duration_s:.1f} s{cut}"])
+        return "  |  ".join([*parts, f"{self.listened_s:.1f} s{cut}"])
 
 
 def read_recording(folder: Path | str) -> RunRecording:
@@ -139,7 +145,7 @@ def summary(recording: RunRecording) -> dict[str, Any]:
     """What is in a recording, for the command line."""
     return {
         **{key: value for key, value in recording.about.items() if key not in LONG},
-        "duration_s": round(recording.duration_s, 3),
+        "duration_s": round(recording.listened_s, 3),
         "ticks": len(recording.times_s),
         "speaker_frames": len(recording.heard_s),
         "plans": recording.plans,

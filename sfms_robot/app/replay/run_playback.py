@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sfms_robot.app.head.pose import NobodyThere
+from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.report import figures_so_far
 from sfms_robot.app.replay.run_file import RunRecording, read_recording
 from sfms_robot.app.session import HeadOptions, Panel, Programme, drive_head, open_head, run_log
@@ -38,10 +39,13 @@ class PlaybackOptions:
 
 
 class RecordedFace:
-    """`ports.Timeline` of a recording: between two ticks the face is interpolated, before and after them it stays."""
+    """`ports.Timeline` of a recording up to its way to rest: between two ticks the face is interpolated, before and
+    after them it stays.
+    """
 
     def __init__(self, recording: RunRecording) -> None:
-        self._times_s, self._motion = recording.times_s, recording.motion
+        listened = recording.times_s <= recording.listened_s
+        self._times_s, self._motion = recording.times_s[listened], recording.motion[listened]
 
     def start(self) -> None:
         return None
@@ -76,20 +80,27 @@ def play_back(folder: Path, options: PlaybackOptions, panel: Panel | None = None
     servos = HeadOptions(head, options.port, options.fast, options.yes)
     with signals_to(interrupt), halt_signals(halt), open_head(servos) as opened:
         log, alone = run_log(opened), NobodyThere()
-        facts = {"head": opened.config.name, "listener": "recorded", "duration_s": recording.duration_s}
+        facts = {"head": opened.config.name, "listener": "recorded", "duration_s": recording.listened_s}
+        knobs = turned(opened.config)
         status = RunStatus(
-            list(opened.config.joints), facts, lambda: figures_so_far(log, opened.rate_hz, real=not options.fast)
+            list(opened.config.joints),
+            facts,
+            lambda: {
+                **figures_so_far(log, opened.rate_hz, real=not options.fast),
+                "intensity": knobs.values["intensity"],
+            },
         )
         programme = Programme(
-            alone, alone, recording.duration_s, RecordedFace(recording), halt=halt, observers=[status]
+            alone, alone, recording.listened_s, RecordedFace(recording), knobs=lambda: knobs.now, halt=halt,
+            observers=[status],
         )  # fmt: skip
-        with panel(status.document, interrupt, halt) if panel is not None else nullcontext():
+        with panel(status.document, interrupt, halt, knobs.turn_all) if panel is not None else nullcontext():
             drove = drive_head(opened, programme, interrupt, signals=False, log=log)
     return {
         "version": 1,
         "head": opened.config.name,
         "port": options.port,
-        "recorded_s": round(recording.duration_s, 3),
+        "recorded_s": round(recording.listened_s, 3),
         "duration_s": round(log.listened_s, 3),
         "whole": recording.whole,
         "exit": drove.outcome,

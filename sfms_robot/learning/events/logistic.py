@@ -10,7 +10,6 @@ import numpy as np
 from sfms_robot.frames import Doubles, Floats
 
 NEWTON_STEPS: Final = 8
-RIDGE: Final = 10.0
 _ROWS: Final = 65_536  # at once
 
 
@@ -27,7 +26,7 @@ class Logistic:
 
 
 def fit(
-    inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles | None = None, ridge: float = RIDGE
+    inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles | None = None, ridge: float = 10.0
 ) -> Logistic:
     """Maximum likelihood of `happens` (N,) 0 or 1, each row counting `counts` (N,) times, less ridge / 2 * |weights|^2.
 

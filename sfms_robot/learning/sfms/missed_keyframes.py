@@ -2,8 +2,8 @@
 
 Teacher forcing never shows the predictor a face that should have come back and has not: a lid whose opening was not
 drawn, a nod that has lost its last swing. In a roll-out that happens, and such a face would stay until some later
-keyframe. So the last keyframes before the first frame to draw are left out now and then, and where what is then shown is
-off by more than a keyframe costs, the right answer is one at once: the face as it is there.
+keyframe. So the last keyframes before the first frame to draw are left out now and then, and where what is then shown
+is off by more than a keyframe costs, the right answer is one at once: the face as it is there.
 """
 
 from __future__ import annotations

@@ -109,10 +109,17 @@ def listener_job(
     def missing(chosen: Tensor, generator: torch.Generator, meant: Tensor, first: Tensor) -> Tensor:
         if not phase.missed_keyframes:
             return meant
-        cut = [windows(one, chosen, listener.window_frames) for one in (dense, motion)]
-        costs = torch.tensor(model.tokenizer.costs, device=device)
-        member, share = model.tokenizer.member, phase.missed_keyframes
-        return without_last_keyframes(meant, *cut, first, member, costs, share, generator)
+        tokenizer, window = model.tokenizer, listener.window_frames
+        return without_last_keyframes(
+            meant,
+            windows(dense, chosen, window),
+            windows(motion, chosen, window),
+            first,
+            tokenizer.member,
+            torch.tensor(tokenizer.costs, device=device),
+            phase.missed_keyframes,
+            generator,
+        )
 
     return Job(
         name="listener",

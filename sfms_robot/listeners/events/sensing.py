@@ -1,8 +1,9 @@
 """A person's frame as evidence: the ear hears who speaks, the face says who looks, nods, smiles and laughs.
 
-Each input may be missing. No microphone: a mouth that moves is a voice. No face: nobody nods or laughs, and whether the
-head is looked at is what `Calmness.addressed` says. Attention flickers; looked-at changes only when a quarter second of
-it, smoothed, has clearly crossed the middle.
+Each input may be missing. No microphone: a mouth that moves is a voice. No face: nobody nods or laughs. Nobody who
+tells whether the head is looked at: it is, for one person talks to one head; an attention of NaN says that nobody
+knows, and so does a face that has told it before and is lost. Attention flickers; looked-at changes only when a quarter
+second of it, smoothed, has clearly crossed the middle.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class SenseMemory:
         own: frames since own voice.
         attention: smoothed; None before any. looked: 1, 0, or NaN for nobody knows.
         unseen: frames since their face; None before the first.
+        tells: somebody has told their attention.
     """
 
     addressed: Addressed = "sense"
@@ -46,6 +48,7 @@ class SenseMemory:
     attention: float | None = None
     looked: float = math.nan
     unseen: int | None = None
+    tells: bool = False
     face: FaceState = FaceState()
     hearing: Hearing = field(default_factory=hearing)
 
@@ -90,8 +93,9 @@ def _looked(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMem
         return gone.looked, gone
     given = speaker.attention
     if given is None or not math.isfinite(given):
-        gone = replace(memory, unseen=0, attention=None, looked=math.nan)
-        return math.nan, gone
+        if given is None and not memory.tells:
+            return 1.0, replace(memory, unseen=0)
+        return math.nan, replace(memory, unseen=0, attention=None, looked=math.nan)
     before = memory.attention
     given = min(max(given, 0.0), 1.0)
     level = given if before is None else given + (before - given) * _KEPT
@@ -100,4 +104,4 @@ def _looked(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMem
         looked = 1.0
     elif level < NOT_LOOKED:
         looked = 0.0
-    return looked, replace(memory, unseen=0, attention=level, looked=looked)
+    return looked, replace(memory, unseen=0, attention=level, looked=looked, tells=True)

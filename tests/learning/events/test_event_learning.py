@@ -12,12 +12,13 @@ import pytest
 
 from sfms_robot.corpora.compose.ami import Person, phrases
 from sfms_robot.corpora.meeting_evidence import meeting_evidence
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.learning.events import event_rollout, logistic
 from sfms_robot.learning.events.event_trainer import GROUPS, hazard, inputs, ranked, student, teach
 from sfms_robot.learning.events.labels import lesson, looks_of
-from sfms_robot.listeners.events.evidence import AT, EVIDENCE, Scene, counts_in
-from sfms_robot.listeners.events.hazards import HazardBank
+from sfms_robot.listeners.events.evidence import AT, Scene, counts_in
+from sfms_robot.listeners.events.hazards import HazardBank, load_tables
 from sfms_robot.listeners.events.model import EventModel
 
 NONE = np.zeros((0, 2))
@@ -157,16 +158,70 @@ def test_counts_of_a_person_are_his_own():
     assert event_rollout.interval_distance(found, found) == 0
 
 
+@pytest.mark.parametrize(
+    ("data", "out", "problem"), [("none", "a.yaml", "no such folder"), (".", "gone/a.yaml", "--out")]
+)
+def test_a_folder_that_is_not_there_is_one_line(tmp_path, data, out, problem):
+    from sfms_robot.app.train.event_training import train_events
+
+    with pytest.raises(ConfigError, match=problem) as raised:
+        train_events(tmp_path / data, tmp_path / out, False, 1)
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    from sfms_robot.app.train.event_training import save
+
+    shipped = EventModel.load().tables
+    save(tmp_path / "events.yaml", shipped)
+    assert load_tables(tmp_path / "events.yaml") == shipped
+    assert "Carletta" in (tmp_path / "events.yaml").read_text()
+
+
 # --- the meetings themselves ------------------------------------------------------------------------------------
+
+
+# R2 of a study of the same 36 meetings and 134 listeners, in the order of `event_trainer.NOD`, as printed there.
+STUDY = {
+    "phrase_s": (0.20, -0.02, -0.18, -0.26, -0.24, 0.00, 0.20, 0.33, 0.34),
+    "silence_s": (0.19, 0.35, 0.41, 0.27, -0.14, 0.08, -0.39, -0.32),
+    "last_phrase_s": (0.04, 0.12, -0.08, -0.07, 0.07, 0.05, 0.07),
+    "one_speaks": (-0.12,),
+    "several_speak": (0.17,),
+    "floor_mine": (-0.41,),
+    "floor_s": (0.12, -0.14, -0.18, 0.00, 0.04, 0.19, 0.20, 0.18),
+    "holder_silence_s": (-0.01, 0.08, -0.04, 0.40, 0.50, 0.40, 0.08, -0.09, -0.46),
+    "own_voice_s": (1.37, 1.28, 0.92, 0.40, 0.25, 0.12, 0.14, 0.05, -0.01),
+    "nod_end_s": (-0.08, -0.53, -0.62, 0.70, 0.73, 0.73, 0.53, 0.30, 0.43),
+    "root_nods_30s": (0.20,),
+    "log_rate": (0.76,),
+    "gaze_known": (-0.18,),
+    "looked_at": (0.77,),
+    "looked_at_s": (-0.39, -0.05, 0.42, 0.57, 0.06, 0.16),
+    "looked_at_silence_s": (0.10, 0.37, 0.21, 0.12),
+    "laugh_s": (0.01, -0.31, -0.44, -0.24, -0.15),
+    "others_nod_s": (0.73, 0.73, 0.56, 0.10, 0.07, -0.03),
+}
 
 
 @pytest.mark.slow
 @pytest.mark.skipif("SFMS_ROBOT_AMI" not in os.environ, reason="needs the AMI tables: SFMS_ROBOT_AMI=DIR")
-def test_all_meetings_teach_what_others_found_in_them():
-    """R2 of a study of the same 36 meetings, 134 listeners: printed to two digits, on its own sixth of the steps."""
+def test_all_meetings_teach_what_a_study_found_in_them():
+    """To what another sixth of the steps leaves, but for instants at which a step begins (docs/listening.md).
+
+    Those are the value just as an own nod ends (-0.08 there, some 0.3 here) and, of a silence of over 2 s, two that
+    cannot occur here.
+    """
     from sfms_robot.app.train.event_training import train_events
 
     found = train_events(Path(os.environ["SFMS_ROBOT_AMI"]), None, True, seed=1)["nod"]
-    assert found["intercept"] == pytest.approx(-7.44, abs=0.1)
-    assert found["weights"]["looked_at"] == pytest.approx(0.77, abs=0.1)
-    assert AT["looked_at"] < len(EVIDENCE)
+    assert found["intercept"] == pytest.approx(-7.44, abs=0.12)
+    off = {}
+    for name, printed in STUDY.items():
+        weight = found["weights"][name]
+        values = list(weight.values()) if isinstance(weight, dict) else [weight]
+        for index, value in enumerate(printed):
+            off[name, index] = values[index] - value
+    assert abs(off.pop(("nod_end_s", 0))) < 0.5
+    assert max(abs(value) for value in off.values()) < 0.2
+    assert np.sqrt(np.mean(np.square(list(off.values())))) < 0.06

@@ -18,7 +18,7 @@ SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
 PPM = 200e-6
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
 # Roll, pitch, yaw of listeners of composed dyads (`data compose`, training), less gaze: 1st and 99th percentile.
-PEOPLE_RAD = ((-0.04, 0.04), (-0.04, 0.06), (-0.04, 0.04))
+PEOPLE_RAD = ((-0.030, 0.030), (-0.024, 0.058), (-0.033, 0.033))
 
 
 def silent_minutes(listener, frames: int = FRAMES) -> np.ndarray:

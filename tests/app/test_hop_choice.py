@@ -1,0 +1,20 @@
+"""`evaluate --hop N`: the hops that a run may choose, and no other."""
+
+import pytest
+
+from sfms_robot.app.evaluate.hop_choice import load_at_hop
+from sfms_robot.config import find
+from sfms_robot.errors import ConfigError
+
+
+@pytest.mark.parametrize(("hop", "plans_every"), [(None, 4), (2, 2), (8, 8)])
+def test_a_listener_plans_as_often_as_it_is_told(hop, plans_every):
+    assert load_at_hop(find("listeners", "sfms-small", "config.yaml"), hop).hop == plans_every
+
+
+@pytest.mark.parametrize(
+    ("listener", "hop", "choices"), [("sfms-small", 9, "1, 2, 3, 4, 5, 6, 7, 8"), ("arig-small", 2, "1")]
+)
+def test_a_hop_that_it_cannot_be_run_with_is_refused_with_the_choices(listener, hop, choices):
+    with pytest.raises(ConfigError, match=rf"^--hop {hop}: {listener} cannot be run with it \({choices}\)$"):
+        load_at_hop(find("listeners", listener, "config.yaml"), hop)
