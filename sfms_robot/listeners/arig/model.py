@@ -15,10 +15,12 @@ to join them; `target` is what the sampler learns and `drawn` its inverse. Every
 plain units: motion of the listener's motion space, sound features of `sound.track`.
 
 Beyond the paper, too:
- - `draws: innovation`: x_t = rho x_(t-1) + step_std * drawn, standardised, with the lag-1 autocorrelation `rho` < 1 of
-   the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near its mean as in the data
-   however long a stream runs: its place is that of a first-order autoregression, not a sum of steps. What was drawn
-   last is told to the sampler beside z: how fast the face moves is too fine for the few numbers of z.
+ - `draws: innovation`: x_t = rho x_(t-1) + step_std * sinh(spread * drawn), standardised, with the lag-1
+   autocorrelation `rho` < 1 of the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near
+   its mean as in the data however long a stream runs: its place is that of a first-order autoregression, not a sum of
+   steps. A face mostly hardly moves and at times moves a hundred times as fast: companded by asinh above `step_std`,
+   what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
+   the face moves is too fine for the few numbers of z.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest.
 
@@ -44,7 +46,6 @@ from sfms_robot.listeners.arig.pmp import Progressive
 from sfms_robot.signals.control import COLUMNS
 
 CONTROL_ROWS = 2  # that are told: of the frame before and of the frame
-LARGEST_TOLD = 8.0  # of the last sample, in deviations
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ class ArigModel(nn.Module):
     motion_high: Tensor
     step_std: Tensor
     rho: Tensor
+    spread: Tensor
     is_drawn: Tensor
     sound_mean: Tensor
     sound_std: Tensor
@@ -137,6 +139,7 @@ class ArigModel(nn.Module):
         self.register_buffer("step_std", torch.ones(self.channels))
         if settings.draws == "innovation":
             self.register_buffer("rho", torch.zeros(self.channels))
+            self.register_buffer("spread", torch.ones(self.channels))
         is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
         self.register_buffer("is_drawn", is_drawn, persistent=False)
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
@@ -180,13 +183,17 @@ class ArigModel(nn.Module):
 
     def target(self, motion: Tensor, last: Tensor) -> Tensor:
         """What the sampler is to draw: motion (..., C) after `last` (..., C), both standardised -> (..., C)."""
-        return motion if self.settings.draws == "motion" else (motion - self.expected(last)) / self.step_std
+        if self.settings.draws == "motion":
+            return motion
+        step = (motion - self.expected(last)) / self.step_std
+        return step.asinh() / self.spread if self.settings.draws == "innovation" else step
 
     def drawn(self, sample: Tensor, last: Tensor) -> Tensor:
         """The inverse of `target`; a step never leads out of the range of the motion, and what is not drawn rests."""
         if self.settings.draws == "motion":
             return self._at_rest(sample)
-        made = torch.addcmul(self.expected(last), sample, self.step_std).clamp(self.motion_low, self.motion_high)
+        step = (sample * self.spread).sinh() if self.settings.draws == "innovation" else sample
+        made = torch.addcmul(self.expected(last), step, self.step_std).clamp(self.motion_low, self.motion_high)
         return self._at_rest(made)
 
     def _at_rest(self, motion: Tensor) -> Tensor:
@@ -201,7 +208,7 @@ class ArigModel(nn.Module):
         """z (..., D) and what the sampler is told besides: embedded events (..., D), its last sample (..., C)."""
         told = [z] if events is None else [z, events]
         if self.settings.draws == "innovation":
-            told.append(sample.clamp(-LARGEST_TOLD, LARGEST_TOLD))
+            told.append(sample)
         return torch.cat(told, dim=-1) if len(told) > 1 else z
 
     def embed_events(self, rows: Tensor) -> Tensor | None:
