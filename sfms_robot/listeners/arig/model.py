@@ -20,7 +20,8 @@ Beyond the paper, too:
    its mean as in the data however long a stream runs: its place is that of a first-order autoregression, not a sum of
    steps. A face mostly hardly moves and at times moves a hundred times as fast: companded by asinh above `step_std`,
    what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
-   the face moves is too fine for the few numbers of z.
+   the face moves is too fine for the few numbers of z. The mean of what is to be drawn is predicted, and the sampler
+   draws what is left: an event that is told shows after few steps of training, whatever the sampler's temperature.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest.
 
@@ -41,10 +42,11 @@ from sfms_robot.listeners.arig.codes import CodeHead
 from sfms_robot.listeners.arig.csu import FIRST, StateUnderstanding
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
-from sfms_robot.listeners.arig.parts import Linear, windows
+from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
 from sfms_robot.listeners.arig.pmp import Progressive
 from sfms_robot.signals.control import COLUMNS
 
+MEAN_WIDTH = 256
 CONTROL_ROWS = 2  # that are told: of the frame before and of the frame
 
 
@@ -167,6 +169,11 @@ class ArigModel(nn.Module):
             if settings.discrete
             else Denoiser(settings.channels, condition, settings.diffusion)
         )
+        self.mean = (
+            nn.Sequential(Linear(condition, MEAN_WIDTH), nn.GELU(), Linear(MEAN_WIDTH, self.channels))
+            if settings.draws == "innovation"
+            else None
+        )
 
     @property
     def noise_shape(self) -> tuple[int, int]:
@@ -203,6 +210,29 @@ class ArigModel(nn.Module):
     def expected(self, last: Tensor) -> Tensor:
         """Where a step after `last` (..., C), standardised, begins: there, or a little on its way back to the mean."""
         return self.rho * last if self.settings.draws == "innovation" else last
+
+    def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
+        """Of the sampler (N, C), the mean included: z (N, D and beside it), noise and levels of `Denoiser.sample`."""
+        drawn = self.head.sample(z, noise, levels) if isinstance(self.head, Denoiser) else self.head.sample(z, noise)
+        return drawn if self.mean is None else drawn + self.mean(z)
+
+    def sample_loss(
+        self,
+        z: Tensor,
+        wanted: Tensor,
+        draws: int = 1,
+        generator: torch.Generator | None = None,
+        weights: Tensor | None = None,
+    ) -> Tensor:
+        """Equation (3) of `target` (N, C) at `draws` noise levels, or the loss of codes, and that of the mean, (N,)."""
+        mean = torch.zeros_like(wanted) if self.mean is None else self.mean(z)
+        left, z = (each.repeat(draws, 1) for each in (wanted - mean.detach(), z))
+        drawn = self.head.loss(z, left, generator, weights).view(draws, -1).mean(0)
+        return (
+            drawn
+            if self.mean is None
+            else drawn + weighted_mean(F.smooth_l1_loss(mean, wanted, reduction="none"), weights)
+        )
 
     def beside(self, z: Tensor, events: Tensor | None, sample: Tensor) -> Tensor:
         """z (..., D) and what the sampler is told besides: embedded events (..., D), its last sample (..., C)."""
@@ -299,7 +329,8 @@ class ArigModel(nn.Module):
         found = self.condition(dyad, known)
         standard = self.standardise(dyad.agent_motion)
         target = self.target(standard[:, 1:], standard[:, :-1])
-        motion = self.head.loss(found.z.flatten(0, 1), target.flatten(0, 1), generator).view(target.shape[:2])
+        motion = self.sample_loss(found.z.flatten(0, 1), target.flatten(0, 1), generator=generator)
+        motion = motion.view(target.shape[:2])
         if found.states is None or states is None:
             return Losses(motion, None)
         wrong = F.cross_entropy(found.states.transpose(1, 2), states[:, 1:], ignore_index=-1, reduction="none")
@@ -308,6 +339,6 @@ class ArigModel(nn.Module):
     def generate(self, dyad: Dyad, noise: Tensor, states: Tensor | None = None) -> Tensor:
         """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape); states: above."""
         z = self.condition(dyad, states).z
-        made = self.head.sample(z.flatten(0, 1), noise.flatten(0, 1))
+        made = self.sample(z.flatten(0, 1), noise.flatten(0, 1))
         last = self.standardise(dyad.agent_motion[:, :-1])
         return self.restore(self.drawn(made.view(*z.shape[:2], -1), last))
