@@ -34,6 +34,8 @@ from sfms_robot.signals.voice_activity import levels_db
 
 SCENES: Final = ("speaking", "listening", "interaction")
 LEAST_STEP: Final = 0.01  # of a frame, in deviations of the motion
+LEAST_SPREAD: Final = 0.25  # of companded innovations: what hardly moves does not weigh more than what moves
+COMPANDED: Final = 4  # innovations above the deviation over this are companded: between what rests and what happens
 LARGEST_RHO: Final = 0.999  # of one frame to the next: a time constant of 40 s
 RARE: Final = 0.02  # of the frames with the same voices: a state so rare there is a label's edge
 
@@ -137,9 +139,24 @@ def _beside_phase(rows: Floats, audio: Floats | None) -> Floats:
 
 
 def autocorrelation(last: Tensor, now: Tensor) -> Tensor:
-    """Lag-1 autocorrelation (C,) of values of mean 0, (M, C) each and the next, within 0..`LARGEST_RHO`."""
+    """Lag-1 autocorrelation (C,) of values of mean 0, (M, C) each and the next, within 0..`LARGEST_RHO`.
+
+    What never moves stays where it is.
+    """
     power = (last.square().sum(0) * now.square().sum(0)).sqrt()
-    return ((last * now).sum(0) / power.clamp(min=1e-9)).clamp(0.0, LARGEST_RHO)
+    found = torch.where(power > 0, (last * now).sum(0) / power.clamp(min=1e-9), 1.0)
+    return found.clamp(0.0, LARGEST_RHO)
+
+
+def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
+    """From standardised motion (M, C) of frames and of the frames after them."""
+    if model.settings.draws != "innovation":
+        model.step_std.copy_((now - last).std(0).clamp(min=LEAST_STEP))
+        return
+    model.rho.copy_(autocorrelation(last, now))
+    steps = now - model.expected(last)
+    model.step_std.copy_((steps.std(0) / COMPANDED).clamp(min=LEAST_STEP))
+    model.spread.copy_((steps / model.step_std).asinh().std(0).clamp(min=LEAST_SPREAD))
 
 
 def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
@@ -173,9 +190,7 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) ->
     model.motion_high.copy_(standard.amax(0))
     of_dyads = torch.split(standard, list(corpus.lengths))
     last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(-1), slice(1, None)))
-    if model.settings.draws == "innovation":
-        model.rho.copy_(autocorrelation(last, now))
-    model.step_std.copy_((now - model.expected(last)).std(0).clamp(min=LEAST_STEP))
+    _fit_steps(model, last, now)
     if isinstance(model.head, Denoiser):
         drawn = model.target(now, last)
         model.head.low.copy_(drawn.amin(0))

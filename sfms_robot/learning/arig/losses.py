@@ -86,8 +86,7 @@ def loss_parts(
     found = model.condition(told, previous)
     target = model.standardise(truth[:, 1:])
     to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]))
-    z, wanted = (each.flatten(0, 1).repeat(draws, 1) for each in (found.z, to_draw))
-    motion = model.head.loss(z, wanted, generator, weights).mean()
+    motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), draws, generator, weights).mean()
     coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
     known = states[:, 1:] >= 0
     state = motion.new_zeros(())

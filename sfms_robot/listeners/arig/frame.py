@@ -104,9 +104,8 @@ class Draw(Part):
             Motion (N, C) in plain units, the same standardised (N, C), as what the sampler drew (N, C), and embedded
             (N, D), and the next motion_keys.
         """
-        model, head = self.model, self.model.head
-        sample = head.sample(z, noise, self.levels) if isinstance(head, Denoiser) else head.sample(z, noise)
-        made = model.drawn(sample, standard)
+        model = self.model
+        made = model.drawn(model.sample(z, noise, self.levels), standard)
         motion = model.embed_motion(made)
         keys = push(motion_keys, model.progress.temporal.keys(motion))
         return model.restore(made), made, model.target(made, standard), motion, keys

@@ -15,10 +15,13 @@ to join them; `target` is what the sampler learns and `drawn` its inverse. Every
 plain units: motion of the listener's motion space, sound features of `sound.track`.
 
 Beyond the paper, too:
- - `draws: innovation`: x_t = rho x_(t-1) + step_std * drawn, standardised, with the lag-1 autocorrelation `rho` < 1 of
-   the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near its mean as in the data
-   however long a stream runs: its place is that of a first-order autoregression, not a sum of steps. What was drawn
-   last is told to the sampler beside z: how fast the face moves is too fine for the few numbers of z.
+ - `draws: innovation`: x_t = rho x_(t-1) + step_std * sinh(spread * drawn), standardised, with the lag-1
+   autocorrelation `rho` < 1 of the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near
+   its mean as in the data however long a stream runs: its place is that of a first-order autoregression, not a sum of
+   steps. A face mostly hardly moves and at times moves a hundred times as fast: companded by asinh above `step_std`,
+   what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
+   the face moves is too fine for the few numbers of z. The mean of what is to be drawn is predicted, and the sampler
+   draws what is left: an event that is told shows after few steps of training, whatever the sampler's temperature.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest.
 
@@ -39,12 +42,12 @@ from sfms_robot.listeners.arig.codes import CodeHead
 from sfms_robot.listeners.arig.csu import FIRST, StateUnderstanding
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
-from sfms_robot.listeners.arig.parts import Linear, windows
+from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
 from sfms_robot.listeners.arig.pmp import Progressive
 from sfms_robot.signals.control import COLUMNS
 
+MEAN_WIDTH = 256
 CONTROL_ROWS = 2  # that are told: of the frame before and of the frame
-LARGEST_TOLD = 8.0  # of the last sample, in deviations
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,7 @@ class ArigModel(nn.Module):
     motion_high: Tensor
     step_std: Tensor
     rho: Tensor
+    spread: Tensor
     is_drawn: Tensor
     sound_mean: Tensor
     sound_std: Tensor
@@ -137,6 +141,7 @@ class ArigModel(nn.Module):
         self.register_buffer("step_std", torch.ones(self.channels))
         if settings.draws == "innovation":
             self.register_buffer("rho", torch.zeros(self.channels))
+            self.register_buffer("spread", torch.ones(self.channels))
         is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
         self.register_buffer("is_drawn", is_drawn, persistent=False)
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
@@ -164,6 +169,11 @@ class ArigModel(nn.Module):
             if settings.discrete
             else Denoiser(settings.channels, condition, settings.diffusion)
         )
+        self.mean = (
+            nn.Sequential(Linear(condition, MEAN_WIDTH), nn.GELU(), Linear(MEAN_WIDTH, self.channels))
+            if settings.draws == "innovation"
+            else None
+        )
 
     @property
     def noise_shape(self) -> tuple[int, int]:
@@ -180,13 +190,17 @@ class ArigModel(nn.Module):
 
     def target(self, motion: Tensor, last: Tensor) -> Tensor:
         """What the sampler is to draw: motion (..., C) after `last` (..., C), both standardised -> (..., C)."""
-        return motion if self.settings.draws == "motion" else (motion - self.expected(last)) / self.step_std
+        if self.settings.draws == "motion":
+            return motion
+        step = (motion - self.expected(last)) / self.step_std
+        return step.asinh() / self.spread if self.settings.draws == "innovation" else step
 
     def drawn(self, sample: Tensor, last: Tensor) -> Tensor:
         """The inverse of `target`; a step never leads out of the range of the motion, and what is not drawn rests."""
         if self.settings.draws == "motion":
             return self._at_rest(sample)
-        made = torch.addcmul(self.expected(last), sample, self.step_std).clamp(self.motion_low, self.motion_high)
+        step = (sample * self.spread).sinh() if self.settings.draws == "innovation" else sample
+        made = torch.addcmul(self.expected(last), step, self.step_std).clamp(self.motion_low, self.motion_high)
         return self._at_rest(made)
 
     def _at_rest(self, motion: Tensor) -> Tensor:
@@ -197,11 +211,34 @@ class ArigModel(nn.Module):
         """Where a step after `last` (..., C), standardised, begins: there, or a little on its way back to the mean."""
         return self.rho * last if self.settings.draws == "innovation" else last
 
+    def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
+        """Of the sampler (N, C), the mean included: z (N, D and beside it), noise and levels of `Denoiser.sample`."""
+        drawn = self.head.sample(z, noise, levels) if isinstance(self.head, Denoiser) else self.head.sample(z, noise)
+        return drawn if self.mean is None else drawn + self.mean(z)
+
+    def sample_loss(
+        self,
+        z: Tensor,
+        wanted: Tensor,
+        draws: int = 1,
+        generator: torch.Generator | None = None,
+        weights: Tensor | None = None,
+    ) -> Tensor:
+        """Equation (3) of `target` (N, C) at `draws` noise levels, or the loss of codes, and that of the mean, (N,)."""
+        mean = torch.zeros_like(wanted) if self.mean is None else self.mean(z)
+        left, z = (each.repeat(draws, 1) for each in (wanted - mean.detach(), z))
+        drawn = self.head.loss(z, left, generator, weights).view(draws, -1).mean(0)
+        return (
+            drawn
+            if self.mean is None
+            else drawn + weighted_mean(F.smooth_l1_loss(mean, wanted, reduction="none"), weights)
+        )
+
     def beside(self, z: Tensor, events: Tensor | None, sample: Tensor) -> Tensor:
         """z (..., D) and what the sampler is told besides: embedded events (..., D), its last sample (..., C)."""
         told = [z] if events is None else [z, events]
         if self.settings.draws == "innovation":
-            told.append(sample.clamp(-LARGEST_TOLD, LARGEST_TOLD))
+            told.append(sample)
         return torch.cat(told, dim=-1) if len(told) > 1 else z
 
     def embed_events(self, rows: Tensor) -> Tensor | None:
@@ -292,7 +329,8 @@ class ArigModel(nn.Module):
         found = self.condition(dyad, known)
         standard = self.standardise(dyad.agent_motion)
         target = self.target(standard[:, 1:], standard[:, :-1])
-        motion = self.head.loss(found.z.flatten(0, 1), target.flatten(0, 1), generator).view(target.shape[:2])
+        motion = self.sample_loss(found.z.flatten(0, 1), target.flatten(0, 1), generator=generator)
+        motion = motion.view(target.shape[:2])
         if found.states is None or states is None:
             return Losses(motion, None)
         wrong = F.cross_entropy(found.states.transpose(1, 2), states[:, 1:], ignore_index=-1, reduction="none")
@@ -301,6 +339,6 @@ class ArigModel(nn.Module):
     def generate(self, dyad: Dyad, noise: Tensor, states: Tensor | None = None) -> Tensor:
         """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape); states: above."""
         z = self.condition(dyad, states).z
-        made = self.head.sample(z.flatten(0, 1), noise.flatten(0, 1))
+        made = self.sample(z.flatten(0, 1), noise.flatten(0, 1))
         last = self.standardise(dyad.agent_motion[:, :-1])
         return self.restore(self.drawn(made.view(*z.shape[:2], -1), last))
