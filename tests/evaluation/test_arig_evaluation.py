@@ -117,7 +117,9 @@ def test_a_table_needs_faces_that_move(evaluate, listener, data):
 
 def test_a_table_needs_clips_that_are_long_enough(evaluate, listener, tmp_path):
     one = dyad("short", "listening", 0)
-    parts = {name: getattr(one, name)[:200] for name in ("speaker", "listener", "listening", "states")}
+    parts = {
+        name: getattr(one, name)[:200] for name in ("speaker", "listener", "listening", "states", "head_of_gaze_rad")
+    }
     sounds = {name: getattr(one, name)[: 200 * 640] for name in ("audio", "agent_audio")}
     clips.save(tmp_path / "validation", [replace(one, **parts, **sounds)])
     code, _, err = evaluate("listener", "--table", "arig-2", "--listener", listener, "--data", tmp_path)
