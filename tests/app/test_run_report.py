@@ -39,7 +39,7 @@ def test_who_watches_a_run_sees_the_figures_of_its_report_as_they_grow():
     documents = []
 
     @contextmanager
-    def panel(document, interrupt, halt):
+    def panel(document, interrupt, halt, turn_all):
         documents.append(document())
         yield
         documents.append(document())
