@@ -11,8 +11,8 @@ import typer
 
 from sfms_robot.cli import names
 
-# Of the ten seeds that `--seeds 10` tries, the one that nods most.
-DEFAULT_SEED = 6
+# Of the ten seeds that `--seeds 10` tries, the first of the two that nod most.
+DEFAULT_SEED = 1
 
 
 def demo(
