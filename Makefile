@@ -28,7 +28,7 @@ lint: install
 	$(BIN)/mypy
 
 bench: install
-	$(BIN)/sfms-robot bench
+	$(BIN)/sfms-robot bench --write docs/performance.md
 
 clean:
 	rm -rf $(VENV) build dist

@@ -9,6 +9,7 @@ RobotError                      base; `exit_code` is what the command line retur
 +-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
 +-- PacketError          (4)    bytes that are no packet (codecs raise it, buses count it)
 +-- ModelError           (5)    weights or model files are missing, corrupt or of another shape
++-- GroupError           (1)    a process that trains with this one is gone
 """
 
 from __future__ import annotations
@@ -86,3 +87,7 @@ class ModelError(RobotError):
     """Weights or a model's files are missing, corrupt, or belong to another configuration."""
 
     exit_code = 5
+
+
+class GroupError(RobotError):
+    """A process that trains with this one is gone. The last checkpoint stands."""

@@ -143,6 +143,18 @@ class Listener(Protocol):
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
 
 
+class BatchListener(Listener, Protocol):
+    """A listener that steps many streams at once: of different people, begun at different times."""
+
+    def step_each(self, speakers: Sequence[SpeakerFrame], memories: Sequence[Any]) -> list[tuple[Plan | None, Any]]:
+        """`step` of N streams, one frame and one memory each, in their order; at a fraction of the time of N steps.
+
+        Every stream does what it would alone, in fp32 but for the last digits (sums are added in another order): its
+        plan is its own, and None where it is not due. Never changes memories in place. Raises as `step`, for the first
+        frame that is refused; then no stream has moved.
+        """
+
+
 class PlanFeed(Protocol):
     """A listener seen from the loop: frames go in, plans come out when they are ready."""
 

@@ -11,15 +11,16 @@ import pytest
 import sfms_robot
 
 PACKAGE = Path(sfms_robot.__file__).parent
-BASE = {"errors", "frames", "ports", "signals", "data", "config", "ranges", "child_process"}
+BASE = {"errors", "frames", "ports", "signals", "data", "config", "ranges", "child_process", "origin", "network"}
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
 ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},
+    "viewer": BASE | {"viewer", "face"},
     "emulator": BASE | {"emulator", "servo"},
     "corpora": BASE | {"corpora"},
     "learning": BASE | {"learning", "listeners", "corpora"},
     "evaluation": BASE | {"evaluation", "learning", "listeners", "corpora", "face"},
-    "app": BASE | PEERS | {"emulator", "corpora", "learning", "evaluation", "app"},
+    "app": BASE | PEERS | {"viewer", "emulator", "corpora", "learning", "evaluation", "app"},
     "cli": {"app", "config", "errors", "data", "cli"},
 }
 SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}

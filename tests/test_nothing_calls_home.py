@@ -211,6 +211,7 @@ def test_commands_that_listen_and_move_stay_here(best):
     best.run(
         "run", "--head", HEAD, "--duration", "2", "--record", "kept", "--status", "0", "--agent-audio", f"tcp:{port}"
     )
+    best.run("run", "--head", HEAD, "--duration", "2", "--view", "0")
     best.run("run", "--head", HEAD, "--fast", "--duration", "1", "--listener", "arig-small", "--agent-audio", "katie")
     best.run("demo", "--head", HEAD, "--fast", "--duration", "2", "--out", "shown")
     best.run("replay", "kept", "--json")
@@ -268,6 +269,21 @@ def test_commands_that_learn_and_measure_stay_here(best):
     best.run("train", "listener", *flags, "--no-tensorboard")
     best.run("evaluate", "tokenizer", "--listener", "out", "--data", "data")
     best.run("bench", "retarget", "--frames", "50")
+    assert best.strangers() == []
+
+
+@pytest.mark.slow
+def test_a_listener_that_is_served_and_a_fleet_stay_here(best):
+    pytest.importorskip("zenoh")
+    pytest.importorskip("prometheus_client")
+    with best.start("serve", "--hop", "3", "--everybody", "--metrics", "0") as server:
+        while "up to" not in (line := server.stderr.readline()):
+            assert line, server.communicate()
+        best.run("run", "--head", HEAD, "--listener", "zenoh/sfms-small", "--fleet", "one", "--duration", "2")
+        best.run("fleet", "--json")
+        best.run("fleet", "halt", codes=(1,))  # nobody is there any more
+        os.killpg(server.pid, signal.SIGTERM)
+        server.communicate(timeout=LIMIT_S)
     assert best.strangers() == []
 
 

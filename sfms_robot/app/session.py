@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.calibrated_head import calibrated_head
+from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import figures_so_far, run_report
@@ -37,11 +38,14 @@ from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.frames import Doubles, Floats
-from sfms_robot.listeners.plugins import listener_folder
+from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.open_feed import NamedFeed, open_feed
+from sfms_robot.listeners.plugins import REMOTE, listener_folder
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.motion.audit import Audit
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
+from sfms_robot.network import check_zenoh
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Timeline
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.spontaneous import Life
@@ -54,6 +58,7 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
+from sfms_robot.runtime.service_notify import NotifyingObserver, ServiceManager
 from sfms_robot.runtime.status import RunStatus
 from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
@@ -387,6 +392,9 @@ class RunOptions:
     status: str | None = None
     calmness: Calmness | None = None
     play: str | None = None
+    fleet: str | None = None
+    zenoh: Path | None = None
+    engine: EngineName = "auto"
 
     @property
     def hears(self) -> str:
@@ -429,10 +437,15 @@ def run(
     Raises RobotError before torque came on.
     """
     head = prepare_head(options.servos)
+    if options.fleet is not None:
+        fleet_name(options.fleet)
+        check_zenoh()
     if options.fast and split_kind(options.hears)[0] == "mic":
         raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
     if options.fast and options.play is not None:
         raise ConfigError(f"--play {options.play}: what is heard of a loudspeaker takes real time, --fast has none")
+    if options.fast and options.listener.startswith(REMOTE):
+        raise ConfigError(f"--listener {options.listener}: another machine takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
@@ -460,8 +473,9 @@ def run(
             raise ConfigError("--fast without a recording never ends: give it a --duration")
         if feed is None:
             return {"version": 1, "head": opened.config.name, "port": options.port, "exit": "done", **_present(opened)}
-        if isinstance(feed, ListenerProcess):
+        if isinstance(feed, NamedFeed):
             feed.wait_loaded()
+        if isinstance(feed, ListenerProcess):
             tick_s = 1.0 / opened.rate_hz
             feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
         live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
@@ -486,6 +500,7 @@ def run(
             stack.callback(teller.close)
         if server is not None:
             server.serve(status.document)
+        watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
         programme = Programme(
             person, feed, duration_s,
             life=Life(opened.config.life, options.seed, opened.config.camera),
@@ -493,7 +508,7 @@ def run(
             overlay=overlay,
             answers=True,
             halt=halt,
-            observers=[status, *observers, *tellers, *([] if recorder is None else [recorder])],
+            observers=[status, *watchers, *observers, *tellers, *([] if recorder is None else [recorder])],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt, signals=False, log=log)
         report = run_report(
@@ -512,6 +527,19 @@ def run(
     if options.record is not None:
         write_report(options.record, report)
     return report
+
+
+def _watchers(options: RunOptions, status: RunStatus, controls: FleetControls, stack: ExitStack) -> list[Observer]:
+    """Who else is told how it goes: a service manager, where there is one, and the fleet."""
+    watchers: list[Observer] = []
+    manager = ServiceManager()
+    if manager.wanted:
+        watchers.append(NotifyingObserver(manager))
+    if options.fleet is not None:
+        head = FleetHead(options.fleet, status.document, controls, options.zenoh)
+        stack.callback(head.close)
+        watchers.append(head)
+    return watchers
 
 
 def _opened(source: Source) -> Future[Source]:
@@ -538,12 +566,12 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     listener_folder(options.listener)
     feed: PlanFeed
     if options.fast:
-        from sfms_robot.listeners.registry import load_listener, one_thread  # torch: only here in this process
+        from sfms_robot.listeners.registry import engine_name, load_listener  # networks: only here in this process
 
-        one_thread()
-        feed = InlineFeed(load_listener(options.listener, calmness=options.calmness), options.seed, FAST_LATENCY_S)
+        listener = load_listener(options.listener, calmness=options.calmness, engine=options.engine, threads=1)
+        feed = InlineFeed(listener, options.seed, FAST_LATENCY_S, engine_name(listener))
     else:
-        feed = ListenerProcess(options.listener, options.seed, options.calmness)
+        feed = open_feed(options.listener, options.seed, options.calmness, options.zenoh, options.engine)
     stack.callback(feed.close)
     return feed
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import sys
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +28,33 @@ def demo(
     seeds: int | None = typer.Option(
         None, min=1, metavar="N", help="In virtual time: what seeds 0 to N - 1 show, without pictures."
     ),
+    view: str | None = typer.Option(
+        None,
+        metavar="[[HOST:]PORT]",
+        help="Where the page is that shows it (default: 127.0.0.1:8780, or the next free).",
+    ),
+    no_view: bool = typer.Option(
+        False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."
+    ),
     json: bool = typer.Option(False, "--json", help="Print what was seen as one JSON object, last line of stdout."),
 ) -> None:
-    """A recorded person talks, an emulated head listens; then two pictures of it lie beside its recording."""
-    from sfms_robot.app.listen.preflight import check_names
+    """A recorded person talks, an emulated head listens; a page shows it, or two pictures where nobody looks."""
+    from sfms_robot.app.listen.preflight import begin_page, check_names
 
     check_names(head=head, listener=listener)
-    from sfms_robot.app.listen import demo as app
-    from sfms_robot.app.listen.panel import live_panel
+    shown = not (no_view or fast or json or seeds is not None)
+    with ExitStack() as stack:
+        page = begin_page(view or ("auto" if shown else None), fast=fast or seeds is not None)
+        if page is not None:
+            stack.enter_context(closing(page))
+        from sfms_robot.app.listen import demo as app
+        from sfms_robot.app.listen.panel import live_panel
 
-    options = app.DemoOptions(head, listener, seed, duration, fast or seeds is not None, out)
-    if seeds is not None:
-        told = app.compare_seeds(options, seeds, lambda row: print(_line(row), file=sys.stderr))
-    else:
-        told = app.demo(options, None if json else live_panel)
+        options = app.DemoOptions(head, listener, seed, duration, fast or seeds is not None, out)
+        if seeds is not None:
+            told = app.compare_seeds(options, seeds, lambda row: print(_line(row), file=sys.stderr))
+        else:
+            told = app.demo(options, None if json else live_panel, page)
     if json:
         print(json_module.dumps(told))
     elif seeds is None:

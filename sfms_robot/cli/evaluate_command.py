@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from enum import StrEnum
 from pathlib import Path
 
@@ -76,15 +77,19 @@ def tokenizer(
 
 @app.command("listener")
 def listener_(
-    listener: list[str] = typer.Option(["sfms-small"], metavar="NAME|DIR", help="May be given often."),
+    listener: list[str] = typer.Option(
+        [], metavar="NAME|DIR", help="May be given often. sfms-small; arig-small for the tables of ARIG."
+    ),
     data: Path = typer.Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
     table: Table | None = typer.Option(
         None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
     ),
     samples: int = typer.Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
     clips: int | None = typer.Option(None, min=1, help="At most this many dyads, for --table; all of them."),
-    models: Path | None = typer.Option(None, help="Folder of the ablations' listeners; those missing are trained."),
-    config: Path | None = typer.Option(None, help="How ablations are trained: configs/training/arig.yaml."),
+    models: Path | None = typer.Option(
+        None, help="Folder of the papers' listeners as written, and of ablations; those missing are trained."
+    ),
+    config: Path | None = typer.Option(None, help="How ablations are trained; configs/training/arig-as-written.yaml."),
     steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
     hop: int | None = HOP,
@@ -95,10 +100,12 @@ def listener_(
     from sfms_robot.app.evaluate.listener_evaluation import evaluate_listener, listener_table
     from sfms_robot.cli.show_learning import print_figures, print_listener_table, show
 
+    of_arig = table is not None and table.value.startswith("arig")
+    listener = listener or ["arig-small" if of_arig else "sfms-small"]
     if table is None:
         show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json, print_figures)
         return
-    if table.value.startswith("arig"):
+    if of_arig:
         if order is not None or hop is not None:
             raise typer.BadParameter("--order and --hop are for --table 1 and 2, or none")
         from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
@@ -107,8 +114,35 @@ def listener_(
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json, print_figures)
         return
-    result = listener_table(int(table.value), listener, data, samples, clips, seed, order.value if order else None, hop)
+    number = int(table.value)
+    result = interruptible(
+        lambda: listener_table(
+            number, listener, data, samples, clips, seed, order.value if order else None, hop, models, steps
+        )
+    )
     show(result, json, print_listener_table)
+
+
+@app.command()
+def papers(
+    data: Path = typer.Option(..., help="Composed dyads."),
+    models: Path = typer.Option(..., help="Folder of what only tables need; what is missing is trained: hours."),
+    table: list[str] = typer.Option(
+        [], metavar="1|2|3|4|arig-1|arig-2|arig-4", help="May be given often; all of them if not."
+    ),
+    clips: int | None = typer.Option(None, min=1, help="At most this many dyads a table; all of them."),
+    samples: int = typer.Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
+    steps: int | None = typer.Option(None, min=1, help="Another number of steps than the training files'."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    json: bool = JSON,
+) -> None:
+    """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
+    from sfms_robot.app.evaluate.papers import EVERY, PapersOptions, evaluate_papers
+    from sfms_robot.cli.show_learning import print_paper_table, show
+
+    options = PapersOptions(data, models, table or EVERY, clips, samples, steps, seed)
+    each = (lambda name, found: None) if json else print_paper_table
+    show(interruptible(lambda: evaluate_papers(options, each)), json, lambda found: None)
 
 
 @app.command()
@@ -172,6 +206,23 @@ def naturalness(
     show(evaluate_naturalness(listener, data, split, clips, drift, seed), json, print_figures)
 
 
+@app.command("metrics")
+def metrics_(
+    truth: Path = typer.Option(..., help="Recorded motion: array (.npy), face track (CSV), or a folder of tracks."),
+    prediction: Path = typer.Option(..., help="Motion to score, likewise; an array may hold K answers, (N, K, T, D)."),
+    speaker: Path | None = typer.Option(None, help="The speakers' motion: for P-FD, RPCC and FRSyn."),
+    space: str | None = typer.Option(None, metavar="SPACE", help="arkit58, faceverse58, deca56, attributes25."),
+    frames: int | None = typer.Option(None, min=2, help="Cut clips to so many; default: to the shortest."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the intervals."),
+    json: bool = JSON,
+) -> None:
+    """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
+    from sfms_robot.app.evaluate.motion_metrics import MetricFiles, evaluate_metrics
+    from sfms_robot.cli.show_learning import print_figures, show
+
+    show(evaluate_metrics(MetricFiles(truth, prediction, speaker, space, frames), seed), json, print_figures)
+
+
 @app.command()
 def interaction(
     listener: str = typer.Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
@@ -185,6 +236,44 @@ def interaction(
     from sfms_robot.cli.show_learning import print_interaction, show
 
     show(evaluate_interaction(listener, data, clips, seed), json, print_interaction)
+
+
+@app.command()
+def people(
+    listener: list[str] = typer.Option(
+        [], metavar="NAME|DIR|recorded", help="Two or more: listeners, and what the people of --data did."
+    ),
+    data: Path | None = typer.Option(
+        None, help="Composed dyads, or any data set with voices; default: bundled voices nobody was trained on."
+    ),
+    voices: int = typer.Option(8, min=1, help="Voices that each listens to."),
+    seconds: float = typer.Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
+    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling, the order and the sides."),
+    out: Path = typer.Option(
+        Path("sfms-people"), metavar="DIR", help="The study: clips and answers; goes on if there."
+    ),
+    view: str = typer.Option("auto", metavar="[HOST:]PORT", help="Where the page is; this machine alone unless told."),
+    results: Path | None = typer.Option(None, metavar="FILE.csv", help="Ask nobody: what these answers say."),
+    json: bool = JSON,
+) -> None:
+    """A page that asks people, blind, which of two listens more like a person; Ctrl-C ends it, with a table."""
+    from sfms_robot.app.evaluate import people_study
+    from sfms_robot.cli.show_learning import print_preferences, show
+
+    if results is not None:
+        show(people_study.table(results), json, print_preferences)
+        return
+    options = people_study.StudyOptions(tuple(listener), data, voices, seconds, seed, out)
+    study = people_study.prepare(options)
+    try:
+        people_study.serve(study, view, _ask)
+    finally:
+        show(study.results(), json, print_preferences)
+
+
+def _ask(url: str, taken: int | None) -> None:
+    note = "" if taken is None else f" (port {taken} is taken)"
+    print(f"people answer at {url}{note}; Ctrl-C ends", file=sys.stderr, flush=True)
 
 
 @app.command()

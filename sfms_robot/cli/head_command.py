@@ -19,10 +19,18 @@ app.command("fit")(fit)
 
 
 @app.command("list")
-def list_heads(json: bool = typer.Option(False, "--json", help="Print as one JSON object.")) -> None:
+def list_heads(
+    urdf: Path | None = typer.Option(None, "--urdf", metavar="FILE.png", help="Draw them all."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
     """Shipped heads, with joints and buses."""
     from sfms_robot.app.session import shipped_heads
 
+    if urdf is not None:
+        from sfms_robot.app.head.head_scene import draw_shipped_heads
+        from sfms_robot.app.plot_style import checked_png
+
+        draw_shipped_heads(checked_png(urdf, "--urdf"))
     heads = shipped_heads()
     if json:
         print(json_module.dumps({"heads": heads}))
@@ -65,9 +73,15 @@ def check(
 def show(
     name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
     joint: str | None = typer.Option(None, "--joint", metavar="JOINT", help="Only this joint."),
+    urdf: Path | None = typer.Option(
+        None, "--urdf", metavar="FILE.png", help="Draw the robot, and tell what its URDF's joints follow."
+    ),
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
+    if urdf is not None:
+        _show_urdf(name, urdf, json)
+        return
     from sfms_robot.config.provenance import provenance, refusals
 
     joints, refused = provenance(name), refusals(name)
@@ -82,6 +96,20 @@ def show(
     from sfms_robot.cli.show_head import print_provenance
 
     print_provenance(name, joints, refused)
+
+
+def _show_urdf(name: str, png: Path, json: bool) -> None:
+    from sfms_robot.app.head.head_scene import draw_scene
+    from sfms_robot.app.plot_style import checked_png
+
+    checked_png(png, "--urdf")
+    told = draw_scene(name, png)
+    if json:
+        print(json_module.dumps(told))
+        return
+    from sfms_robot.cli.show_head import print_scene
+
+    print_scene(told)
 
 
 @app.command("calibrate")

@@ -21,10 +21,13 @@ from sfms_robot.cli import (
     doctor_command,
     emulate_command,
     evaluate_command,
+    export_command,
+    fleet_command,
     head_command,
     list_commands,
     replay_command,
     run_command,
+    serve_command,
     servo_command,
     train_command,
 )
@@ -45,10 +48,13 @@ app = typer.Typer(
 )
 app.command("demo")(demo_command.demo)
 app.command("run")(run_command.run)
+app.command("serve")(serve_command.serve)
+app.command("export")(export_command.export)
 app.command("replay")(replay_command.replay)
 app.command("emulate")(emulate_command.emulate)
 app.command("doctor")(doctor_command.doctor)
-app.command("bench")(bench_command.bench)
+app.command("bench", epilog=bench_command.EPILOG)(bench_command.bench)
+app.add_typer(fleet_command.app, name="fleet")
 app.add_typer(head_command.app, name="head")
 app.add_typer(list_commands.listener, name="listener")
 app.add_typer(list_commands.speaker, name="speaker")

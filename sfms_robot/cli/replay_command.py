@@ -26,9 +26,14 @@ def replay(
     ),
     fast: bool = typer.Option(False, "--fast", help="With --port sim: virtual time."),
     yes: bool = typer.Option(False, "--yes", help="With --port: hobby servos may jump when they come on."),
+    view: str | None = typer.Option(
+        None, metavar="[[HOST:]PORT]", help="Put it on a page, to be played there (alone: 127.0.0.1:8780)."
+    ),
     json: bool = typer.Option(False, "--json", help="Print what was found as one JSON object."),
 ) -> None:
     """Draw a recorded run, drive a head with it, or say what is in it."""
+    if view is not None and port is not None:
+        raise ConfigError("--view shows a recording, --port drives a head with it: one at a time")
     if port is None and (head is not None or fast or yes):
         raise ConfigError("--head, --fast and --yes are of a head that is driven: add --port (sim, or a device)")
     from sfms_robot.app.replay import replay_run
@@ -40,6 +45,8 @@ def replay(
 
         played = play_back(folder, PlaybackOptions(head, port, fast, yes), None if json else live_panel)
         told = {**played, "recording": told}
+    if view is not None:
+        _view(folder, view)
     if json:
         print(json_module.dumps(told))
     else:
@@ -49,3 +56,22 @@ def replay(
     if told.get("error"):
         print(f"sfms-robot: {told['error']}", file=sys.stderr)
     raise typer.Exit(told.get("exit_code", 0))
+
+
+def _view(folder: Path, view: str) -> None:
+    """Until nobody looks any more, or Ctrl-C."""
+    from contextlib import closing, suppress
+
+    from sfms_robot.app.listen.browser_window import open_browser
+    from sfms_robot.app.listen.preflight import begin_page
+    from sfms_robot.app.replay.page_replay import show_recording, wait_for_visitors
+
+    page = begin_page(view)
+    assert page is not None
+    with closing(page):
+        page.wait()
+        show_recording(folder, page)
+        print(f"page: {page} (Ctrl-C ends it)", file=sys.stderr)
+        open_browser(page.url)
+        with suppress(KeyboardInterrupt):
+            wait_for_visitors(page)

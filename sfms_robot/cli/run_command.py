@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
-OPTIONAL = {"--play": "default", "--status": "auto"}  # options that may stand alone, and what they mean then
+OPTIONAL = {
+    "--play": "default",
+    "--status": "auto",
+    "--view": "auto",
+}  # options that may stand alone, and what they mean then
 
 
 def run(
@@ -39,9 +43,9 @@ def run(
         "default",
         autocompletion=names.speakers,
         rich_help_panel=PERSON,
-        metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|none",
+        metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|none",
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
-        "yours, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
+        "yours, who is in front of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
     ),
     face: str = typer.Option(
         "auto",
@@ -69,7 +73,7 @@ def run(
         "sfms-small",
         autocompletion=names.listeners,
         rich_help_panel=LISTENER,
-        help="Shipped listener, or a folder with config.yaml and weights.",
+        help="Shipped listener, a folder with config.yaml and weights, or zenoh/NAME on a machine that serves it.",
     ),
     calmness: list[str] = typer.Option(
         [],
@@ -82,6 +86,12 @@ def run(
         metavar="sense|assume|never",
         rich_help_panel=LISTENER,
         help="Is it the head that is spoken to? By the person's look, and yes where no face is seen; always; never.",
+    ),
+    engine: str = typer.Option(
+        "auto",
+        metavar="auto|onnx|torch",
+        rich_help_panel=LISTENER,
+        help="What computes the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
     ),
     seed: int = typer.Option(
         0,
@@ -111,6 +121,30 @@ def run(
         rich_help_panel=OUTPUT,
         help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
     ),
+    view: str | None = typer.Option(
+        None,
+        metavar="[[HOST:]PORT]",
+        rich_help_panel=OUTPUT,
+        help="Serve a page that shows the run, and works it (alone: 127.0.0.1:8780, or the next port that is free).",
+    ),
+    view_cert: Path | None = typer.Option(
+        None, metavar="FILE", rich_help_panel=OUTPUT, help="Serve it by https, which a phone's microphone needs: PEM."
+    ),
+    view_key: Path | None = typer.Option(
+        None, metavar="FILE", rich_help_panel=OUTPUT, help="The key of that certificate: PEM."
+    ),
+    fleet: str | None = typer.Option(
+        None,
+        metavar="NAME",
+        rich_help_panel=OUTPUT,
+        help="Tell a fleet how the run is, as NAME, and obey it: docs/remote.md.",
+    ),
+    zenoh: Path | None = typer.Option(
+        None,
+        metavar="FILE",
+        rich_help_panel=OUTPUT,
+        help="zenoh's configuration (JSON5), for --fleet and --listener zenoh/NAME. Default: tcp/127.0.0.1:7447.",
+    ),
     dry_run: bool = typer.Option(
         False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
     ),
@@ -134,24 +168,38 @@ def run(
     ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.listen.preflight import begin_listening, check_names
+    from sfms_robot.app.listen.preflight import begin_listening, begin_page, check_names, engine_named
 
     check_names(head, listener, port, audio, face, agent_audio, play, status)
+    runs_on = engine_named(engine)
     calm = _calmness(calmness, addressed) if calmness or addressed != "sense" else None
     if check:
         _check(audio, duration, json)
         return
     with ExitStack() as stack:
         # The listener loads from here on, in a process of its own, while this one imports what drives a head.
-        feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(listener, seed, calm)))
+        page = begin_page(view, view_cert, view_key, audio=audio, face=face, fast=fast, dry_run=dry_run)
+        if page is not None:
+            stack.enter_context(closing(page))
+        feed = (
+            None
+            if fast or dry_run
+            else stack.enter_context(closing(begin_listening(listener, seed, calm, zenoh, runs_on)))
+        )
         from sfms_robot.app import session
         from sfms_robot.app.listen.panel import live_panel
 
         options = session.RunOptions(
             head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
-            tuple(intensity), tuple(style), tuple(without), halt_on, status, calm, play,
+            tuple(intensity), tuple(style), tuple(without), halt_on, status, calm, play, fleet, zenoh, runs_on,
         )  # fmt: skip
-        report = session.run(options, None if json else live_panel, feed=feed)
+        panel = None if json else live_panel
+        if page is None:
+            report = session.run(options, panel, feed=feed)
+        else:
+            from sfms_robot.app.listen.page_session import page_session
+
+            report = stack.enter_context(page_session(page, options)).run(panel, feed)
     if json:
         print(json_module.dumps(report))
     else:

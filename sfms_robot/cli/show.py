@@ -87,16 +87,6 @@ def print_sound_check(told: Mapping[str, Any]) -> None:
         console.print(line)
 
 
-def print_bench(result: Mapping[str, Mapping[str, Any]]) -> None:
-    """One row per thing measured."""
-    table = Table("measured", "median", "p99", "ratio", "to")
-    for name, row in result.items():
-        table.add_row(
-            name, f"{row['median']:.4g} {row['unit']}", cell(row.get("p99")), f"{row['ratio']:.3g}", row["peer"]
-        )
-    screen().print(table)
-
-
 def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
     """A table of rows, with the keys of the first as its columns."""
     table = Table(*rows[0])

@@ -89,6 +89,19 @@ def print_provenance(
         console.print(line, style=_OVER, markup=False, highlight=False, soft_wrap=True)
 
 
+def print_scene(told: Mapping[str, Any]) -> None:
+    """The URDF of a head, and which of its joints follow which of ours."""
+    renamed = {ours: theirs for ours, theirs in told["follows"].items() if ours != theirs}
+    print(f"{told['name']}: {told['urdf']}, drawn as {told['picture']}")
+    print(f"follow the joint of their own name: {', '.join(n for n in told['follows'] if n not in renamed) or 'none'}")
+    for ours, theirs in renamed.items():
+        print(f"{theirs} follows {ours}")
+    if told["by_kinematics"]:
+        print(f"by forward kinematics: {', '.join(told['by_kinematics'])}")
+    if told["undriven"]:
+        print(f"nothing in the picture follows: {', '.join(told['undriven'])}")
+
+
 class Terminal:
     """The person in front of it, line by line."""
 

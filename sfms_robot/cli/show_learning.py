@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from sfms_robot.cli.show import cell, print_rows, screen
@@ -46,6 +47,17 @@ def print_listener_table(result: Mapping[str, Any]) -> None:
         "The paper's rows are from other data; FRRea, a distance between rendered pictures, is out of scope.",
         soft_wrap=True,
     )
+
+
+def print_paper_table(name: str, found: Mapping[str, Any]) -> None:
+    """One table of `evaluate papers`."""
+    screen().rule(f"ARIG, table {name.removeprefix('arig-')}" if name.startswith("arig") else f"SFMS, table {name}")
+    if name in ("1", "2"):
+        print_listener_table(found)
+    elif name in ("3", "4"):
+        print_tokenizer_tables(found)
+    else:
+        print_figures(found)
 
 
 def _print_parts(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -96,6 +108,16 @@ def print_robustness(result: Mapping[str, Any]) -> None:
     )
 
 
+# --- train --dry-run ---------------------------------------------------------------------------------------------
+
+
+def print_dry_run(result: Mapping[str, Any]) -> None:
+    """What a step of every stage does, and hours of all of them on GPUs."""
+    print_rows(result["rows"])
+    hours = ", ".join(f"{gpu} {hours:g} h" for gpu, hours in result["hours"].items())
+    screen().print(f"all stages, computed: {hours}; {result['assumed']}.", soft_wrap=True)
+
+
 # --- evaluate interaction ---------------------------------------------------------------------------------------
 
 
@@ -130,7 +152,18 @@ def _print_table(console: Console, found: Mapping[str, Any]) -> None:
     name = str(found["table"])
     table = Table(title=TITLES[name])
     table.add_column("")
-    for heading in ("k", "params", "bits/window", "MSE", "median", "angles rad", "shapes", "paper MSE"):
+    for heading in (
+        "k",
+        "params",
+        "bits/window",
+        "MSE",
+        "median",
+        "angles rad",
+        "shapes",
+        "silhouette",
+        "separation",
+        "paper MSE",
+    ):
         table.add_column(heading, justify="right")
     for row in found["rows"]:
         paper = row["paper_mse_e2"]
@@ -143,9 +176,12 @@ def _print_table(console: Console, found: Mapping[str, Any]) -> None:
             f"{row['median']:.4f}",
             f"{row['angle_rmse_rad']:.4f}",
             f"{row['shape_rmse']:.4f}",
+            cell(row["silhouette"]),
+            cell(row["separation"]),
             "" if paper is None else f"{paper:.2f}e-2",
         )
     console.print(table)
+    console.print(f"silhouette of the windows as they are: {cell(found['truth_silhouette'])}")
     for line in _lines(found):
         console.print(line)
 
@@ -220,3 +256,32 @@ def _span(frames: Mapping[str, float] | None) -> str:
 
 def _counts(counts: Mapping[str, int]) -> str:
     return "\n".join(f"{name} {count}" for name, count in counts.items()) or "-"
+
+
+# --- evaluate people --------------------------------------------------------------------------------------------
+
+
+def print_preferences(result: Mapping[str, Any]) -> None:
+    """Per question and pair who was chosen how often; of three and more, Bradley and Terry's strengths."""
+    console = screen(highlight=False)
+    if not result["answers"]:
+        console.print("nobody has answered yet")
+        return
+    table = Table("question", "first", "second", "first : second : neither", "first chosen, 95 %", "p")
+    for row in result["rows"]:
+        share = "-"
+        if row["share"] is not None:
+            low, high = row["interval"]
+            share = f"{row['share']:.0%}  [{low:.0%}, {high:.0%}]"
+        counts = f"{row['first_chosen']} : {row['second_chosen']} : {row['neither']}"
+        p = "-" if row["p"] is None else f"{row['p']:.3f}"
+        table.add_row(row["question"], row["first"], row["second"], counts, escape(share), p)
+    console.print(table)
+    for question, strengths in result["bradley_terry"].items():
+        told = []
+        for name, each in sorted(strengths.items(), key=lambda item: -item[1]["strength"]):
+            interval = "" if each["interval"] is None else " [{:+.2f}, {:+.2f}]".format(*each["interval"])
+            told.append(f"{name} {each['strength']:+.2f}{interval}")
+        console.print(escape(f"{question}, Bradley-Terry: {', '.join(told)}"))
+    left, right = result["sides"]["left"], result["sides"]["right"]
+    console.print(f"{result['participants']} people, {result['answers']} answers; left {left} times, right {right}")

@@ -27,6 +27,7 @@ from sfms_robot.config.listener_kinds import load_listener, parse_listener
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
 from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.recipe import Baseline, Dense, Grouped, Recipe
+from sfms_robot.config.robot_description import FollowingJoint, RobotDescription
 from sfms_robot.config.safety_rules import Faults, LoadRule, Safety, Threshold
 from sfms_robot.config.training import Phase, PredictorTraining, TokenizerTraining, Training
 from sfms_robot.data import find
@@ -47,6 +48,7 @@ __all__ = [
     "Faults",
     "FirmwareMap",
     "Fold",
+    "FollowingJoint",
     "Gaze",
     "GroupWeights",
     "Grouped",
@@ -65,6 +67,7 @@ __all__ = [
     "Recipe",
     "Region",
     "Register",
+    "RobotDescription",
     "Safety",
     "Sampling",
     "Sfms",

@@ -38,6 +38,7 @@ class Diffusion(Model):
         temperature: factor on the noise that is added between steps; two: after the first step and before the last,
             evenly in between. Early noise decides what happens, late noise is jitter.
         temperatures: the same, in its place, for channels whose names begin so: `{eye: 1.1}`; the first that fits.
+        clamp: is every estimate of the clean motion kept within the range of the data? (4) does not.
     """
 
     width: Annotated[int, Field(ge=2, multiple_of=2)] = 262
@@ -47,6 +48,7 @@ class Diffusion(Model):
     sampler: Literal["ddpm", "ddim"] = "ddpm"
     temperature: Temperature = (1.0, 1.0)
     temperatures: dict[str, Temperature] = {}
+    clamp: bool = True
 
     def temperature_of(self, channel: str) -> tuple[float, float]:
         fits = (value for prefix, value in self.temperatures.items() if channel.startswith(prefix))
@@ -64,13 +66,16 @@ class Arig(Listener):
 
     Attributes:
         sound: `mel` (4 rows of 128 per frame) or `wav2vec2` (768 per frame, brought with the data: trains, never runs).
+        phase: is each track's place in a phrase (`signals.phase`) beside its sound? Beyond the paper; it reaches back
+            further than a short context.
         width, feedforward: of every block; heads: of every attention.
         chunk_frames: c of the paper; context_chunks: w (4: ablation "w/o long-range context").
         bidirectional_layers: 2 in the paper; integrated_layers, context_layers: the paper leaves them open.
         sound_frames: of the agent, that the coarse motion looks at; motion_frames: that the temporal layer looks at.
         state_guidance: false leaves the conversational states out; visual: false leaves motion out of the behaviours;
             interaction: `linear` puts plain layers in place of bidirectional-integrated learning;
-            discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4).
+            discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4), codes of `motion`
+            itself: what codes of steps get wrong would add up.
         draws: what the sampler draws of a frame: its `motion`, as in the paper; the `step` from the frame before, which
             is small where a face is still, and with it what the sampler gets wrong, but that stays; or the
             `innovation` of a first-order autoregression fitted on the data, a step that is forgotten as fast as
@@ -80,6 +85,7 @@ class Arig(Listener):
 
     kind: Literal["arig"]
     sound: Literal["mel", "wav2vec2"] = "mel"
+    phase: bool = True
     width: Count = 512
     feedforward: Count = 2048
     heads: Count = 8
@@ -103,6 +109,12 @@ class Arig(Listener):
     def _heads_fit(self) -> Arig:
         if self.width % (2 * self.heads):
             raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        return self
+
+    @model_validator(mode="after")
+    def _codes_are_of_motion(self) -> Arig:
+        if self.discrete and self.draws != "motion":
+            raise ValueError(f"discrete: true is of draws: motion, not {self.draws}")
         return self
 
     @property

@@ -25,6 +25,8 @@ from sfms_robot.config.migration import migrated
 from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.overlay import load_overlay
 from sfms_robot.config.register_rules import register_problems
+from sfms_robot.config.robot_description import RobotDescription
+from sfms_robot.config.robot_description import problems as description_problems
 from sfms_robot.config.safety_rules import Safety
 from sfms_robot.config.yaml_file import read
 from sfms_robot.data import find
@@ -87,12 +89,14 @@ def _problems(raw: Any) -> list[str]:
         if isinstance(given, list if key in _LISTS else dict):
             entries: Iterable[Any] = given.items() if isinstance(given, dict) else enumerate(given)
             parts[key] = {name: _parsed(model, value, f"{key}.{name}", found) for name, value in entries}
+    description = _parsed(RobotDescription | None, full.get("urdf"), "urdf", found)
     neck = _parsed(Kinematics | None, full.get("kinematics"), "kinematics", found)
     rest = {key: value if key not in parts else _names_only(key, value) for key, value in raw.items()}
-    _parsed(_Rest, rest | {"kinematics": None}, "", found)
+    _parsed(_Rest, rest | {"kinematics": None, "urdf": None}, "", found)
     table = {key: parts.get(key, {}) for key in (*_TABLES, *_LISTS)}
     found += wiring(table["joints"], table["buses"], table["limits"]) + rates(table["joints"], table["buses"])
     found += _servos(table["joints"], full.get("safety", {}))
+    found += description_problems(description, table["joints"])
     couplings, folds = list(table["couplings"].values()), list(table["folds"].values())
     if neck is not None:
         found += neck_problems(neck, table["joints"], folds)

@@ -19,6 +19,8 @@ from sfms_robot.config.life import Life
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
 from sfms_robot.config.migration import VERSION, former_words, migrated
 from sfms_robot.config.named_bus import Bus
+from sfms_robot.config.robot_description import RobotDescription
+from sfms_robot.config.robot_description import problems as description_problems
 from sfms_robot.config.safety_rules import Faults, Safety
 from sfms_robot.config.yaml_file import read
 from sfms_robot.data import find
@@ -50,6 +52,7 @@ class Head(Model):
     kinematics: Kinematics | None = None
     camera: CameraMount | None = None
     life: Life = Life()
+    urdf: RobotDescription | None = None
     _folder: Path | None = PrivateAttr(None)
 
     @property
@@ -68,6 +71,7 @@ class Head(Model):
         found += problems(self.joints, self.expressions, self.couplings, self.folds, self.regions)
         if self.kinematics is not None:
             found += neck_problems(self.kinematics, self.joints, self.folds)
+        found += description_problems(self.urdf, self.joints)
         if found:
             more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
             raise ValueError(found[0] + more)

@@ -51,12 +51,15 @@ class Sampling(Model):
         seam_frames: over these a plan fades into the motion before it.
         smoothing: how far the head moves from each frame toward the mean of the two beside it, 0 to 1: motion between
             coarse codes has corners, which servos would make heard. 0 is the paper.
+        reach: may a code follow another only as fast as faces moved in training (`listeners.sfms.reachable`)? The paper
+            has no such rule.
     """
 
     temperature: Positive = 1.0
     nucleus: Annotated[float, Field(gt=0, le=1)] = 1.0
     seam_frames: Count = 4
     smoothing: Share = 0.0
+    reach: bool = True
 
 
 class Scores(Model):

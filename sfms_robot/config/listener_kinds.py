@@ -1,6 +1,6 @@
 """The kinds of listeners that a folder may hold: what its config.yaml says, and what loads the folder.
 
-Imported when a listener of that kind is asked for, torch too. Listeners of other packages are not folders of ours: see
+Imported when a listener of that kind is asked for. Listeners of other packages are not folders of ours: see
 `listeners.plugins`.
 """
 
@@ -20,28 +20,39 @@ from sfms_robot.errors import ConfigError
 
 @dataclass(frozen=True)
 class ListenerKind:
-    """Both as "module:name".
+    """All as "module:name".
 
     Attributes:
         settings: a subclass of `config.Listener`, the model of config.yaml.
-        load: folder -> `ports.Listener`; raises ConfigError or ModelError.
+        load: folder, engine, threads or None -> `ports.BatchListener`; raises ConfigError or ModelError.
+        export: folder, folder to write to, whether in 8 bits too -> the ONNX files of its networks.
     """
 
     settings: str
     load: str
+    export: str
 
     def settings_class(self) -> type[Listener]:
         found: type[Listener] = _resolved(self.settings)
         return found
 
-    def load_folder(self, folder: Path) -> Any:
-        """The listener of a folder (`ports.Listener`)."""
-        return _resolved(self.load)(folder)
+    def load_folder(self, folder: Path, engine: str = "auto", threads: int | None = None) -> Any:
+        """The listener of a folder (`ports.BatchListener`), computed by `engine` (`listeners.engine.EngineName`)."""
+        return _resolved(self.load)(folder, engine, threads)
+
+    def export_folder(self, folder: Path, out: Path, int8: bool) -> list[Path]:
+        """Write graphs of a folder's networks below `out`; the files written."""
+        files: list[Path] = _resolved(self.export)(folder, out, int8)
+        return files
 
 
 LISTENER_KINDS: Final[Mapping[str, ListenerKind]] = {
-    "sfms": ListenerKind("sfms_robot.config.listener:Sfms", "sfms_robot.listeners.sfms:load"),
-    "arig": ListenerKind("sfms_robot.config.arig:Arig", "sfms_robot.listeners.arig:load"),
+    "sfms": ListenerKind(
+        "sfms_robot.config.listener:Sfms", "sfms_robot.listeners.sfms:load", "sfms_robot.listeners.sfms:export_graphs"
+    ),
+    "arig": ListenerKind(
+        "sfms_robot.config.arig:Arig", "sfms_robot.listeners.arig:load", "sfms_robot.listeners.arig:export_graphs"
+    ),
 }
 
 

@@ -71,7 +71,8 @@ class PredictorTraining(Phase):
     """Phase 2: the next-token predictor.
 
     Attributes:
-        transition_weight: of class 0 in (14); a keyframe weighs 1. Taken out of the probabilities again afterwards.
+        transition_weight: of class 0 in (14); a keyframe weighs 1. undo_weight: is it taken out of the probabilities
+            again afterwards? The paper says nothing of that.
         dtw_weight, dtw_gamma: of the soft-DTW on the keyframe indicator (IV-D3), and how soft its minima are.
         neutral_prefix: share of windows that begin as a stream does; drop_audio, drop_face: that lack a modality.
         history_noise: share of past keyframes that are one level off.
@@ -84,6 +85,7 @@ class PredictorTraining(Phase):
     """
 
     transition_weight: Positive = 0.5
+    undo_weight: bool = True
     dtw_weight: NonNegative = 0.1
     dtw_gamma: Positive = 0.1
     neutral_prefix: Share = 0.1

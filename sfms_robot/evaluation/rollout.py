@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import pad
 
 from sfms_robot.config.arig import paper_state
 from sfms_robot.corpora.clips import Dyad
@@ -26,12 +25,12 @@ from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.learning.sfms.features import frames_of
 from sfms_robot.listeners.arig.stream import Memory as ArigMemory
-from sfms_robot.listeners.sfms.predictor import Context
-from sfms_robot.listeners.sfms.stream import SfmsListener, later, passed, revoked
+from sfms_robot.listeners.events.model import LEAD_FRAMES
+from sfms_robot.listeners.sfms.draw import Seen
+from sfms_robot.listeners.sfms.keyframes import later, passed, revoked
+from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.ports import Listener
 from sfms_robot.signals.control import control_track
-
-LEAD_FRAMES = 2  # an event decided with frame n begins behind frame n + 1 + LEAD_FRAMES
 
 
 @dataclass(frozen=True)
@@ -153,44 +152,51 @@ def rollouts(
     return found
 
 
-@torch.inference_mode()
 def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) -> OfflineRollout:
     """`rollout` from arrays, told of the dyad's own events where the listener is told of any.
 
     Raises ConfigError when the dyad is in a space that cannot become the listener's, or has no events.
     """
-    model, past, ahead = listener.model, listener.settings.past_frames, listener.horizon
+    past, ahead, streams = listener.settings.past_frames, listener.horizon, len(seeds)
     heard = frames_of(dyad, listener.space, listener.frontend, listener.settings)
     frames = len(heard.motion)
-    sound = model.standardise_sound(torch.cat([torch.zeros_like(heard.sound[:1]), heard.sound]).float())
-    sound = torch.where(pad(heard.heard, (1, 0))[:, None, None], sound, 0.0)
-    voice = model.predictor.speaker.listen(sound.flatten(0, 1)[None])[0]
-    face, voice, phase = (pad(part, (0, 0, past, 0)) for part in (model.standardise(heard.face), voice, heard.phase))
-    known, audible = (pad(part, (past, 0)) for part in (heard.face_known, heard.heard))  # frame t at index past + t
-    tokens, path = (part.expand(len(seeds), *part.shape) for part in listener.at_rest())
-    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-    sway = torch.stack([listener.draw_sway(generator) for generator in generators])
-    control = torch.zeros(1, past + ahead, heard.control.shape[1])
-    drawn = tokens[:, -1:].expand(-1, frames + ahead + 1, -1).clamp(min=0)
-    shown = path[:, :1].expand(-1, frames + ahead + 1, -1).clone()
+    sound = listener.standardise_sound(heard.sound.float().numpy())
+    sound = _led(np.where(heard.heard.numpy()[:, None, None], sound, np.float32(0)), 1)
+    voice = listener.voices(np.concatenate([sound[:-1], sound[1:]], axis=1))
+    face, voice, phase = (
+        _led(part, past) for part in (listener.standardise(heard.face.numpy()), voice, heard.phase.numpy())
+    )
+    known, audible = (_led(part.numpy(), past) for part in (heard.face_known, heard.heard))  # frame t at index past + t
+    rest = listener.at_rest()
+    tokens, path = np.repeat(rest[0][None], streams, axis=0), np.repeat(rest[1][None], streams, axis=0)
+    control = np.zeros((1, past + ahead, heard.control.shape[1]), np.float32)
+    drawn = np.repeat(np.maximum(tokens[:, -1:], 0), frames + ahead + 1, axis=1)
+    shown = np.repeat(path[:, :1], frames + ahead + 1, axis=1)
     for now in range(0, frames, listener.hop):  # the newest frame heard
         frames_passed = listener.hop if now else 1
         tokens, path = passed(tokens, path, frames_passed, listener.holds)
         told = control_at(listener, dyad.events or (), now)
         if told is not None:
-            control, before = torch.from_numpy(told)[None], later(control, frames_passed)
+            control, before = told[None].astype(np.float32), later(control, frames_passed)
             tokens = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
-        seen = Context(
+        seen = Seen(
             face=face[None, window],
             face_known=known[None, window],
             voice=voice[None, window],
             heard=audible[None, window],
             phase=phase[None, window],
             tokens=tokens,
-            control=control.expand(len(seeds), -1, -1),
+            control=np.repeat(control, streams, axis=0),
         )
-        tokens, path = listener.plan(seen, path, generators)
+        tokens, path = listener.plan(seen, path, seeds, [now] * streams)
         shown[:, now + 1 : now + 1 + ahead] = listener.shown(path)
         drawn[:, now + 1 : now + 1 + ahead] = tokens[:, -ahead:]
-    return OfflineRollout(listener.with_sway(shown[:, :frames], sway, 0), drawn[:, :frames])
+    sway = np.stack([listener.draw_sway(seed) for seed in seeds])
+    motion = listener.with_sway(shown[:, :frames], sway, 0)
+    return OfflineRollout(torch.from_numpy(motion), torch.from_numpy(drawn[:, :frames]))
+
+
+def _led(rows: NDArray[Any], frames: int) -> NDArray[Any]:
+    """(N, ...) behind so many rows of nothing."""
+    return np.concatenate([np.zeros((frames, *rows.shape[1:]), rows.dtype), rows])

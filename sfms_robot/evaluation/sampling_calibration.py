@@ -22,6 +22,7 @@ from sfms_robot.learning.sfms.features import gather
 from sfms_robot.learning.sfms.predictor_trainer import corrected
 from sfms_robot.learning.sfms.tokens import tokenise
 from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
@@ -76,7 +77,7 @@ def calibrated(
 
 def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: int) -> config.Sfms:
     """One round: biases that would have brought the keyframe rates of a roll-out to those of the data."""
-    listener = SfmsListener(settings, model)
+    listener = SfmsListener(settings, torch_engine(settings, model.eval()))
     wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space, None, settings)))
     rates = _rates(torch.cat([one.tokens.flatten(0, 1) for one in _rolled_out(listener, dyads, seed)]))
     groups = {}

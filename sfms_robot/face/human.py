@@ -82,10 +82,10 @@ def load_human(folder: Path | None = None) -> HumanHead:
     except (OSError, KeyError, ValueError, IndexError) as error:
         raise ConfigError(f"{file}: not a head with the 52 ARKit morphs: {error}") from error
     shown = triangles[~_lower_lashes(rest, colors)[triangles].any(axis=1)]
-    return _with_brows(HumanHead(rest, deltas, _shares(rest), shown, _painted(rest, colors)))
+    return _with_brows(HumanHead(rest, deltas, share_of_rotation(rest), shown, _painted(rest, colors)))
 
 
-def _shares(rest: Floats) -> Floats:
+def share_of_rotation(rest: Floats) -> Floats:
     along = (rest[:, 2] + 0.5 * rest[:, 0] - _SHARE_FROM_M) / (_SHARE_TO_M - _SHARE_FROM_M)
     t = np.clip(along, 0.0, 1.0)
     out: Floats = (t * t * (3 - 2 * t)).astype(np.float32)

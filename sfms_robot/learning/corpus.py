@@ -23,6 +23,7 @@ from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import usable
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, Floats
+from sfms_robot.learning.staged_frames import Scratch, StagedFrames, read_staged
 from sfms_robot.listeners.space import MotionSpace
 
 if TYPE_CHECKING:
@@ -45,11 +46,13 @@ class Corpus(Generic[Frames]):
         frames: tensors (N, ...).
         lengths: frames of each dyad.
         scenes: the kind of conversation each dyad is of.
+        staged: they lie on disk, and only what is cut out of them goes to another device.
     """
 
     frames: Frames
     lengths: tuple[int, ...]
     scenes: tuple[str, ...]
+    staged: bool = False
 
     @cached_property
     def begins(self) -> Tensor:
@@ -73,11 +76,13 @@ class Corpus(Generic[Frames]):
         return {name: starts[torch.from_numpy(scene == name)] for name in dict.fromkeys(scene.tolist())}
 
     def cut(self, starts: Tensor, window: int) -> Frames:
-        """The windows (B, window, ...) at (B,) starts."""
-        return _each(self.frames, lambda part: windows(part, starts, window))
+        """The windows (B, window, ...) at (B,) starts, on their device."""
+        return _each(self.frames, lambda part: windows(part, starts.to(part.device), window).to(starts.device))
 
     def to(self, device: torch.device) -> Corpus[Frames]:
-        """The same frames on another device."""
+        """The same frames on another device; staged ones stay where they are."""
+        if self.staged:
+            return self
         return replace(self, frames=_each(self.frames, lambda part: part.to(device)))
 
     def fingerprint(self) -> dict[str, Any]:
@@ -92,12 +97,35 @@ def _each(frames: Frames, change: Callable[[Tensor], Tensor]) -> Frames:
     return replace(frames, **{field.name: change(getattr(frames, field.name)) for field in fields(frames)})
 
 
-def gather(scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callable[[Dyad], Frames]) -> Corpus[Frames]:
+def gather(
+    scenes: Mapping[str, Sequence[Dyad]],
+    window: int,
+    frames_of: Callable[[Dyad], Frames],
+    scratch: Scratch | None = None,
+) -> Corpus[Frames]:
     """Stack dyads, read one at a time; those shorter than a window are left out and counted.
+
+    `scratch`: on disk, where the first process of each machine stages them and the others wait.
 
     Raises ConfigError when none is left, and whatever `frames_of` raises.
     """
+    if scratch is None or scratch.group.local_rank == 0:
+        corpus = _read(scenes, window, frames_of, scratch)
+    if scratch is None:
+        return corpus
+    scratch.group.wait()
+    if scratch.group.local_rank == 0:
+        return corpus
+    like = frames_of(next(iter(usable(next(iter(scenes.values()))))))
+    found, lengths, named = read_staged(scratch.folder)
+    return Corpus(replace(like, **found), lengths, named, staged=True)
+
+
+def _read(
+    scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callable[[Dyad], Frames], scratch: Scratch | None
+) -> Corpus[Frames]:
     parts: list[Frames] = []
+    files = None if scratch is None else StagedFrames(scratch.folder)
     lengths: list[int] = []
     named: list[str] = []
     short = 0
@@ -106,7 +134,12 @@ def gather(scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callabl
             if len(dyad.listener) < window:
                 short += 1
                 continue
-            parts.append(frames_of(dyad))
+            one = frames_of(dyad)
+            if files is None:
+                parts.append(one)
+            else:
+                files.add(one)
+                parts = [one]
             lengths.append(len(dyad.listener))
             named.append(scene)
     total = sum(len(dyads) for dyads in scenes.values())
@@ -115,6 +148,10 @@ def gather(scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callabl
         raise ConfigError(f"none of {total} dyads can be used: {left_out}")
     if len(lengths) < total:
         log.warning("%d of %d dyads are used: %s", len(lengths), total, left_out)
+    if files is not None and scratch is not None:
+        files.close(lengths, named)
+        found, _, _ = read_staged(scratch.folder)
+        return Corpus(replace(parts[0], **found), tuple(lengths), tuple(named), staged=True)
     joined = {field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(parts[0])}
     return Corpus(replace(parts[0], **joined), tuple(lengths), tuple(named))
 
@@ -171,6 +208,17 @@ def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tens
     """
     least, most = _spread_bounds(channels)
     return motion.mean(0), motion.std(0).clamp(min=least, max=most)
+
+
+def some_sound(*tracks: tuple[Tensor, Tensor]) -> Tensor:
+    """Rows (M, ...) of sounds (N, ...) where they are heard (N,), as many as `sound_scales` looks at and as evenly."""
+    at = [heard.nonzero()[:, 0] for _, heard in tracks]
+    step = max(1, sum(map(len, at)) // SOUND_SAMPLE)
+    found, before = [], 0
+    for (sound, _), index in zip(tracks, at, strict=True):
+        found.append(sound[index[-before % step :: step]])
+        before += len(index)
+    return torch.cat(found)
 
 
 def sound_scales(rows: Tensor) -> tuple[Tensor, Tensor]:

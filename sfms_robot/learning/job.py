@@ -8,7 +8,7 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
         name="mine",                                       # of the bar, the checkpoint file, the TensorBoard folder
         model=model,                                       # all of its state dict goes into checkpoints
         optimizers=[optimizer(model.parameters(), phase.learning_rate, phase.weight_decay)],
-        loss_of=lambda step, generator: ...,               # scalar loss of one step on data drawn with `generator`
+        loss_of=lambda step, generator, batch: ...,        # scalar loss on `batch` samples drawn with `generator`
         held_out=lambda: ...,                              # loss or error to watch, the same data each time; or None
         frames_per_step=phase.batch * window,
         phase=phase,                                       # a config.Phase: steps, clipping, precision, patience, ...
@@ -17,9 +17,11 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
     )
     outcome = fit(job, out, run)                           # the model now holds its best weights: save them
 
-Four duties make a resumed run bit-identical on a CPU:
+Five duties make a resumed run bit-identical on a CPU:
  - `loss_of` draws every random number from the generator it is given (a CPU one: draw there, then move to the device)
    or from torch's global one (dropout); never from numpy, the clock or a generator of its own;
+ - it takes as many samples as it is told: `phase.batch`, or the part of them that is a piece of a step
+   (`learning.process_group`), and its loss is their mean;
  - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
  - `held_out` may draw what it likes (its draws leave no trace) but gives the same number for the same weights;
  - everything before `fit` follows from the settings and the data, and `identity` names them: plain JSON data, and a
@@ -30,12 +32,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
+from sfms_robot.learning.process_group import ProcessGroup
+from sfms_robot.learning.staged_frames import Scratch
+
+LossOf = Callable[[int, torch.Generator, int], Tensor]
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,8 @@ class Job:
     """One phase of training; see the module's text.
 
     Attributes:
-        loss_of: (step from 0, CPU generator) -> scalar loss. The model is in training mode, under autocast if asked.
+        loss_of: (step from 0, CPU generator, samples) -> scalar loss. The model is in training mode, under autocast if
+            asked.
         held_out: error on held-out data, less is better. The model is in evaluation mode, gradients are off.
         frames_per_step: motion frames a step learns from, for the speed that is shown.
     """
@@ -51,7 +59,7 @@ class Job:
     name: str
     model: nn.Module
     optimizers: Sequence[torch.optim.Optimizer]
-    loss_of: Callable[[int, torch.Generator], Tensor]
+    loss_of: LossOf
     held_out: Callable[[], float] | None
     frames_per_step: int
     phase: config.Phase
@@ -96,11 +104,26 @@ def unwatched(report: Report) -> None:
 
 @dataclass(frozen=True)
 class Run:
-    """How a job is run rather than what it is: the same job gives the same weights whoever watches."""
+    """How a job is run rather than what it is: the same job gives the same weights whoever watches.
+
+    Attributes:
+        group: the processes that run it together.
+        accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
+            Into how many pieces a batch is cut is part of what a run is, who takes them is not: a run goes on with any
+            number of processes that can share its pieces.
+        scratch: folder for frames that are read from disk as they are drawn; None: they are held in memory.
+    """
 
     resume: bool = False
     device: torch.device = torch.device("cpu")
     watch: Callable[[Report], None] = unwatched
+    group: ProcessGroup = ProcessGroup()
+    accumulate: int | None = None
+    scratch: Path | None = None
+
+    def staging(self, name: str) -> Scratch | None:
+        """Where frames of this name are staged, if they are."""
+        return None if self.scratch is None else Scratch(self.scratch / name, self.group)
 
 
 @dataclass(frozen=True)

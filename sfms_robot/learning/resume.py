@@ -106,6 +106,15 @@ def peek(file: Path) -> Position | None:
         return None
 
 
+def pieces(file: Path) -> int | None:
+    """Into how many pieces the batches of the checkpoint in `file` are cut; None where it cannot be read."""
+    try:
+        with safe_open(file, framework="pt") as opened:
+            return int(json.loads((opened.metadata() or {})["identity"]).get("pieces", 1))
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError):
+        return None
+
+
 def _read(file: Path) -> tuple[Mapping[str, str], Weights]:
     try:
         with safe_open(file, framework="pt") as opened:

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -21,8 +22,9 @@ import torch
 from torch import nn
 
 from sfms_robot import config
-from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.errors import ConfigError, GroupError, ModelError
 from sfms_robot.learning import resume
+from sfms_robot.learning.gradients import Gradients, pieces_of
 from sfms_robot.learning.job import Job, Outcome, Position, Report, Run
 
 SMOOTHING = 0.98  # of the loss that is shown
@@ -43,8 +45,14 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     only restores its weights. Ctrl-C ends the step, writes a checkpoint and raises KeyboardInterrupt with a line for
     the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite: the last
     checkpoint stays. `clock` (s) decides when to write checkpoints and how fast frames go, and no weights.
+
+    Of a group of processes (`run.group`) all make the same steps; the first one looks at held-out data and writes. Then
+    it also raises GroupError when another process is gone, and ConfigError when they cannot share the batch.
     """
     file = resume.checkpoint_file(out, job.name)
+    group, pieces = run.group, pieces_of(job, run, file)
+    if pieces > 1:
+        job = replace(job, identity={**job.identity, "pieces": pieces})
     try:
         out.mkdir(parents=True, exist_ok=True)  # hours before it is needed
     except OSError as error:
@@ -55,22 +63,23 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     position, best = Position(), None
     if run.resume:
         position, best = resume.load(file, job, generator)
-    elif (left := resume.peek(file)) is not None and not left.finished:
+    elif group.first and (left := resume.peek(file)) is not None and not left.finished:
         log.warning("%s: was at step %d, begins anew; --resume would have gone on", file, left.step)
     began_at = position.step
 
     saved_s = before_s = clock()
     frames_per_s = 0.0
     job.model.train()
-    with _interruptions() as interrupted:
+    gradients = Gradients(job, group, pieces, file)
+    with _interruptions(patient=group.size > 1) as pressed:
         while not position.finished:
             rate = _set_rates(job, base, position.step)
-            loss, norm = _step(job, position.step, generator, file)
+            loss, norm, interrupted = _step(gradients, position.step, generator, pressed())
             smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
             position = replace(position, step=position.step + 1, loss=smooth)
             looked = _look_is_due(job, position.step)
             if looked:
-                position = _compared(position, _held_out(job))
+                position = _compared(position, group.told_by_first(partial(_held_out, job)))
                 best = resume.weights_of(job) if position.worse == 0 else best
             position = replace(position, finished=_over(job.phase, position))
 
@@ -78,10 +87,11 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             frames_per_s = _speed(frames_per_s, job.frames_per_step, now_s - before_s)
             before_s = now_s
             run.watch(Report(job.name, job.phase.steps, position, loss, norm, rate, frames_per_s, looked))
-            if interrupted() or _save_is_due(job.phase, position, now_s - saved_s):
+            interrupted = interrupted or (group.size == 1 and pressed())
+            if group.first and (interrupted or _save_is_due(job.phase, position, now_s - saved_s)):
                 resume.save(file, job, position, generator, best)
                 saved_s = now_s
-            if interrupted():
+            if interrupted:
                 raise KeyboardInterrupt(
                     f"{job.name}: interrupted after step {position.step} of {job.phase.steps}, saved in {file}; "
                     "the same command with --resume goes on"
@@ -115,28 +125,30 @@ def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
     return base[0][0] * share
 
 
-def _step(job: Job, step: int, generator: torch.Generator, file: Path) -> tuple[float, float]:
-    """One update of the weights; returns loss and largest gradient norm. Nothing is updated when one is not finite."""
+def _step(gradients: Gradients, step: int, generator: torch.Generator, pressed: bool) -> tuple[float, float, bool]:
+    """One update of the weights; returns loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
+
+    Nothing is updated when one is not finite.
+    """
+    job, file = gradients.job, gradients.file
     for one in job.optimizers:
         one.zero_grad(set_to_none=True)
-    half = job.phase.precision == "bf16" and multiplies_bf16(job.device)
-    with torch.autocast(job.device.type, torch.bfloat16, enabled=half):
-        loss = job.loss_of(step, generator)
-    loss.backward()  # type: ignore[no-untyped-call]
+    try:
+        value, asked = gradients.group.mean([gradients.of(step, generator), float(pressed)])
+    except GroupError as error:
+        raise GroupError(f"{job.name}: {error}; at step {step} ({_kept(file)}; --resume goes on)") from error
     norm = max(_clip(one, job.phase.clip_norm) for one in job.optimizers)
-    value = loss.item()
     if not math.isfinite(value) or not math.isfinite(norm):
-        left = resume.peek(file)
-        kept = f"{file} holds step {left.step}" if left is not None else "there is no checkpoint yet"
-        raise ModelError(f"{job.name}: loss {value:g}, gradient norm {norm:g} at step {step}: not finite ({kept})")
+        broken = f"loss {value:g}, gradient norm {norm:g} at step {step}: not finite"
+        raise ModelError(f"{job.name}: {broken} ({_kept(file)})")
     for one in job.optimizers:
         one.step()
-    return value, norm
+    return value, norm, asked > 0
 
 
-def multiplies_bf16(device: torch.device) -> bool:
-    """Whether bf16 is faster there than fp32; a processor without such instructions only pretends."""
-    return device.type == "cuda" or (device.type == "cpu" and torch.cpu._is_avx512_bf16_supported())
+def _kept(file: Path) -> str:
+    left = resume.peek(file)
+    return f"{file} holds step {left.step}" if left is not None else "there is no checkpoint yet"
 
 
 def _clip(one: torch.optim.Optimizer, norm: float) -> float:
@@ -186,13 +198,17 @@ def _speed(frames_per_s: float, frames: int, took_s: float) -> float:
 
 
 @contextmanager
-def _interruptions() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C was pressed; inside, the first one only raises the flag. Signals reach the main thread alone."""
+def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C was pressed; inside, the first one only raises the flag. Signals reach the main thread alone.
+
+    `patient`: so do all others; whoever started this process (torchrun) passes the terminal's on as its own.
+    """
     pressed = threading.Event()
 
     def press(number: int, frame: FrameType | None) -> None:
         pressed.set()
-        signal.signal(signal.SIGINT, before)  # the second one does what it always did
+        if not patient:
+            signal.signal(signal.SIGINT, before)  # the second one does what it always did
 
     if threading.current_thread() is not threading.main_thread():
         yield pressed.is_set

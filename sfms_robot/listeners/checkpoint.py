@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import nn
+from safetensors import SafetensorError, deserialize, safe_open
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError
+from sfms_robot.listeners.engine import Array
+
+if TYPE_CHECKING:
+    from torch import nn
 
 CONFIG = "config.yaml"
 WEIGHTS = "model.safetensors"
+BFLOAT16 = "BF16"
 LARGEST = 1e6  # of a tensor; a speed nobody measured is stored as this, weights are below 200, and 1e30 overflows
 
 
@@ -33,6 +40,8 @@ def save_weights(file: Path, module: nn.Module, half: bool = False) -> None:
     `half`: in 16 bits, which is half the room; what loads it computes in 32 again. Raises ModelError where it cannot
     be written, and leaves no part of it.
     """
+    from safetensors.torch import save_file
+
     part = file.with_suffix(".part")
     state = {
         name: value.half() if half and value.is_floating_point() else value
@@ -50,7 +59,19 @@ def save_weights(file: Path, module: nn.Module, half: bool = False) -> None:
 
 
 def load_weights(file: Path, module: nn.Module) -> None:
-    """Fill `module` from a safetensors file: plain numbers, no code is run.
+    """Fill `module` from a safetensors file: plain numbers, no code is run. Raises ModelError as `read_weights`."""
+    import torch
+
+    wanted = module.state_dict()
+    shapes = {name: (tuple(value.shape), value.is_floating_point()) for name, value in wanted.items()}
+    found = read_weights(file, shapes)
+    module.load_state_dict({name: torch.from_numpy(value) for name, value in found.items()})
+
+
+def read_weights(file: Path, wanted: Mapping[str, tuple[tuple[int, ...], bool]] | None = None) -> dict[str, Array]:
+    """Tensors of a safetensors file by name, real numbers in 32 bits: plain numbers, no code is run.
+
+    `wanted`: shape of every tensor, and whether it is of real numbers; None: whatever there is.
 
     Raises ModelError when the file or a tensor is missing, cut off, of another shape or type, not finite, or of values
     that no trained model has.
@@ -58,27 +79,46 @@ def load_weights(file: Path, module: nn.Module) -> None:
     if not file.is_file():
         raise ModelError(f"{file}: no such weights file")
     try:
-        found = load_file(file)
-    except (SafetensorError, OSError) as error:
+        with safe_open(file, "np") as stored:
+            kinds = {name: stored.get_slice(name).get_dtype() for name in stored.keys()}  # noqa: SIM118, no mapping
+            found = {name: _plain(stored.get_tensor(name)) for name, kind in kinds.items() if kind != BFLOAT16}
+        if len(found) < len(kinds):
+            found |= _read_bfloat16(file)
+    except (SafetensorError, OSError, TypeError) as error:
         raise ModelError(f"{file}: not a readable safetensors file: {error}") from error
-    for name, expected in module.state_dict().items():
+    for name, (shape, real) in (wanted or {}).items():
         if name not in found:
             raise ModelError(f"{file}: tensor {name} is missing; the weights belong to another configuration")
-        if found[name].shape != expected.shape:
-            raise ModelError(
-                f"{file}: tensor {name} has shape {tuple(found[name].shape)}, "
-                f"the configuration needs {tuple(expected.shape)}"
-            )
-        if found[name].is_floating_point() != expected.is_floating_point():
-            raise ModelError(f"{file}: tensor {name} is of {found[name].dtype}, the model needs {expected.dtype}")
-        if not bool(found[name].isfinite().all()):
+        if found[name].shape != shape:
+            raise ModelError(f"{file}: tensor {name} has shape {found[name].shape}, the configuration needs {shape}")
+        if (found[name].dtype.kind == "f") != real:
+            needs = "float32" if real else "int64"
+            raise ModelError(f"{file}: tensor {name} is of {found[name].dtype}, the model needs {needs}")
+    for name, value in found.items():
+        if wanted is not None and name not in wanted:
+            raise ModelError(f"{file}: tensor {name} is not part of the configured model")
+        if value.dtype.kind != "f" or not value.size:
+            continue
+        largest = float(max(value.max(), -value.min()))  # NaN where there is any
+        if not math.isfinite(largest):
             raise ModelError(f"{file}: tensor {name} holds values that are not finite")
-        if found[name].numel() and (largest := float(found[name].abs().max())) > LARGEST:
+        if largest > LARGEST:
             raise ModelError(f"{file}: tensor {name} holds {largest:g}, no trained model is above {LARGEST:g}")
-    extra = sorted(set(found) - set(module.state_dict()))
-    if extra:
-        raise ModelError(f"{file}: tensor {extra[0]} is not part of the configured model")
-    module.load_state_dict(found)
+    return found
+
+
+def _read_bfloat16(file: Path) -> dict[str, Array]:
+    """Tensors of a kind that numpy does not know: the upper half of a 32-bit number."""
+    out = {}
+    for name, stored in deserialize(file.read_bytes()):  # type: ignore[no-untyped-call]
+        if stored["dtype"] == BFLOAT16:
+            upper = np.frombuffer(stored["data"], np.uint16).astype(np.uint32) << 16
+            out[name] = upper.view(np.float32).reshape(stored["shape"])
+    return out
+
+
+def _plain(value: Array) -> Array:
+    return value.astype(np.float32) if value.dtype.kind == "f" else value
 
 
 def load_config(folder: Path) -> config.Listener:

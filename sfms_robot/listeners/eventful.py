@@ -1,4 +1,4 @@
-"""A listener in three parts: events say when, a model of motion says how, kinematics move the eyes.
+"""A listener in four parts: events say when, a model of motion says how, kinematics move the eyes, a face never rests.
 
 Of every frame, in this order:
 
@@ -6,6 +6,7 @@ Of every frame, in this order:
     control     what has been decided becomes rows of numbers, of the past and of the frames to be planned
     motion      the model draws head and face, told those rows; the direction of the eyes it leaves alone
     gaze        the eyes go to where the last gaze shift said, the head follows, and while it nods the eyes stay
+    idle        the small motion of a resting face, where the listener has learned any (`idle_motion`)
 
 An event is decided `LEAD_FRAMES` before it begins, whatever the hop: a plan that is made in between shows it from its
 beginning. What has been decided is never taken back.
@@ -26,6 +27,7 @@ import numpy as np
 from sfms_robot.config import Calmness
 from sfms_robot.frames import FRAME_HZ, FRAME_S, POSE, Doubles, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.events.model import Decision, EventMemory, EventModel
+from sfms_robot.listeners.idle_motion import IdleMotion, IdleStream
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.control import control_track
 from sfms_robot.signals.gaze_kinematics import GazeState
@@ -63,6 +65,7 @@ class EventfulMemory:
         events: decided, and not over since longer than the model looks back; the last gaze shift always.
         news: those of them that no plan has told yet.
         gaze: state of the eyes after the newest frame, then after every row of the plan in force.
+        idle: the stream's own idle motion; None: it has none.
     """
 
     when: EventMemory
@@ -70,13 +73,16 @@ class EventfulMemory:
     events: tuple[ListenerEvent, ...]
     news: tuple[ListenerEvent, ...]
     gaze: tuple[GazeState, ...]
+    idle: IdleStream | None = None
 
 
 class EventfulListener:
-    """`ports.Listener`: `when` decides, `how` moves. Holds weights only."""
+    """`ports.Listener`: `when` decides, `how` moves, `idle` is what it does meanwhile. Holds weights only."""
 
-    def __init__(self, how: MotionModel, when: EventModel, calmness: Calmness | None = None) -> None:
-        self.how, self.when, self.calmness = how, when, calmness or Calmness()
+    def __init__(
+        self, how: MotionModel, when: EventModel, calmness: Calmness | None = None, idle: IdleMotion | None = None
+    ) -> None:
+        self.how, self.when, self.calmness, self.idle = how, when, calmness or Calmness(), idle
 
     @property
     def hop(self) -> int:
@@ -107,7 +113,8 @@ class EventfulListener:
     def start(self, seed: int) -> EventfulMemory:
         """Memory of a stream that has heard nothing and decided nothing."""
         when = self.when.start(seed, self.calmness)
-        return EventfulMemory(when, self.how.start(seed), (), (), (gaze_kinematics.start(seed),))
+        idle = None if self.idle is None else self.idle.start(seed)
+        return EventfulMemory(when, self.how.start(seed), (), (), (gaze_kinematics.start(seed),), idle)
 
     def calmed(self, memory: EventfulMemory, calmness: Calmness) -> EventfulMemory:
         """The same stream, from now on with other rates."""
@@ -118,6 +125,28 @@ class EventfulListener:
         decision, told = self._decided(speaker, memory)
         plan, how = self.how.step(speaker, told.how, self._control(speaker, told))
         return self._looking(plan, decision, replace(told, how=how))
+
+    def step_each(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
+    ) -> list[tuple[Plan | None, EventfulMemory]]:
+        """See `ports.BatchListener`; a motion model that steps one stream at a time is asked for each."""
+        decided = [self._decided(*each) for each in zip(speakers, memories, strict=True)]
+        told = [memory for _, memory in decided]
+        controls = [self._control(*each) for each in zip(speakers, told, strict=True)]
+        moved = self._move_each(speakers, [memory.how for memory in told], controls)
+        return [
+            self._looking(plan, decision, replace(memory, how=how))
+            for (plan, how), (decision, memory) in zip(moved, decided, strict=True)
+        ]
+
+    def _move_each(
+        self, speakers: Sequence[SpeakerFrame], hows: Sequence[Any], controls: Sequence[Floats]
+    ) -> Sequence[tuple[Plan | None, Any]]:
+        together = getattr(self.how, "step_each", None)
+        if together is None:
+            return [self.how.step(*each) for each in zip(speakers, hows, controls, strict=True)]
+        moved: Sequence[tuple[Plan | None, Any]] = together(speakers, hows, controls)
+        return moved
 
     def step_many(
         self, speaker: SpeakerFrame, memories: Sequence[EventfulMemory]
@@ -166,6 +195,8 @@ class EventfulListener:
             seen, state = gaze_kinematics.step(target_at(memory.events, time_s), frames[row, POSE], states[-1])
             frames[row] = seen.applied(frames[row])
             states.append(state)
+        if memory.idle is not None:
+            frames = memory.idle.added(frames, plan.times_s)
         told = replace(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
         return told, replace(memory, news=(), gaze=tuple(states))
 

@@ -17,13 +17,16 @@ if TYPE_CHECKING:  # numpy, which a look at a name does not need
     from sfms_robot.ports import Listener
 
 GROUP: Final = "sfms_robot.listeners"
+REMOTE: Final = "zenoh/"  # begins the name of a listener on another machine (`remote`)
 
 
 def listener_folder(name: str) -> Path | None:
-    """Folder of a listener by shipped name or path; None for one that another package brings.
+    """Folder of a listener by shipped name or path; None for one that another package brings, or another machine.
 
     Raises ConfigError with the choices.
     """
+    if name.startswith(REMOTE):
+        return None
     try:
         return find("listeners", name, "config.yaml")
     except ConfigError:

@@ -1,8 +1,8 @@
 """A listener in a process of its own: the same `step`, frames one way, plans the other, over two pipes.
 
-In one process torch and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
-model and its threads (cores - 1), and the servo process never loads torch. It ends when its pipe does, so it never
-outlives its parent, whatever killed that.
+In one process networks and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
+model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it. It ends
+when its pipe does, so it never outlives its parent, whatever killed that.
 
 The child says of every frame that it is done. One that is silent for `HUNG_S` is named as hung; after `RESTART_S`, or
 when it died, it is started anew and listens from then on, while the head goes on by itself. Too many of those in a
@@ -11,15 +11,17 @@ minute and it stays down.
 A machine that cannot keep up must not answer what was said seconds ago: when more than half a second is waiting, the
 listener goes on at the newest frame. What it did not hear is counted, and said once.
 
-A listener that is loaded is not yet fast: it builds its graphs while the head eases in, and measures what a plan takes
-on this machine. By that, and by how late the source has been for half a second, its hop is chosen. What it did not hear
-meanwhile it hears then, as fast as it can. Every ten seconds the choice is held against what has been measured since: a
-hop that does not fit any more gives way to a shorter one, and never to a longer one, so that it settles.
+A listener that is loaded is not yet fast: it builds its graphs while the head eases in, tries whether more than one
+thread is faster, and measures what a plan takes on this machine. By that, and by how late the source has been for half
+a second, its hop is chosen. What it did not hear meanwhile it hears then, as fast as it can. Every ten seconds the
+choice is held against what has been measured since: a hop that does not fit any more gives way to a shorter one, and
+never to a longer one, so that it settles.
 
-    parent -> child    pickle: (name, seed, calmness), then SpeakerFrame after SpeakerFrame; between them an int: the
-                       hop, which it waits for and which may change; whenever somebody asks for it, another Calmness
+    parent -> child    pickle: (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
+                       int: the hop, which it waits for and which may change; whenever somebody asks for it, another
+                       Calmness
     child -> parent    pickle: (kind, value, number)
-        loaded         nothing is wrong with it
+        loaded         nothing is wrong with it; value names its engine
         probed         value is a `Probe`; it waits for its hop
         ready          it listens
         done, plan     a frame was taken; for a plan, value is the answer and number the ms that it took
@@ -48,6 +50,7 @@ from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.hop import HopChoice, Latencies, choose_hop
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
+from sfms_robot.listeners.engine import EngineName
 from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -85,10 +88,12 @@ class ListenerProcess:
         name: what `registry.load_listener` takes: a shipped listener, a folder, or a kind of another package.
         seed: of the stream.
         calmness: how often a listener that decides events does what.
+        engine: what its networks are computed by.
     """
 
-    def __init__(self, name: str, seed: int, calmness: Calmness | None = None) -> None:
-        self._name, self._seed, self._calmness = name, seed, calmness
+    def __init__(self, name: str, seed: int, calmness: Calmness | None = None, engine: EngineName = "auto") -> None:
+        self._name, self._seed, self._calmness, self._wanted = name, seed, calmness, engine
+        self._engine: str | None = None
         self._step_ms = Quantiles()
         self._skipped = 0
         self._restarted_s: list[float] = []
@@ -102,7 +107,7 @@ class ListenerProcess:
         self._probed: Probe | None = None  # what the choice in force was made by
         self._review_s = math.inf
         self._pushed = 0
-        self._child = _Child(name, seed, calmness)
+        self._child = _Child(name, seed, calmness, engine)
 
     def calm(self, calmness: Calmness) -> None:
         """From the next frames on. Never blocks; a listener that decides nothing takes no notice."""
@@ -115,7 +120,7 @@ class ListenerProcess:
             return
         kind, value, _ = self._child.next(limit_s)
         if kind == "loaded":
-            self._state = "building"
+            self._state, self._engine = "building", value
             return
         self.close()
         raise ModelError(value or f"the listener process was not loaded after {limit_s:g} s")
@@ -155,11 +160,12 @@ class ListenerProcess:
         return self._state in ("hung", "given up") or (self._restarts > 0 and self._state != "listening")
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` (starting, building, listening, hung, given up), `restarts`, `skipped_frames`, `step_ms`, `hop` and
-        `budget_ms` (see `config.hop`), None as long as no hop was chosen.
+        """`state` (starting, building, listening, hung, given up), `engine` in words, `restarts`, `skipped_frames`,
+        `step_ms`, `hop` and `budget_ms` (see `config.hop`), None as long as no hop was chosen.
         """
         return {
             "state": self._state,
+            "engine": self._engine,
             "restarts": self._restarts,
             "skipped_frames": self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),
@@ -180,7 +186,7 @@ class ListenerProcess:
             self._skipped += int(number)
             self._answered(int(number), now_s)
         elif kind == "loaded":
-            self._state = "building"
+            self._state, self._engine = "building", value
         elif kind == "probed":
             self._probe = value
             self._tell_hop()
@@ -258,15 +264,15 @@ class ListenerProcess:
         self._restarted_s.append(now_s)
         self._restarts += 1
         self._state, self._waits_since_s, self._unanswered, self._probe = "starting", None, 0, None
-        self._child = _Child(self._name, self._seed + self._restarts, self._calmness)
+        self._child = _Child(self._name, self._seed + self._restarts, self._calmness, self._wanted)
 
 
 class _Child:
     """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
 
-    def __init__(self, name: str, seed: int, calmness: Calmness | None) -> None:
+    def __init__(self, name: str, seed: int, calmness: Calmness | None, engine: EngineName) -> None:
         self._process = start_child("sfms_robot.listeners.process:main")
-        self._frames: deque[Any] = deque([(name, seed, calmness)])
+        self._frames: deque[Any] = deque([(name, seed, calmness, engine)])
         self._urgent: deque[int | Calmness] = deque()
         self._changed = threading.Condition()
         self._messages: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
@@ -350,7 +356,7 @@ class _Child:
 
 
 def threads() -> int:
-    """Of torch in the child: one core is the servo loop's."""
+    """That the child may use: one core is the servo loop's."""
     return max(1, (os.cpu_count() or 2) - 1)
 
 
@@ -362,28 +368,46 @@ def main() -> None:
     frames, plans = take_pipes()
     inbox, hops = Inbox(), queue.SimpleQueue[int]()
     try:
-        name, seed, calmness = pickle.load(frames)
+        name, seed, calmness, engine = pickle.load(frames)
     except (EOFError, pickle.UnpicklingError):
         return  # the parent ended before it said what to load
     threading.Thread(target=_receive, args=(frames, inbox, hops), daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(NICE)
     try:
-        import torch
+        from sfms_robot.listeners.registry import at_hop, build_graphs, engine_name, hops_of, load_listener
 
-        from sfms_robot.listeners.registry import at_hop, build_graphs, hops_of, load_listener
-
-        torch.set_num_threads(threads())
-        listener = load_listener(name, graphs=False, calmness=calmness)
-        _say(plans, "loaded")
+        listener = load_listener(name, graphs=False, calmness=calmness, engine=engine, threads=1)
+        _say(plans, "loaded", engine_name(listener))
         build_graphs(listener)
         choices = hops_of(listener)
+        if use_threads(at_hop(listener, min(choices)), threads()):
+            _say(plans, "loaded", engine_name(listener))
         p50_s, p99_s = plan_times_s(at_hop(listener, min(choices)))
         _say(plans, "probed", Probe(listener.horizon, listener.hop, tuple(choices), p50_s, p99_s))
     except RobotError as error:
         _say(plans, "error", str(error))
         return
     listen(at_hop(listener, hops.get()), seed, inbox, plans, hops)
+
+
+def use_threads(listener: Listener, most: int) -> bool:
+    """Let a listener's networks use one thread or `most`, whichever makes plans faster here; whether that is `most`.
+
+    Blocks for half of `PROBE_S` each where there is a choice.
+    """
+    from sfms_robot.listeners.registry import engine_name, set_threads
+
+    if most == 1 or engine_name(listener) is None:
+        return False
+
+    planned_s = {}
+    for count in (1, most):
+        set_threads(listener, count)
+        planned_s[count], _ = plan_times_s(listener, PROBE_S / 2)
+    if planned_s[1] <= planned_s[most]:
+        set_threads(listener, 1)
+    return planned_s[most] < planned_s[1]
 
 
 def plan_times_s(

@@ -9,28 +9,64 @@ from typing import Any, cast
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.listener_kinds import LISTENER_KINDS
 from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.listeners.engine import Engine, EngineName
 from sfms_robot.listeners.eventful import EventfulListener, MotionModel
 from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.idle_motion import FILE as IDLE_FILE
+from sfms_robot.listeners.idle_motion import IdleMotion
 from sfms_robot.listeners.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
 
-def load_listener(name: str | Path, graphs: bool = True, calmness: Calmness | None = None) -> Listener:
+def load_listener(
+    name: str | Path,
+    graphs: bool = True,
+    calmness: Calmness | None = None,
+    engine: EngineName = "auto",
+    threads: int | None = None,
+) -> Listener:
     """A listener by shipped name, of a folder with config.yaml and weights, or of another package.
 
-    `graphs`: ready to run at full speed, which takes another second or two; else `build_graphs` is still to be called.
-    `calmness`: how often a listener that decides events does what. Raises ConfigError or ModelError.
+    Those that ship are `ports.BatchListener`s.
+
+    Args:
+        graphs: ready to run at full speed, which takes torch another second; else `build_graphs` is still to be called.
+        calmness: how often a listener that decides events does what.
+        engine: what its networks are computed by (`engine_choice`); auto: onnx where it can be, else torch.
+        threads: that its networks may use; None: one, and with torch as many as it is set to.
+
+    Raises ConfigError or ModelError.
     """
     folder = listener_folder(str(name))
     if folder is None:
         return load_plugin(str(name))
     settings = load_config(folder)
-    listener = cast(Listener, LISTENER_KINDS[settings.kind].load_folder(folder))
+    listener = cast(Listener, LISTENER_KINDS[settings.kind].load_folder(folder, engine, threads))
     if settings.events:
-        listener = EventfulListener(cast(MotionModel, listener), EventModel.load(), calmness)
+        resting = folder / IDLE_FILE
+        idle = IdleMotion.load(resting) if resting.is_file() else None
+        listener = EventfulListener(cast(MotionModel, listener), EventModel.load(), calmness, idle)
     if graphs:
         build_graphs(listener)
     return listener
+
+
+def engine_name(listener: Listener) -> str | None:
+    """What computes its networks, in words; None for a listener of somebody else's."""
+    engine = _engine(listener)
+    return None if engine is None else engine.name
+
+
+def set_threads(listener: Listener, threads: int) -> None:
+    """Use so many from now on; a listener of somebody else's is left alone."""
+    engine = _engine(listener)
+    if engine is not None:
+        engine.set_threads(threads)
+
+
+def _engine(listener: Listener) -> Engine | None:
+    found: Engine | None = getattr(getattr(listener, "how", listener), "engine", None)
+    return found
 
 
 def build_graphs(listener: Listener) -> None:

@@ -19,8 +19,9 @@ class InlineFeed:
 
     lost = False
 
-    def __init__(self, listener: Listener, seed: int, latency_s: float) -> None:
-        self._listener = listener
+    def __init__(self, listener: Listener, seed: int, latency_s: float, engine: str | None = None) -> None:
+        """`engine`: what computes it, in words, for the report."""
+        self._listener, self._engine = listener, engine
         self._memory = listener.start(seed)
         self._latency_s = latency_s
         self._coming: list[tuple[float, Plan]] = []
@@ -37,7 +38,7 @@ class InlineFeed:
 
     def statistics(self) -> Mapping[str, Any]:
         """See `ports.PlanFeed`; in virtual time a step has no duration."""
-        return {**IDLE_FEED, "hop": self._listener.hop}
+        return {**IDLE_FEED, "engine": self._engine, "hop": self._listener.hop}
 
     def close(self) -> None:
         """Nothing to give back."""

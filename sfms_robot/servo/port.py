@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_REPLY_TIMEOUT_S = 5.0  # real seconds; only a stopped emulator takes so long
+_REPLY_TIMEOUT_S = 30.0  # real seconds: a stopped emulator, or one that waits for its turn on a busy machine
 _TERMINALS: Final = "/dev/pts/"
 _NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs behind which servos can be
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
@@ -177,6 +177,7 @@ class VirtualTimePort:
         except BaseException:
             self._control.close()
             raise
+        self._serial.write_timeout = _REPLY_TIMEOUT_S  # real time, which says nothing here about the device
 
     def write(self, data: bytes) -> None:
         now_s = self._clock.now_s()

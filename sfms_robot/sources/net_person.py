@@ -24,6 +24,7 @@ import numpy as np
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.sources.net_clock import SenderClock
+from sfms_robot.sources.net_intake import Intake
 from sfms_robot.sources.net_messages import (
     FEEDS,
     MICROPHONE,
@@ -45,9 +46,7 @@ logger = logging.getLogger(__name__)
 PORT: Final = 8765
 LOOPBACK: Final = "127.0.0.1"
 SILENT_S: Final = 2.0
-OLDEST_S: Final = 1.0  # of a voice or a face that is still of use
 FLAGS: Final = {"voice": "--audio push", "face": "--face push", "speech": "--agent-audio tcp"}
-_SPARE_S: Final = 2.0  # of sound, that may come in faster than time passes
 _HIGHEST_PORT: Final = 65535
 
 _open: dict[tuple[str, int], NetPerson] = {}
@@ -69,11 +68,9 @@ class NetPerson:
         self._feeders: dict[str, Connection] = {}
         self._clocks: dict[Connection, SenderClock] = {}
         self._heard_s: dict[str, float] = {}
-        self._spare_s = _SPARE_S
-        self._spared_s = now()
         self._origin_s = 0.0
         self._state: Mapping[str, Any] | None = None
-        self._counts = dict.fromkeys(("old", "too_fast"), 0)
+        self._intake = Intake(now)
         self._server = NetServer(flag, host, port, self)
         bound = self._server.address
         self.token = None if ipaddress.ip_address(bound[0]).is_loopback else secrets.token_urlsafe(12)
@@ -121,7 +118,7 @@ class NetPerson:
     def statistics(self) -> Mapping[str, Any]:
         """What the server counts; sound and faces that came too late, or faster than time passes; who feeds what."""
         feeders = {name: connection.name for name, connection in self._feeders.copy().items()}
-        return {**self._server.counts, **self._counts, "feeders": feeders}
+        return {**self._server.counts, **self._intake.counts, "feeders": feeders}
 
     # --- what programs send; in the server's thread ---
 
@@ -186,50 +183,24 @@ class NetPerson:
             raise PacketError(f"{name} was not announced in its hello")
         self._heard_s[name] = self.now()
 
-    def _times(self, connection: Connection, message: Sound | Seen) -> tuple[float, float | None]:
-        """Now, and what the sender says of a time in our clock."""
-        now_s = self.now()
-        if not message.at_s:
-            return now_s, None
-        clock = self._clocks[connection]
-        clock.observe(message.sent_s, now_s)
-        return now_s, message.at_s + clock.offset_s
-
     def _see(self, connection: Connection, message: Seen) -> None:
         self._allowed(connection, "face")
-        now_s, at_s = self._times(connection, message)
-        if at_s is not None and at_s < now_s - OLDEST_S:
-            self._counts["old"] += 1
-            return
         sight = self._feeds["face"]
         assert isinstance(sight, NetSight)
-        sight.see(message.motion, None if at_s is None else min(at_s, now_s), message.attention)
+        self._intake.see(sight, message, self._clocks[connection])
 
     def _sound(self, connection: Connection, message: Sound) -> None:
         name = next(name for name, kind in FEEDS.items() if kind == message.kind)
         self._allowed(connection, name)
-        now_s, at_s = self._times(connection, message)
-        if message.kind != VOICE:
-            speech = self._feeds[name]
-            assert isinstance(speech, NetSpeech)
-            speech.say(message.samples, message.rate_hz, at_s)
-            return
-        if at_s is not None and at_s < now_s - OLDEST_S:
-            self._counts["old"] += 1
-        elif self._in_time(len(message.samples) / message.rate_hz, now_s):
+        if message.kind == VOICE:
             voice = self._feeds[name]
             assert isinstance(voice, NetVoice)
-            voice.hear(message.samples, message.rate_hz, None if at_s is None else min(at_s, now_s))
-
-    def _in_time(self, piece_s: float, now_s: float) -> bool:
-        """Whether no more sound came than time has passed, and a little."""
-        self._spare_s = min(_SPARE_S, self._spare_s + (now_s - self._spared_s))
-        self._spared_s = now_s
-        if piece_s > self._spare_s:
-            self._counts["too_fast"] += 1
-            return False
-        self._spare_s -= piece_s
-        return True
+            self._intake.hear(voice, message, self._clocks[connection])
+            return
+        speech = self._feeds[name]
+        assert isinstance(speech, NetSpeech)
+        _, at_s = self._intake.times(message, self._clocks[connection])
+        speech.say(message.samples, message.rate_hz, at_s)
 
     def _send_sound(self, audio: Floats, at_s: float) -> None:
         wanting = [each for each in self._server.connections() if "microphone" in each.wants]

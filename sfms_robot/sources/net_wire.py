@@ -1,16 +1,14 @@
 """How messages travel: behind their length over TCP, or as a WebSocket's own. Bytes in, bytes out; opens no socket.
 
 Both forms share one port. Who begins with "GET" speaks HTTP and wants a WebSocket: as a length that would be more than
-any message has. Pages of the web may not connect: a browser tells whose page it is (Origin), and only pages that this
-machine serves, or that came from the very address they call, are let in.
+any message has. Pages of the web may not connect: a browser tells whose page it is, and only pages that this machine
+serves, or that came from the very address they call, are let in (`origin`).
 """
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Iterator
 from typing import Final, Protocol
-from urllib.parse import urlsplit
 
 from websockets.exceptions import InvalidHandshake, WebSocketException
 from websockets.frames import CloseCode, Frame, Opcode
@@ -18,6 +16,7 @@ from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
 from sfms_robot.errors import PacketError
+from sfms_robot.origin import origin_problem
 from sfms_robot.sources.net_messages import LONGEST, MessageBuffer, framed
 
 HTTP: Final = b"GET "
@@ -123,41 +122,6 @@ class WebSocketWire:
         else:
             self._protocol.send_response(self._protocol.reject(403, problem + "\n"))
             raise PacketError(problem)
-
-
-def origin_problem(origin: str | None, host: str) -> str | None:
-    """Why a page may not connect; None where it may, or where who connects is no browser (`origin` None).
-
-    A name that somebody else gives to this machine's address proves nothing, so what is no loopback name must be an
-    address, that of `host`.
-    """
-    if origin is None:
-        return None
-    page, here = _host(origin), _host(f"//{host}")
-    if page == "localhost" or (page is not None and _is_loopback(page)):
-        return None
-    if page is not None and page == here and _address(page) is not None:
-        return None
-    return f"a page of {origin[:80]!r} may not connect"
-
-
-def _host(url: str) -> str | None:
-    try:
-        return urlsplit(url).hostname
-    except ValueError:
-        return None
-
-
-def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(host)
-    except ValueError:
-        return None
-
-
-def _is_loopback(host: str) -> bool:
-    address = _address(host)
-    return address is not None and address.is_loopback
 
 
 def _line(error: BaseException) -> str:

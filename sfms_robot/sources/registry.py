@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,9 +19,11 @@ from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, speakers, voi
 
 if TYPE_CHECKING:
     from sfms_robot.ports import Source, Voice
+    from sfms_robot.sources.browser import Visitor
     from sfms_robot.sources.spoken import Spoken
 
 GROUP: Final = "sfms_robot.sources"
+BROWSER: Final = "browser"  # the kind of a person in front of the page
 _HERE: Final = "sfms_robot.sources"
 _METHODS: Final = {"voice": "take", "face": "at", "source": "read"}  # by which each is told from the others
 
@@ -93,12 +94,14 @@ def open_source(
     kinds: SourceKinds | None = None,
     agent: Spoken | None = None,
     play: str | None = None,
+    visitor: Visitor | None = None,
 ) -> Source:
     """A person by what a run is told of them.
 
     An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
     own, else none. `loop`: recordings start again when they end before `duration_s` does. `agent` is what the robot
-    says, instead of `agent_audio`. `play`: the device that plays it; None: somebody else does.
+    says, instead of `agent_audio`. `play`: the device that plays it; None: somebody else does. `visitor`: who is in
+    front of the page, where one is served.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
@@ -116,7 +119,7 @@ def open_source(
         if split_kind(audio)[0] == "mic" and (own is not None or agent_audio != "none"):
             voice, own = _conversation(audio, own or agent_audio, known, failed)
         else:
-            voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed)
+            voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed, visitor)
         voice = voice or _recorded_voice(audio, again)
         if voice is not None and hasattr(voice, _METHODS["source"]):
             for flag, value, free in (("--face", face, "auto"), ("--agent-audio", agent_audio, "none")):
@@ -124,7 +127,7 @@ def open_source(
                     raise ConfigError(f"{flag} {value}: --audio {audio} brings its own ({free})")
             source: Source = JudgedSource(voice)
         else:
-            sight = _opened("--face", face, known.sights, ("face",), failed)
+            sight = _opened("--face", face, known.sights, ("face",), failed, visitor)
             sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
             own = own or _agent(agent_audio, known, failed)
             source = PairedSource(voice, sight, own, duration_s)
@@ -134,11 +137,7 @@ def open_source(
 
 def _check(flag: str, value: str, kinds: Kinds, file: Path | None, files: Iterable[str]) -> None:
     (name, _), choices = split_kind(value), ", ".join([*kinds, *files])
-    if name in kinds:
-        module = kinds[name].value.partition(":")[0]
-        if module.startswith(f"{_HERE}.") and find_spec(module) is None:
-            raise ConfigError(f"{flag} {value}: not available yet ({choices})")
-    elif value not in files and file is None:
+    if name not in kinds and value not in files and file is None:
         raise ConfigError(f"{flag} {value}: no such file ({choices})")
 
 
@@ -146,7 +145,9 @@ def _existing(name: str) -> Path | None:
     return Path(name) if Path(name).exists() else None
 
 
-def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack) -> Any:
+def _opened(
+    flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack, visitor: Visitor | None = None
+) -> Any:
     """What a kind opens; None where `value` names none."""
     name, argument = split_kind(value)
     if name not in kinds:
@@ -156,7 +157,7 @@ def _opened(flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed
         build = kind.load()
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"{flag} {name}: {kind.value} cannot be imported: {error}") from error
-    part = build(argument)
+    part = build(argument, visitor) if name == BROWSER else build(argument)
     failed.callback(part.close)
     if not any(hasattr(part, _METHODS[each]) for each in wanted):
         raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {' or '.join(wanted)}")

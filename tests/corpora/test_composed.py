@@ -159,7 +159,7 @@ def test_nods_are_where_they_were_annotated(made):
             continue
         start = float(dyad.name.split("_")[2])
         expected = [t - start for t in np.arange(4.2, UNTIL_S - 4, 8) if 2 < t - start < len(dyad.listener) / 25 - 2]
-        found = find_nods(dyad.listener[:, PITCH], FRAME_HZ)
+        found = find_nods(dyad.listener[:, PITCH] - dyad.head_of_gaze_rad[:, 1], FRAME_HZ)  # a look down is no nod
         assert len(found) >= 0.7 * len(expected)
         for onset, _, _ in found:
             assert np.abs(np.array(expected) - onset).min() < 1.3 or not 2 < onset < len(dyad.listener) / 25 - 2

@@ -87,12 +87,13 @@ def test_table_2_has_a_row_for_every_listener_given_and_the_papers(evaluate, lis
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("table", "paper"), [("arig-1", PAPER_1), ("arig-4", PAPER_4)])
-def test_ablations_that_are_missing_are_trained_and_kept(evaluate, lively, tmp_path, table, paper):
+def test_ablations_that_are_missing_are_trained_and_kept(evaluate, listener, lively, tmp_path, table, paper):
     file = tmp_path / "arig.yaml"
     file.write_text(yaml.safe_dump(settings(steps=2).model_dump(mode="json")))
     words = ("listener", "--table", table, "--data", lively, "--models", tmp_path / "m", "--config", file, "--json")
+    words += ("--listener", listener)
     code, out, _ = evaluate(*words)
-    assert code == 0 and {row["name"] for row in json.loads(out)["rows"]} == {"GT", *paper}
+    assert code == 0 and {row["name"] for row in json.loads(out)["rows"]} == {"GT", *paper, str(listener)}
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.safetensors")}
     assert evaluate(*words)[1] == out and before == {path: path.stat().st_mtime_ns for path in before}
 
@@ -100,7 +101,7 @@ def test_ablations_that_are_missing_are_trained_and_kept(evaluate, lively, tmp_p
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--table", "arig-1"), "--table arig-1: needs --models DIR and --config FILE (configs/training/arig.yaml)"),
+        (("--table", "arig-1"), "--table arig-1: needs --models DIR, where its listeners are trained and kept"),
         (("--table", "arig-2", "--order", "motion_first"), "--order"),
         (("--table", "arig-3"), "'arig-3' is not one of"),
     ],

@@ -9,6 +9,7 @@ from sfms_robot.evaluation import interaction as scores
 from sfms_robot.evaluation.paper import arig_tables as tables
 from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
+from sfms_robot.listeners.arig import torch_engine
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import ArigListener
 
@@ -127,7 +128,7 @@ def test_the_agents_sound_comes_one_frame_early():
 def test_what_is_played_has_a_frame_and_a_state_for_every_frame():
     listener = settings().listener
     one = dyad("a", "interaction", 0)
-    played = rollout(ArigListener(listener, ArigModel(listener)), frames_of_dyad(one), [1])
+    played = rollout(ArigListener(listener, torch_engine(listener, ArigModel(listener))), frames_of_dyad(one), [1])
     assert played.motion[0].shape == one.listener.shape and np.isfinite(played.motion).all()
     assert played.states[0, 0] == -1 and (played.states[0, 1:] >= 0).all()
 

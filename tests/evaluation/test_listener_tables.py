@@ -13,6 +13,7 @@ from sfms_robot.evaluation.paper.listener_clips import collect, shared_space, sp
 from sfms_robot.evaluation.paper.listener_tables import TABLE_1, TABLE_2, Clips, cut, table
 from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
+from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 
@@ -30,7 +31,7 @@ def listener(space: str = "arkit58", **changes) -> SfmsListener:
     settings = config.parse(config.Sfms, raw | changes, "tiny")
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return SfmsListener(settings, SfmsModel(settings))
+        return SfmsListener(settings, torch_engine(settings, SfmsModel(settings)))
 
 
 def dyad(name: str, frames: int = 70, seed: int = 0, space: str = "arkit58") -> Dyad:

@@ -35,8 +35,8 @@ from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
 from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS
-from sfms_robot.listeners.arig.csu import FIRST, NODDING
 from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.sojourns import FIRST, NODDING
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import LN_PER_DB
 

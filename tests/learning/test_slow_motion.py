@@ -48,10 +48,8 @@ def test_what_is_fitted_on_sway_is_its_amplitudes():
     hz = torch.tensor(BANDS_HZ)
     amplitude = torch.linspace(0.02, 0.004, len(hz) - 1)[:, None] * torch.tensor([1.0, 0.5])
     people = [
-        sway_at(
-            draw_sway(amplitude, torch.tensor(0.3), torch.Generator().manual_seed(seed)), 5 + torch.arange(6000) * 0.04
-        )
-        for seed in range(40)
+        torch.from_numpy(sway_at(draw_sway(amplitude.numpy(), 0.3, seed), 5 + np.arange(6000) * 0.04))
+        for seed in range(80)
     ]
     found, spread = fit_sway(people)
     torch.testing.assert_close(found[1:], amplitude[1:], rtol=0.25, atol=1e-3)

@@ -23,6 +23,8 @@ from sfms_robot.learning.sfms import tokenizer_trainer as tokenizer
 from sfms_robot.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather
 from sfms_robot.learning.sfms.tokens import place_all
 from sfms_robot.listeners import checkpoint, sfms
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
 from sfms_robot.listeners.space import MotionSpace
@@ -162,6 +164,24 @@ def test_the_weight_of_class_0_is_taken_out_of_its_probability():
 
 def _corpus() -> SfmsCorpus:
     return gather([dyad("a"), dyad("short", 40), dyad("b", 130, seed=1)], 48, ARKIT)
+
+
+def test_the_weight_stays_where_nobody_takes_it_out():
+    kept = settings(predictor={"steps": 1, "batch": 1, "learning_rate": 1e-3, "undo_weight": False})
+    assert listener.corrected(kept) == kept.listener
+
+
+@pytest.mark.parametrize("hop", [4, 8])
+def test_a_plan_that_is_drawn_as_a_whole_is_learned_as_a_whole(hop):
+    """V-C: 8 frames in parallel; a shorter hop finds some of them drawn already."""
+    tiny = settings()
+    tiny = tiny.model_copy(update={"listener": tiny.listener.model_copy(update={"hop": hop})})
+    corpus = gather([dyad("a")], 48, ARKIT, AudioFrontend.of(tiny.listener), tiny.listener)
+    model, undecided = SfmsModel(tiny.listener), []
+    model.predictor.register_forward_pre_hook(lambda _, seen: undecided.append(seen[0].tokens[:, -8:] == UNDECIDED))
+    listener.held_out_loss(model, corpus, tiny)
+    first = torch.cat(undecided)[..., 0]
+    assert first[:, -1].all() and first.all() == (hop == 8)
 
 
 def test_windows_never_cross_from_one_dyad_into_the_next():

@@ -26,8 +26,8 @@ def toy(identity=None, loss=None, held_out=None, seed=3, **phase) -> Job:
     model = nn.Sequential(nn.Linear(4, 8), nn.Dropout(0.5), nn.Linear(8, 1))
     chosen = config.parse(config.Phase, {"steps": 12, "batch": 4, "learning_rate": 0.05} | phase, "toy")
 
-    def loss_of(step: int, generator: torch.Generator) -> torch.Tensor:
-        x = torch.randn(chosen.batch, 4, generator=generator)
+    def loss_of(step: int, generator: torch.Generator, batch: int) -> torch.Tensor:
+        x = torch.randn(batch, 4, generator=generator)
         out = ((model(x) - x.sum(1, keepdim=True)) ** 2).mean()
         return out if loss is None else loss(step, out)
 
@@ -280,7 +280,7 @@ def test_bf16_is_for_processors_that_have_it(tmp_path, monkeypatch, precision, h
     job = toy(precision=precision)
     seen = []
 
-    def loss_of(step, generator):
+    def loss_of(step, generator, batch):
         x = torch.randn(4, 4, generator=generator)
         out = job.model(x)
         seen.append(out.dtype)
@@ -296,7 +296,7 @@ def test_bf16_trains_on_a_gpu(tmp_path):
     job = toy(precision="bf16")
     model = job.model.cuda()
 
-    def loss_of(step, generator):
+    def loss_of(step, generator, batch):
         x = torch.randn(4, 4, generator=generator).cuda()
         out = model(x)
         assert out.dtype == torch.bfloat16

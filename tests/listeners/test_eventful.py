@@ -52,6 +52,21 @@ def test_streams_side_by_side_are_each_one_alone(lively):
     assert [plan.events for plan in alone[0]] != [plan.events for plan in alone[1]]
 
 
+def test_streams_of_any_age_together_are_each_one_alone(lively):
+    begins, speakers = (0, 3, 10), [speech(60, seed) for seed in (4, 5, 6)]
+    alone = [plans_of(lively, speaker, seed)[0] for seed, speaker in enumerate(speakers)]
+    memories, together = [lively.start(seed) for seed in range(3)], [[] for _ in begins]
+    for now in range(60):
+        live = [row for row, begin in enumerate(begins) if begin <= now]
+        stepped = lively.step_each([speakers[row][now - begins[row]] for row in live], [memories[row] for row in live])
+        for row, (plan, memories[row]) in zip(live, stepped, strict=True):
+            together[row] += [] if plan is None else [plan]
+    for one, many in zip(alone, together, strict=True):
+        for plan, other in zip(one, many, strict=False):
+            assert plan.events == other.events
+            np.testing.assert_allclose(plan.frames, other.frames, atol=1e-5)
+
+
 def test_each_event_is_told_once_before_it_begins_and_with_why(lively):
     plans, _ = plans_of(lively, speech(500))
     events = [event for plan in plans for event in plan.events]

@@ -5,6 +5,7 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.frames import BLENDSHAPES, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame
+from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.signals.control import control_track
@@ -29,7 +30,7 @@ def tiny_listener(**changes) -> SfmsListener:
     settings = tiny_settings(**changes)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return SfmsListener(settings, SfmsModel(settings))
+        return SfmsListener(settings, torch_engine(settings, SfmsModel(settings)))
 
 
 def guided_listener(guidance: float, **changes) -> SfmsListener:
@@ -53,9 +54,9 @@ def told_listener(**changes) -> SfmsListener:
         },
     }
     listener = tiny_listener(**raw | changes)
-    if listener.model.head:
-        listener.model.sway_amplitude.fill_(0.003)
-        listener.model.sway_spread.fill_(0.3)
+    if listener.engine.model.head:
+        listener.engine.model.sway_amplitude.fill_(0.003)
+        listener.engine.model.sway_spread.fill_(0.3)
     return listener
 
 

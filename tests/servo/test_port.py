@@ -15,6 +15,7 @@ from sfms_robot.errors import BusError, PortError
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.port import SerialPort, VirtualTimePort
+from sfms_robot.servo.serial_io import WRITE_TIMEOUT_S
 
 
 @contextmanager
@@ -159,6 +160,14 @@ def test_rubbish_neither_hangs_nor_confuses(make_rig):
         with rig.link() as link:
             assert link.ping(1) is not None
         assert rig.chain.digest()[1] > 100_000
+
+
+def test_a_busy_machine_is_no_reason_to_give_up_a_write_in_virtual_time(make_rig):
+    """A process that gets no turn for half a second, with pyserial's own write under way, lost its bus for good."""
+    with make_rig([EmulatedServo(1)]) as rig:
+        port = rig.port()
+        assert port._serial.write_timeout > 10 * WRITE_TIMEOUT_S
+        port.close()
 
 
 def test_second_host_in_virtual_time_starts_from_zero(make_rig):

@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from sfms_robot.errors import ConfigError, PortError
+from sfms_robot.origin import origin_problem
 from sfms_robot.sources import net_server
 from sfms_robot.sources.net_messages import (
     MICROPHONE,
@@ -25,7 +26,6 @@ from sfms_robot.sources.net_messages import (
     sound_message,
 )
 from sfms_robot.sources.net_person import SILENT_S, NetPerson, NetSight, NetSpeech, NetVoice
-from sfms_robot.sources.net_wire import origin_problem
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.registry import open_source
 

@@ -112,8 +112,8 @@ def test_files_are_opened_by_path(tmp_path):
 @pytest.mark.parametrize(
     ("audio", "face", "message"),
     [
-        ("browser", "auto", "--audio browser: not available yet .mic, push, browser, FILE.wav, none, default"),
-        ("none", "browser:8000", "--face browser:8000: not available yet .live-link, vmc, .*FILE.csv"),
+        ("browser", "auto", "--audio browser: there is no page .sfms-robot run --view"),
+        ("none", "browser:8000", "--face browser:8000: takes nothing behind the colon"),
         ("nobody.wav", "auto", "--audio nobody.wav: no such file .*facegood_1114_3_16, katie"),
         ("none", "nobody.csv", "--face nobody.csv: no such file"),
     ],

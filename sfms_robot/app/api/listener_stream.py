@@ -10,18 +10,19 @@ from numpy.typing import ArrayLike
 
 from sfms_robot.errors import InputError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
+from sfms_robot.listeners.engine import EngineName
 from sfms_robot.ports import Listener
 
 
-def load_listener(name: str | Path) -> LoadedListener:
+def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListener:
     """A listener by shipped name, folder, or the name under which another package registers its own.
 
-    Blocks while its library (torch, for those that ship) and its weights load, a second or two. Raises ConfigError,
-    ModelError.
+    `engine`: what computes it, "onnx" or "torch"; "auto": onnxruntime where it has graphs for it, as those that ship.
+    Blocks while its engine and its weights load, half a second, with torch two. Raises ConfigError, ModelError.
     """
-    from sfms_robot.listeners import registry  # torch comes with what it loads
+    from sfms_robot.listeners import registry  # an engine comes with what it loads
 
-    return LoadedListener(registry.load_listener(name))
+    return LoadedListener(registry.load_listener(name, engine=engine))
 
 
 class LoadedListener:

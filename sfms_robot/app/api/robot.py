@@ -24,7 +24,8 @@ from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError, RobotError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
-from sfms_robot.listeners.process import ListenerProcess
+from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.open_feed import NamedFeed, open_feed
 from sfms_robot.listeners.thread import ListenerThread
 from sfms_robot.ports import Listener, Observer, Source
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
@@ -67,7 +68,7 @@ class Robot:
     Args:
         head: shipped name, folder, or what `load_head` gave.
         port: "sim" for emulated servos, "auto", a device, or NAME=DEVICE[,NAME=DEVICE].
-        listener: shipped name, folder, a name that another package registers; or an object that implements
+        listener: shipped name, folder, zenoh/NAME, a name that another package registers; or an object that implements
             `Listener`, which is then stepped in a thread of this process.
         audio: "push" for what `hear`, `see` and `say` hand over; else a source that `run --audio` knows.
         face, agent_audio: as `run --face`, `--agent-audio`, beside another source than "push".
@@ -109,6 +110,7 @@ class Robot:
         style: Mapping[str, float] | None = None,
         calmness: Mapping[str, float] | None = None,
         addressed: str = "sense",
+        engine: EngineName = "auto",
     ) -> None:
         pushed = source is None and audio == PUSH
         if pushed and (face, agent_audio) != ("auto", "none"):
@@ -122,14 +124,14 @@ class Robot:
             head=head_name(head), port=port, listener=type(own).__name__ if own is not None else str(listener),
             audio="none" if pushed else audio, face=face, agent_audio=agent_audio, duration_s=duration_s, fast=fast,
             seed=seed, record=None if record is None else Path(record), overwrite=overwrite, yes=yes,
-            without=tuple(without), play=play,
+            without=tuple(without), play=play, engine=engine,
             calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
         )  # fmt: skip
         prepare_head(self._options.servos)
         config = load_head(self._options.head)
         self._listener = own
         self._calmness = self._options.calmness or Calmness()
-        self._feed: ListenerThread | ListenerProcess | None = None
+        self._feed: ListenerThread | NamedFeed | None = None
         self._person = _PushedPerson() if pushed else None
         self._speech = self._person.speech if self._person is not None else None
         if source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none":
@@ -306,13 +308,13 @@ class Robot:
             "callbacks_detached": dict(self._events.detached),
         }  # fmt: skip
 
-    def _begin_listening(self) -> ListenerThread | ListenerProcess | None:
+    def _begin_listening(self) -> ListenerThread | NamedFeed | None:
         """What listens in real time; in virtual time the run steps a listener inline."""
         if self._listener is not None:
             return ListenerThread(self._listener, self._options.seed)
         if self._options.fast:
             return None
-        return ListenerProcess(self._options.listener, self._options.seed, self._calmness)
+        return open_feed(self._options.listener, self._options.seed, self._calmness, engine=self._options.engine)
 
     def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
         with ExitStack() as stack:

@@ -1,70 +1,128 @@
 """`sfms-robot bench`: each part against a peer or a baseline, both measured in the same run.
 
-| name | measured | peer |
-|---|---|---|
-| startup.help, .wrong_port, .wrong_head | until the process is over | the same Python doing nothing |
-| startup.first_goal, .exit, .resident | `run` typed to first goal; last byte to the end; memory | the same |
-| own-voice | own voice taken for the person, person missed, in rooms, over own voice and motors | what is so in truth |
-| memory.growth | resident memory that a run gains per virtual hour, after the first | resident memory after it |
-| bus.write, bus.tick | our sync write; write and read of a head, of each family (CPU time) | the vendor's own calls |
-| bus.cpu_share, bus.wire_use, bus.one_silent | of a core; of the line; ticks with one servo dead | the same |
-| retarget.tick | mapping, limits, calibration of a head (CPU time) | a plain matrix product of the mapping's size |
-| retarget.stewart | inverse of a six-legged platform | a 6 x 3 matrix product |
-| lead | how late the joints are | the same joints with no lead |
-| listener.plan | one plan on one thread | the time it covers: hop x 40 ms |
-
-`bench webcam` (`webcam_bench.py`), `live` (`live_bench.py`, `torture_bench.py`), `campaign` and `fuzz` have tables of
-their own.
+`BENCHES` is the table of all of them; a new one is a line there, and the function that it names. That function takes
+the options that the line says, as keywords, and returns rows by name (`measure.row`), or `measure.Told` where a table
+of its own says more. Nothing is imported before it is measured: a shell that completes names waits for this file.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.bench.adversary import adversarial
-from sfms_robot.app.bench.bus_bench import bus
-from sfms_robot.app.bench.lead import lead
-from sfms_robot.app.bench.listener_bench import listener
-from sfms_robot.app.bench.measure import HEAD, Row, beside
-from sfms_robot.app.bench.memory_bench import HOURS, memory
-from sfms_robot.app.bench.retarget_bench import retarget
-from sfms_robot.app.bench.startup_bench import startup
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, MissingExtra
 
-PARTS: Mapping[str, Callable[[], dict[str, Row]]] = {
-    "startup": startup,
-    "bus": bus,
-    "retarget": retarget,
-    "lead": lead,
-    "listener": listener,
-}
+if TYPE_CHECKING:
+    from sfms_robot.app.bench.measure import Told
+
+ALL: Final = "all"
+Say = Callable[[str], None]
 
 
-def run_bench(
-    name: str,
-    head: str | None = None,
-    frames: int | None = None,
-    against: Path | None = None,
-    hours: float = HOURS,
-) -> dict[str, Row]:
-    """Measure `name`, or everything for "all". A row has median, p99, unit, peer, peer_median and ratio.
+@dataclass(frozen=True)
+class Bench:
+    """One thing to measure.
 
-    `head`: another one for "lead", and for "retarget" with wild `frames`. `against`: a folder with another
-    installation, which becomes the peer; the two run in turn. `hours`: of "memory". Raises ConfigError where they mean
-    nothing.
+    Attributes:
+        place: "module:function" in this folder.
+        about: what is measured, and beside what.
+        in_all: whether `bench` without a name measures it too: takes a minute or two, needs nothing but the package.
+        takes: options that it understands; "say" is a function that is told what is going on.
     """
-    if name == "memory":
-        return memory(hours)
-    if against is not None:
-        return startup(against) if name == "startup" else beside(name, against)
-    if frames is not None and name != "retarget":
-        raise ConfigError(f"--frames {frames}: only 'bench retarget' takes wild frames")
-    if head is not None and name != "lead" and frames is None:
-        raise ConfigError(f"--head {head}: only 'bench lead' and 'bench retarget --frames N' take a head")
-    if frames is not None:
-        return adversarial(frames, (head,) if head else ())
-    if name == "lead":
-        return lead(head or HEAD)
-    chosen = PARTS.values() if name == "all" else [PARTS[name]]
-    return {key: row for part in chosen for key, row in part().items()}
+
+    place: str
+    about: str
+    in_all: bool = True
+    takes: tuple[str, ...] = ()
+
+
+BENCHES: Final[Mapping[str, Bench]] = {
+    "startup": Bench(
+        "startup_bench:startup", "a command typed to its end, `run` to its first goal, beside a bare Python",
+        takes=("against",),
+    ),
+    "bus": Bench("bus_bench:bus", "write and read of a head, of each family, beside the vendor's own calls"),
+    "retarget": Bench(
+        "retarget_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size",
+        takes=("head", "frames"),
+    ),
+    "lead": Bench("lead:lead", "how late joints are, beside the same with no lead", takes=("head",)),
+    "listener": Bench(
+        "listener_bench:listener", "a plan, beside plain fp32 and the time there is for it", takes=("budget",)
+    ),
+    "memory": Bench(
+        "memory_bench:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,
+        takes=("hours", "head"),
+    ),
+    "own-voice": Bench(
+        "own_voice_bench:measure", "own voice taken for the person, person missed, beside what is so in truth",
+        in_all=False, takes=("data",),
+    ),
+    "webcam": Bench(
+        "webcam_bench:measure", "what MediaPipe sees of a face, beside the face that was drawn", in_all=False
+    ),
+    "live": Bench(
+        "torture_bench:measure", "a head that hears a microphone and sees a phone, beside an empty loop and a file",
+        in_all=False, takes=("minutes", "audio", "torture", "say"),
+    ),
+    "view": Bench(
+        "view_bench:measure", "a page with three who look, beside the same run without; a halt from click to wire",
+        in_all=False, takes=("say",),
+    ),
+    "serve": Bench(
+        "serve_bench:measure", "heads that one server answers in time, beside one head at a time", in_all=False,
+        takes=("say",),
+    ),
+    "campaign": Bench(
+        "campaign:measure", "every fault on every family of servos; exit code 1 where one is not survived",
+        in_all=False, takes=("say",),
+    ),
+    "fuzz": Bench(
+        "fuzz:measure", "random bytes at every family; exit code 1 where they do harm", in_all=False,
+        takes=("minutes", "say"),
+    ),
+}  # fmt: skip
+
+
+def run_bench(name: str, given: Mapping[str, Any], say: Say) -> Told:
+    """Measure `name`, or all that belong to "all"; `say` is told of each.
+
+    Args:
+        given: options by name, those that were given. `against`, a folder with another installation, goes with every
+            bench of rows: that one becomes the peer, and the two run in turn.
+
+    Raises ConfigError for a name that is none and for an option that means nothing there, and what the bench raises.
+    """
+    from sfms_robot.app.bench.measure import Told, beside
+
+    chosen = {key: one for key, one in BENCHES.items() if (one.in_all if name == ALL else key == name)}
+    if not chosen:
+        raise ConfigError(f'bench: there is no "{name}" ({", ".join([ALL, *BENCHES])})')
+    takes = () if name == ALL else BENCHES[name].takes
+    if "against" in given and "against" not in takes:
+        return Told.of_rows(beside(name, given["against"]))
+    for option in given:
+        if option not in takes:
+            those = " and ".join(f"'bench {key}'" for key, one in BENCHES.items() if option in one.takes)
+            raise ConfigError(f"--{option} {given[option]}: only {those} takes it")
+    if name != ALL:
+        return _measured(chosen[name], given, say)
+    rows: dict[str, Any] = {}
+    for key, one in chosen.items():
+        say(key)
+        try:
+            rows |= _measured(one, {}, say).figures
+        except MissingExtra as error:
+            say(f"{key} is left out: {error}")
+    return Told.of_rows(rows)
+
+
+def _measured(bench: Bench, given: Mapping[str, Any], say: Say) -> Told:
+    from sfms_robot.app.bench.measure import Told
+
+    module, function = bench.place.split(":")
+    measure = getattr(importlib.import_module(f"{__name__}.{module}"), function)
+    found = measure(**given, **({"say": say} if "say" in bench.takes else {}))
+    return found if isinstance(found, Told) else Told.of_rows(found)

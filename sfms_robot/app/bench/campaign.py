@@ -18,13 +18,15 @@ A run is the same every time: time is virtual, and the dice are seeded.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 
 from sfms_robot.app.bench.campaign_rig import FAMILIES, LIMIT_DEG, RATE_HZ, RECOVERY_S, Judge, Rig, head_of, plugged_in
+from sfms_robot.app.bench.measure import Told
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.faults import KINDS
@@ -280,6 +282,15 @@ def run_campaign(
             progress(f"{family}: {case}")
             out.append(one(family, case, ticks))
     return out
+
+
+def measure(say: Callable[[str], None]) -> Told:
+    """`run_campaign`, as `bench` tells it."""
+    logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
+    outcomes = run_campaign(progress=say)
+    plain = [asdict(each) | {"passed": each.passed} for each in outcomes]
+    passed = all(each.passed for each in outcomes)
+    return Told({"passed": passed, "runs": plain}, table(outcomes), passed=passed)
 
 
 def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:

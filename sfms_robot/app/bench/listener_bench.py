@@ -20,7 +20,7 @@ import numpy as np
 
 from sfms_robot import config
 from sfms_robot.app.bench.in_run import in_run
-from sfms_robot.app.bench.measure import Row, row
+from sfms_robot.app.bench.measure import Row, Told, row
 from sfms_robot.app.bench.samplers import samplers
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -47,9 +47,17 @@ listener.step(SpeakerFrame(0.04, np.zeros(640, np.float32)), listener.start(0))
 """
 
 
-def listener() -> dict[str, Row]:
-    """One row per listener; the threads that torch uses are as before when it returns."""
+def listener(budget: bool = False) -> dict[str, Row] | Told:
+    """One row per listener; the threads that torch uses are as before when it returns.
+
+    `budget`: what a frame costs, counted, and what small computers need for it (`compute_budget`), instead.
+    """
     import torch
+
+    if budget:
+        from sfms_robot.app.bench.compute_budget import budget as counted
+
+        return counted()
 
     threads = torch.get_num_threads()
     try:
@@ -74,6 +82,7 @@ def _sfms_paper() -> Row:
     """The size of the paper, with seeded weights: what a plan costs does not depend on them."""
     import torch
 
+    from sfms_robot.listeners.sfms import torch_engine
     from sfms_robot.listeners.sfms.model import SfmsModel
     from sfms_robot.listeners.sfms.stream import SfmsListener
 
@@ -84,7 +93,7 @@ def _sfms_paper() -> Row:
         torch.manual_seed(0)
         model = SfmsModel(training.listener)
     params = sum(each.numel() for each in model.parameters())
-    return _plans(SfmsListener(training.listener, model).build_graphs()) | {
+    return _plans(SfmsListener(training.listener, torch_engine(training.listener, model)).build_graphs()) | {
         "params": params,
         "weights": "seeded, not trained",
     }
@@ -110,6 +119,7 @@ def _arig(folder: Path, settings: config.Arig) -> Row:
     import torch
 
     from sfms_robot.listeners import checkpoint
+    from sfms_robot.listeners.arig import torch_engine
     from sfms_robot.listeners.arig.model import ArigModel
     from sfms_robot.listeners.arig.stream import ArigListener
 
@@ -122,8 +132,9 @@ def _arig(folder: Path, settings: config.Arig) -> Row:
     else:  # motion inside 0..1, where nothing is clipped
         model.motion_mean.copy_(torch.tensor([0.5 * (name not in POSE_CHANNELS) for name in settings.channels]))
         model.motion_std.fill_(0.02)
-    quick = ArigListener(settings, model).build_graphs()
-    exact = ArigListener(settings.model_copy(update={"precision": "fp32"}), model)
+    plain = settings.model_copy(update={"precision": "fp32"})
+    quick = ArigListener(settings, torch_engine(settings, model)).build_graphs()
+    exact = ArigListener(plain, torch_engine(plain, model))
     speaker = _speaker()
     full = _after_minutes(quick, 60)
     eager_ms = _times_of(exact, full, speaker, threads=1, steps=STEPS // 2)
@@ -183,11 +194,9 @@ def _steps(listener: Listener, memory: Any, speaker: list[SpeakerFrame], steps: 
 
 def _after_minutes(listener: ArigListener, minutes: int) -> Memory:
     """A memory as it is after so many minutes, its whole chunks made up."""
-    import torch
-
     memory = listener.start(0)
     _, memory = listener.step(_speaker()[0], memory)
-    made_up = torch.randn(memory.context.shape, generator=torch.Generator().manual_seed(0))
+    made_up = np.random.default_rng(0).standard_normal(memory.context.shape, np.float32)
     return replace(memory, frames=minutes * MINUTE, context=made_up)
 
 

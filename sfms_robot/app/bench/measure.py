@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +25,47 @@ Row = dict[str, Any]
 MAIN: Final = ("-P", "-c", "from sfms_robot.cli.main import main; main()")
 
 
+@dataclass(frozen=True)
+class Told:
+    """What a bench found.
+
+    Attributes:
+        figures: all of it, as plain data.
+        table: a row per line, for people; `lines` says what it leaves out.
+        passed: whether everything is as it has to be.
+    """
+
+    figures: dict[str, Any]
+    table: Sequence[Mapping[str, Any]]
+    lines: Sequence[str] = ()
+    passed: bool = True
+
+    @classmethod
+    def of_rows(cls, rows: Mapping[str, Row]) -> Told:
+        """Of a bench whose figures are rows with a ratio to a peer; each says on what machine."""
+        rows = {name: {**each, "machine": machine()} for name, each in rows.items()}
+        columns = {"median": "median", "unit": "unit", "p99": "p99", "ratio": "ratio", "peer": "to"}
+        table = [{"measured": name} | {columns[key]: each.get(key) for key in columns} for name, each in rows.items()]
+        return cls(rows, table)
+
+
+def machine() -> str:
+    """The computer that is measured, in a line: cores that this process may use, processor, system, Python."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return (
+        f"{cores} cores of {_processor()}, {platform.system()} {platform.release()}, Python {platform.python_version()}"
+    )
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model")))
+    return next(named, "") or platform.processor() or platform.machine()
+
+
 def row(ours: list[float], peers: list[float], unit: str, peer: str) -> Row:
     median, peer_median = float(np.median(ours)), float(np.median(peers))
     return {
@@ -32,6 +75,7 @@ def row(ours: list[float], peers: list[float], unit: str, peer: str) -> Row:
         "peer": peer,
         "peer_median": peer_median,
         "ratio": median / peer_median,
+        "repeats": len(ours),
     }
 
 
@@ -63,12 +107,14 @@ def beside(name: str, against: Path, repeats: int = 3) -> dict[str, Row]:
     for _ in range(repeats):
         for found, env in ((ours, None), (theirs, environment(against))):
             for key, each in _rows(name, env).items():
+                if not isinstance(each, dict) or "median" not in each:
+                    raise ConfigError(f"--against {against}: 'bench {name}' has no rows to lay beside others")
                 found.setdefault(key, []).append(each["median"])
                 units[key] = each["unit"]
     return {key: row(ours[key], theirs[key], units[key], str(against)) for key in ours if key in theirs}
 
 
-def _rows(name: str, env: Mapping[str, str] | None) -> dict[str, Row]:
+def _rows(name: str, env: Mapping[str, str] | None) -> dict[str, Any]:
     done = subprocess.run(
         [sys.executable, *MAIN, "bench", name, "--json"],
         capture_output=True, text=True, check=False, env=env,
@@ -76,5 +122,5 @@ def _rows(name: str, env: Mapping[str, str] | None) -> dict[str, Row]:
     )  # fmt: skip
     if done.returncode:
         raise ConfigError(f"bench {name}: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
-    rows: dict[str, Row] = json.loads(done.stdout.splitlines()[-1])
+    rows: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return rows

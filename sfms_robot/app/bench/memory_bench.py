@@ -39,14 +39,14 @@ class ResidentMemory(Observer):
             self.resident_mb.append(pages * self._page_mb)
 
 
-def memory(hours: float = HOURS) -> dict[str, Row]:
-    """Growth after the first hour in MB, beside what was resident then; Linux only.
+def memory(hours: float = HOURS, head: str = HEAD) -> dict[str, Row]:
+    """Growth after the first hour in MB, beside what was resident then; Linux only. `head`: a name or a folder.
 
     Raises BusError when the run does not come to its end.
     """
     looks = ResidentMemory()
     with TemporaryDirectory() as folder:
-        options = RunOptions(head=HEAD, fast=True, audio="none", duration_s=hours * _HOUR_S, record=Path(folder))
+        options = RunOptions(head=head, fast=True, audio="none", duration_s=hours * _HOUR_S, record=Path(folder))
         report = run(options, feed=Waves(), observers=[looks], signals=False)
     if report["exit"] != "done":
         raise BusError(f"bench memory: the run ended early ({report['exit']}: {report['error']})")

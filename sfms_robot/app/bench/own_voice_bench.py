@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.bench.acoustics import GEAR_SEED, Bools, Call, Scene, read_call, scene, without_person
+from sfms_robot.app.bench.measure import Told
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
@@ -144,6 +145,17 @@ def echo_latency_ms(call: Call) -> float:
     size = 1 << (2 * len(after) - 1).bit_length()
     likeness = np.fft.irfft(np.fft.rfft(after, size) * np.fft.rfft(before, size).conj(), size)
     return float(np.argmax(likeness[: AUDIO_HZ // 10])) / AUDIO_HZ * 1e3
+
+
+def measure(data: Path | None = None) -> Told:
+    """`own_voice` over the calls in folder `data`, as `bench` tells it."""
+    result = own_voice(data)
+    chosen_on = ", ".join(result["chosen_on"]["calls"])
+    lines = [
+        f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms",
+        f"parameters were chosen on other calls ({chosen_on}), gears and movements",
+    ]
+    return Told(result, table(result), lines)
 
 
 def table(result: Mapping[str, Any]) -> list[dict[str, str]]:

@@ -6,10 +6,12 @@ import time
 
 import numpy as np
 
+from sfms_robot.app.bench.adversary import adversarial
 from sfms_robot.app.bench.measure import HEAD, Row, row, times
 from sfms_robot.app.head.faces import recorded_faces
 from sfms_robot.app.session import build_motion
 from sfms_robot.config import load_firmware_map, load_head
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
@@ -22,7 +24,19 @@ _HORIZON, _HOP = 8, 4
 STEWART_HEAD = "reachy_mini"
 
 
-def retarget() -> dict[str, Row]:
+def retarget(head: str | None = None, frames: int | None = None) -> dict[str, Row]:
+    """CPU time of a tick, or violations over so many wild `frames`, of all heads or of one.
+
+    Raises ConfigError for a head without frames.
+    """
+    if frames is not None:
+        return adversarial(frames, (head,) if head else ())
+    if head is not None:
+        raise ConfigError(f"--head {head}: 'bench retarget' takes a head with --frames N")
+    return {**_tick(), "retarget.stewart": _stewart()}
+
+
+def _tick() -> dict[str, Row]:
     """CPU time of `retarget.tick` = mapping + limits + calibration, of each of them, and of the timeline before."""
     head = load_head(HEAD)
     motion = build_motion(head, RATE_HZ)
@@ -57,7 +71,7 @@ def retarget() -> dict[str, Row]:
     peers = times(lambda: matrix @ frame, TICKS, time.thread_time)
     name = f"{len(head.joints)} x {MOTION_DIM} matrix product"
     rows = {f"retarget.{part}": row(took, peers, "ms", name) for part, took in spent.items()}
-    return {"retarget.tick": row(safe, peers, "ms", name), **rows, "retarget.stewart": _stewart()}
+    return {"retarget.tick": row(safe, peers, "ms", name), **rows}
 
 
 def _plans(ticks: int) -> list[Plan]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from sfms_robot.frames import SpeakerFrame
 
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
         if index % EVERY == EVERY - 1:
             conditions.append(listener.condition(frame, memory)[0])
         _, memory = listener.step(frame, memory)
-    told = torch.cat(conditions).repeat_interleave(DRAWS, dim=0)
+    told = torch.from_numpy(np.concatenate(conditions)).repeat_interleave(DRAWS, dim=0)
 
     @torch.inference_mode()
     def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

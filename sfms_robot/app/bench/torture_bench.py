@@ -32,6 +32,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.app.bench import live_bench
 from sfms_robot.app.bench.live_bench import (
     SINK,
     Audio,
@@ -44,7 +45,7 @@ from sfms_robot.app.bench.live_bench import (
     live_person,
     patient_head,
 )
-from sfms_robot.app.bench.measure import HEAD, LISTENER, MAIN
+from sfms_robot.app.bench.measure import HEAD, LISTENER, MAIN, Told
 from sfms_robot.app.replay.run_file import read_recording, states_of
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
@@ -87,7 +88,7 @@ class Blow:
         return in_time and self.well_s is not None
 
 
-def torture(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str, Any]:
+def tortured(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str, Any]:
     """Half an hour, or another time with as many blows as fit; Linux only. Blocks.
 
     Raises ConfigError without PulseAudio, BusError when the run does not begin.
@@ -312,6 +313,15 @@ def _ended(command: _Command) -> dict[str, Any]:
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 2)
+
+
+def measure(say: Say, minutes: float = 0.0, audio: Audio = "mic", torture: bool = False) -> Told:
+    """A live run, tortured or not, as `bench` tells it; 0 minutes: as many as it mostly takes."""
+    if torture:
+        blows = tortured(minutes or MINUTES, audio, say)
+        return Told(blows, table(blows), words(blows), blows["passed"])
+    result = live_bench.live(minutes or live_bench.MINUTES, audio, say)
+    return Told(result, live_bench.table(result), live_bench.words(result))
 
 
 def table(result: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.bench.measure import times
+from sfms_robot.app.bench.measure import Told, times
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.virtual_webcam import PLACE_M, SIZE_PX, VirtualWebcam
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
@@ -228,6 +228,13 @@ def _latency(pictures: Sequence[Picture]) -> dict[str, Any]:
             return out
         finally:
             webcam.close()
+
+
+def measure() -> Told:
+    """`webcam`, as `bench` tells it."""
+    result = webcam()
+    times = [f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})" for name, ms in result["timings_ms"].items()]
+    return Told(result, table(result), times)
 
 
 def table(result: Mapping[str, Any]) -> list[Row]:

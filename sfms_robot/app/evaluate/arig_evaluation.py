@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from sfms_robot import config
+from sfms_robot.app.evaluate.as_written import as_written, training_file
 from sfms_robot.app.train.train_runs import TrainOptions, run_of, train_settings
 from sfms_robot.config import find, parse_training
 from sfms_robot.config.arig import STATES
@@ -26,6 +27,7 @@ from sfms_robot.evaluation.paper.listener_tables import cut
 from sfms_robot.evaluation.rollout import Rollout, rollouts
 from sfms_robot.learning.arig.features import open_scenes
 from sfms_robot.learning.arig.trainer import train_arig
+from sfms_robot.learning.resume import checkpoint_file
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.registry import load_listener
 from sfms_robot.ports import Listener
@@ -35,7 +37,10 @@ TABLES: Final = ("arig-1", "arig-2", "arig-4")
 
 @dataclass(frozen=True)
 class AblationOptions:
-    """Where the ablations' listeners are, and how those that are missing are trained (`steps`: not the file's)."""
+    """Where listeners of the tables alone are, and how those that are missing are trained.
+
+    `training`: None is the paper as written. `steps`: not the file's.
+    """
 
     models: Path | None = None
     training: Path | None = None
@@ -118,9 +123,9 @@ def _lips(played: Mapping[str, Sequence[Rollout]], held_out: Mapping[str, Sequen
 def arig_table(
     name: str, names: Sequence[str], data: Path, clips: int | None, seed: int, ablations: AblationOptions
 ) -> dict[str, Any]:
-    """`arig-2`: `names` side by side on the listening set. `arig-1`, `arig-4`: ablations on the interaction set.
+    """`arig-2`: `names` side by side on the listening set. `arig-1`, `arig-4`: ablations on the interaction set, too.
 
-    Raises ConfigError.
+    With a folder for models the paper as written is in each of them. Raises ConfigError.
     """
     if name not in TABLES:
         raise ConfigError(f"--table {name}: is not one of {', '.join(TABLES)}")
@@ -134,7 +139,9 @@ def arig_table(
         raise ConfigError(f"{data}: no validation dyad is as long as a clip of {tables.CLIP_FRAMES} frames")
     folders = {one: find("listeners", one, "config.yaml") for one in names}
     if number != 2:
-        folders = _ablated(number, data, ablations)
+        folders = _ablated(number, data, ablations) | folders
+    elif ablations.models is not None:
+        folders |= as_written("arig", data, ablations.models, ablations.steps)
     truth = cut([dyad.listener for dyad in held_out], tables.CLIP_FRAMES)
     speaker = cut([dyad.speaker for dyad in held_out], tables.CLIP_FRAMES)
     answers = {}
@@ -151,22 +158,24 @@ def arig_table(
 
 def _ablated(number: int, data: Path, options: AblationOptions) -> dict[str, Path]:
     """Folders of the full model and the table's ablations, trained alike where they are missing."""
-    if options.models is None or options.training is None:
-        raise ConfigError(f"--table arig-{number}: needs --models DIR and --config FILE (configs/training/arig.yaml)")
-    file = options.training
+    if options.models is None:
+        raise ConfigError(f"--table arig-{number}: needs --models DIR, where its listeners are trained and kept")
+    file = options.training or training_file("arig")
     base = train_settings(TrainOptions(file, data, options.models, steps=options.steps))
     if not isinstance(base, config.ArigTraining):
         raise ConfigError(f"{file}: listener.kind is not arig")
     folders = {}
     variants: dict[str, Mapping[str, Any]] = {"ARIG": {}, **tables.ABLATIONS[number]}
     for label, changes in variants.items():
-        out = options.models / label.replace("/", "").replace(" ", "-").lower()
+        unchanged = "arig-as-written" if options.training is None else "arig"
+        out = options.models / (label.replace("/", "").replace(" ", "-").lower() if changes else unchanged)
         folders[label] = out
         if (out / checkpoint.WEIGHTS).is_file():
             continue
         raw = base.model_dump(mode="json")
         raw["listener"] |= changes
-        _train(parse_training(raw, file), TrainOptions(file, data, out, tensorboard=False))
+        begun = checkpoint_file(out, "arig").is_file()
+        _train(parse_training(raw, file), TrainOptions(file, data, out, resume=begun, tensorboard=False))
     return folders
 
 

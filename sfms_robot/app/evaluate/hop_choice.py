@@ -13,7 +13,7 @@ def load_at_hop(folder: Path, hop: int | None) -> Listener:
     """A listener that plans every `hop` frames; None: as often as its config.yaml says. Raises ConfigError for a hop
     that it cannot be run with, ModelError.
     """
-    listener = load_listener(folder)
+    listener = load_listener(folder, engine="torch")
     choices = hops_of(listener)
     if hop is not None and hop not in choices:
         raise ConfigError(f"--hop {hop}: {folder.name} cannot be run with it ({', '.join(map(str, choices))})")

@@ -33,7 +33,7 @@ def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dic
     from sfms_robot.learning.sfms.tokenizer_trainer import reconstruction_error
     from sfms_robot.listeners.sfms import load as load_sfms
 
-    listener = load_sfms(find("listeners", name, "config.yaml"))
+    listener = load_sfms(find("listeners", name, "config.yaml"), "torch")
     model = listener.model
     window = model.tokenizer.window
     dyads = open_for(listener.space.name, data, "validation", order)
@@ -103,12 +103,16 @@ def listener_table(
     seed: int,
     order: Order | None = None,
     hop: int | None = None,
+    models: Path | None = None,
+    steps: int | None = None,
 ) -> dict[str, Any]:
     """Table 1 or 2 of the paper for listeners and heuristics, on the validation split of any data set known.
 
-    At most `limit` dyads, spread evenly; `hop`: see `load_at_hop`. Raises ConfigError when the listeners do not share a
-    motion space.
+    At most `limit` dyads, spread evenly; `hop`: see `load_at_hop`. `models`: a folder with the paper's listener as
+    written, trained (for so many `steps`) where it is missing; None: without it. Raises ConfigError when the listeners
+    do not share a motion space.
     """
+    from sfms_robot.app.evaluate.as_written import as_written
     from sfms_robot.app.evaluate.hop_choice import load_at_hop
     from sfms_robot.corpora.formats import open_for
     from sfms_robot.evaluation.paper import listener_clips
@@ -116,6 +120,10 @@ def listener_table(
     from sfms_robot.listeners.sfms.stream import SfmsListener
 
     listeners = {name: load_at_hop(find("listeners", name, "config.yaml"), hop) for name in names}
+    if models is not None:
+        listeners |= {
+            name: load_at_hop(folder, None) for name, folder in as_written("sfms", data, models, steps, order).items()
+        }
     space = listener_clips.shared_space(listeners)
     heard = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
     train, held_out = (listener_clips.spread(open_for(space.name, data, split, order, heard), most) for split, most in

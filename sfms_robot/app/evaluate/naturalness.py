@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from rich.progress import Progress
 from sfms_robot.config import find
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import usable
-from sfms_robot.corpora.formats import open_for
+from sfms_robot.corpora.formats import detect, open_for, split_names
 from sfms_robot.corpora.resampling import at_frame_rate
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import manners as manner
@@ -51,9 +52,9 @@ def evaluate_naturalness(
             progress.advance(playing)
         drift = long_run(listener, heard, drift_s, seed)
         progress.advance(playing)
-        judging = progress.add_task("telling apart", total=2 * len(REGIONS) * FOLDS)
-        told = two_samples(ours, [dyad.listener for dyad in dyads], lambda: progress.advance(judging))
-    theirs = [dyad.listener for dyad in dyads]
+        theirs, taught = [dyad.listener for dyad in dyads], of_training(data, len(dyads))
+        judging = progress.add_task("telling apart", total=(3 if taught else 2) * len(REGIONS) * FOLDS)
+        told = two_samples(ours, theirs, taught, lambda: progress.advance(judging))
     addressed = [asked_for(dyad) for dyad in dyads]
     return {
         "listener": name,
@@ -64,6 +65,16 @@ def evaluate_naturalness(
         **figures(manner.manners(ours, addressed), manner.manners(theirs, addressed)),
         **drifted(drift, theirs),
     }
+
+
+def of_training(data: Path, count: int) -> list[Floats]:
+    """Motion of as many listeners of the training part; none where there are not so many."""
+    if "train" not in split_names(*detect(data, "auto")):
+        return []
+    every = open_for("arkit58", data, "train")
+    rows = np.linspace(0, len(every) - 1, min(count, len(every))).round().astype(int).tolist()
+    some = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(every.clips[row] for row in rows)))]
+    return [dyad.listener for dyad in some] if len(some) == count else []
 
 
 def _spread(dyads: Sequence[Dyad], most: int | None) -> list[Dyad]:
@@ -95,17 +106,27 @@ def _at(frame: SpeakerFrame, time_s: float) -> SpeakerFrame:
     return SpeakerFrame(time_s, frame.audio, frame.face, frame.agent_audio, frame.attention, frame.place_m)
 
 
-def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], each: Callable[[], object]) -> dict[str, Any]:
-    """By region, `two_sample_auc`, and for scale people against other people; each with its interval over dyads."""
+def two_samples(
+    ours: Sequence[Floats], theirs: Sequence[Floats], taught: Sequence[Floats], each: Callable[[], object]
+) -> dict[str, Any]:
+    """By region, `two_sample_auc`, each with its interval over dyads; and for scale two others.
+
+    People against other people of the same part, and, where `taught` are given, people of training against them: who
+    imitates those without a flaw is told from these as often.
+    """
     rng = np.random.default_rng(0)
     made, real = ([windows(motion, rng) for motion in motions] for motions in (ours, theirs))
-    pairs = len(real) // 2
-    found = {region: told_apart(made, real, region, each) for region in REGIONS}
-    people = {region: told_apart(real[0 : 2 * pairs : 2], real[1 : 2 * pairs : 2], region, each) for region in REGIONS}
+    half = 2 * (len(real) // 2)
+    pairs = {"two_sample_auc": (made, real), "person_two_sample_auc": (real[0:half:2], real[1:half:2])}
+    if taught:
+        pairs["training_two_sample_auc"] = [windows(motion, rng) for motion in taught], real
+    found = {
+        name: {region: told_apart(one, other, region, each) for region in REGIONS}
+        for name, (one, other) in pairs.items()
+    }
     return {
-        "two_sample_auc": {region: round(told.auc, 3) for region, told in found.items()},
-        "person_two_sample_auc": {region: round(told.auc, 3) for region, told in people.items()},
-        "interval": {"two_sample_auc": _intervals(found), "person_two_sample_auc": _intervals(people)},
+        **{name: {region: round(told.auc, 3) for region, told in one.items()} for name, one in found.items()},
+        "interval": {name: _intervals(one) for name, one in found.items()},
     }
 
 

@@ -36,7 +36,7 @@ class TableOptions:
     Attributes:
         table: one of `TABLES`, or all of them.
         data: face tracks to score on, all held out; None: the held-out takes of the bundled motion.
-        models: folder of trained tokenizers; None: those that ship.
+        models: folder of trained tokenizers; None: those of the checkout, without the papers' as written.
         train: train them all anew; otherwise only what `models` has not.
         steps: of training, in place of the size's own.
         plots: folder for pictures.
@@ -59,7 +59,7 @@ def evaluate_table(options: TableOptions) -> dict[str, Any]:
     folder = options.models or data_dir("configs") / "tokenizers"
     recorded = takes.load(data_dir("sim") / "listeners" / RECORDED)
     held_out = recorded[takes.HELD_OUT] if options.data is None else takes.folder_takes(options.data)
-    wanted = list(dict.fromkeys(name for table in chosen for name in needed(table)))
+    wanted = list(dict.fromkeys(name for table in chosen for name in needed(table, options.models is None)))
     train_missing(options, wanted, folder, recorded)
     loaded = {name: models.read(folder / name) for name in wanted}
     _same_scales(loaded, folder)

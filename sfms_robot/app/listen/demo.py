@@ -1,8 +1,9 @@
-"""`sfms-robot demo`: a bundled person talks, an emulated head listens, and two pictures show what it did."""
+"""`sfms-robot demo`: a bundled person talks, an emulated head listens, and a page or two pictures show what it did."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
@@ -11,10 +12,13 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app import session
+from sfms_robot.app.listen.browser_window import open_browser
+from sfms_robot.app.listen.page_session import page_session
 from sfms_robot.config import load_head
 from sfms_robot.errors import MissingExtra
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.viewer.page_process import PageProcess
 
 FOLDER: Final = "sfms-demo"
 PLOT, SHEET = "run.png", "head.png"
@@ -39,15 +43,21 @@ class DemoOptions:
         )  # fmt: skip
 
 
-def demo(options: DemoOptions, panel: session.Panel | None = None) -> dict[str, Any]:
-    """Run once, record it, draw it. Blocks for the length of the run and some seconds. Raises RobotError.
+def demo(options: DemoOptions, panel: session.Panel | None = None, page: PageProcess | None = None) -> dict[str, Any]:
+    """Run once, record it, show it on a page or draw it. Raises RobotError.
 
-    Where the pictures' packages are not installed the run is as good as any; `"missing"` names the pip install.
+    Blocks for the length of the run and some seconds; with a page for as long as somebody looks at it. What visitors
+    choose there is run behind it, unrecorded. Where the pictures' packages are not installed the run is as good as any;
+    `"missing"` names the pip install.
     """
     folder = options.folder if options.folder is not None else free_folder(Path(FOLDER))
-    report = session.run(options.run(options.seed, folder), panel)
+    seen = False
+    if page is None:
+        report = session.run(options.run(options.seed, folder), panel)
+    else:
+        report, seen = _watched(options.run(options.seed, folder), panel, page)
     told = {**_summary(options, report), "folder": str(folder), "pictures": [], "missing": None, "report": report}
-    if report["exit"] == "failed" or not report["ticks"]:  # interrupted before it began: nothing to draw
+    if seen or report["exit"] == "failed" or not report["ticks"]:  # interrupted before it began: nothing to draw
         return told
     from sfms_robot.app.replay import replay_run  # scipy: not while servos move
 
@@ -57,6 +67,19 @@ def demo(options: DemoOptions, panel: session.Panel | None = None) -> dict[str, 
     except MissingExtra as error:
         told["missing"] = str(error)
     return told
+
+
+def _watched(
+    options: session.RunOptions, panel: session.Panel | None, page: PageProcess
+) -> tuple[dict[str, Any], bool]:
+    """Report of the last run behind a page, and whether anybody looked."""
+    with page_session(page, options, choices=True) as pages:
+        opened = open_browser(page.url)
+        report = pages.run(panel)
+        with suppress(KeyboardInterrupt):  # which ends the page; the head rests
+            while pages.next(stay=report["exit"] == "done" or pages.released):
+                report = pages.run(panel)
+        return report, opened or page.visited.is_set()
 
 
 def compare_seeds(options: DemoOptions, seeds: int, each: Callable[[dict[str, Any]], None]) -> dict[str, Any]:

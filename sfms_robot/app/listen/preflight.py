@@ -6,17 +6,23 @@ library only, so the answer takes as long as the interpreter does to start.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from sfms_robot.data import find
-from sfms_robot.errors import PortError
+from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.servo.discovery import access_problem
-from sfms_robot.sources.registry import check_source
+from sfms_robot.sources.registry import BROWSER, check_source, split_kind
+
+ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
+PAGE: Final = "sfms_robot.app.listen.page_scene:main"
 
 if TYPE_CHECKING:
     from sfms_robot.config import Calmness
-    from sfms_robot.listeners.process import ListenerProcess
+    from sfms_robot.listeners.engine import EngineName
+    from sfms_robot.listeners.open_feed import NamedFeed
+    from sfms_robot.viewer.page_process import PageProcess
 
 
 def check_names(
@@ -43,8 +49,47 @@ def check_names(
             raise PortError(f"{device}: {problem}")
 
 
-def begin_listening(listener: str, seed: int, calmness: Calmness | None = None) -> ListenerProcess:
-    """The listener's own process, which loads from now on. For `session.run(feed=...)`; closed by the caller."""
-    from sfms_robot.listeners.process import ListenerProcess  # numpy: not for who only mistyped a name
+def engine_named(name: str) -> EngineName:
+    """The engine of that name. Raises ConfigError."""
+    for known in ENGINES:
+        if name == known:
+            return known
+    raise ConfigError(f"--engine {name}: none of {', '.join(ENGINES)}")
 
-    return ListenerProcess(listener, seed, calmness)
+
+def begin_listening(
+    listener: str, seed: int, calmness: Calmness | None = None, zenoh: Path | None = None, engine: EngineName = "auto"
+) -> NamedFeed:
+    """The listener, which loads or is connected to from now on. For `session.run(feed=...)`; closed by the caller."""
+    from sfms_robot.listeners.open_feed import open_feed  # numpy: not for who only mistyped a name
+
+    return open_feed(listener, seed, calmness, zenoh, engine)
+
+
+def begin_page(
+    wanted: str | None,
+    certificate: Path | None = None,
+    key: Path | None = None,
+    *,
+    audio: str = "default",
+    face: str = "auto",
+    fast: bool = False,
+    dry_run: bool = False,
+) -> PageProcess | None:
+    """The page's own process, which starts from now on; None where nobody asked for one. Closed by the caller.
+
+    `wanted`: of `--view`; a person in front of the page needs one. Raises ConfigError for what cannot be.
+    """
+    if wanted is None:
+        if BROWSER not in (split_kind(audio)[0], split_kind(face)[0]):
+            if certificate is not None or key is not None:
+                raise ConfigError("--view-cert, --view-key: no page is served (--view)")
+            return None
+        wanted = "auto"
+    if fast:
+        raise ConfigError(f"--view {wanted}: a page shows what takes real time, --fast has none")
+    if dry_run:
+        raise ConfigError(f"--view {wanted}: nothing moves in a --dry-run")
+    from sfms_robot.viewer.page_process import Address, PageProcess  # only for who wants it
+
+    return PageProcess(Address.parsed(wanted, certificate, key), PAGE)

@@ -52,7 +52,8 @@ e15614560ba7b0c1121e3d82c8a6e29c57cff5bd, Apache-2.0. Blinks, brows and sizes: m
 
 
 def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> dict[str, Any]:
-    """Write `out` (if given) and return the figures. Raises ConfigError.
+    """Write `out` (if given) and return the figures. Raises ConfigError, also for tables in which people never do what
+    is to be learned: without gaze, say, or without laughs. Without people of validation nothing is ranked.
 
     `all_series`: taught on everybody, those of validation and test too, so there is nothing to rank: for comparison
     with what a study learned from the same meetings, by its recipe (89 inputs of nods, ridge 10), never for use.
@@ -64,6 +65,9 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
     parts = {"train": people if all_series else split["train"], "validation": [] if all_series else split["validation"]}
     with _progress(len(parts["train"]) + len(parts["validation"]) + len(LEARNED)) as step:
         taught, judged = ([_one(person, seed, step) for person in parts[name]] for name in ("train", "validation"))
+        for kind in LEARNED:
+            if not any(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons):
+                raise ConfigError(f"{data}: in {len(taught)} people to learn from there is no {kind}: {FROM[kind]}")
         recipe = ({**GROUPS, "nod": NOD}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
         hazards = {kind: _taught(taught, kind, *recipe, seed, step) for kind in LEARNED}
         motions = load_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]

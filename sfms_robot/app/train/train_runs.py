@@ -6,7 +6,7 @@ import importlib.util
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.sampling_calibration import calibrate, rounds
 from sfms_robot.learning.arig.trainer import train_arig
 from sfms_robot.learning.job import Run
+from sfms_robot.learning.process_group import joined, local_rank
 from sfms_robot.learning.resume import checkpoint_file
 from sfms_robot.learning.sfms import predictor_trainer as listener
 from sfms_robot.learning.sfms import tokenizer_trainer as tokenizer
@@ -36,7 +37,10 @@ class TrainOptions:
     """What the command line says. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
 
     `order` is that of the channels in the data, if not its layout's own. `overwrite`: what an earlier training left in
-    `out` may be lost.
+    `out` may be lost. `accumulate` and `scratch`: of `learning.job.Run`.
+
+    Several processes train together where `torchrun` starts them; those but the first return no figures. What torchrun
+    starts again after one of them died goes on from the checkpoint.
     """
 
     file: Path
@@ -49,6 +53,8 @@ class TrainOptions:
     tensorboard: bool | None = None
     order: Order | None = None
     overwrite: bool = False
+    accumulate: int | None = None
+    scratch: Path | None = None
 
 
 def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
@@ -56,10 +62,11 @@ def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
     settings = train_settings(options, "tokenizer")
     if isinstance(settings, config.ArigTraining):
         raise ConfigError(f"{options.file}: listener.kind = 'arig' has no tokenizer; `train listener` is all of it")
-    _spare(options, tokenizer.WEIGHTS, "tokenizer")
+    began_s = time.monotonic()
     with run_of(options) as run:
-        began_s = time.monotonic()
-        return _timed(tokenizer.train_tokenizer(settings, options.data, options.out, run, options.order), began_s)
+        run = _begun(run, options, tokenizer.WEIGHTS, "tokenizer")
+        figures = tokenizer.train_tokenizer(settings, options.data, options.out, run, options.order)
+    return _timed(figures, began_s) if run.group.first else {}
 
 
 def train_listener(options: TrainOptions) -> dict[str, Any]:
@@ -67,13 +74,18 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
     settings = train_settings(options, "predictor")
     if isinstance(settings, config.ArigTraining) and options.order is not None:
         raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
-    _spare(options, checkpoint.WEIGHTS, "arig" if isinstance(settings, config.ArigTraining) else "listener")
+    arig = isinstance(settings, config.ArigTraining)
     began_s = time.monotonic()
     with run_of(options) as run:
+        run = _begun(run, options, checkpoint.WEIGHTS, "arig" if arig else "listener")
         if isinstance(settings, config.ArigTraining):
-            return _timed(train_arig(settings, options.data, options.out, run), began_s)
-        figures = listener.train_listener(settings, options.data, options.out, run, options.order)
-    _calibrate(settings, options)
+            figures = train_arig(settings, options.data, options.out, run)
+        else:
+            figures = listener.train_listener(settings, options.data, options.out, run, options.order)
+    if not run.group.first:
+        return {}
+    if isinstance(settings, config.Training):
+        _calibrate(settings, options)
     return _timed(figures, began_s)
 
 
@@ -83,13 +95,20 @@ def _calibrate(settings: config.Training, options: TrainOptions) -> None:
         calibrate(settings, options.data, options.out, options.order, partial(progress.advance, task))
 
 
-def _spare(options: TrainOptions, weights: str, job: str) -> None:
-    """Raise ConfigError where this training would be the end of an earlier one."""
+def _begun(run: Run, options: TrainOptions, weights: str, job: str) -> Run:
+    """The run as it begins: from the checkpoint, where it was started again. Raises ConfigError where it would be the
+    end of an earlier training.
+    """
+    if run.group.restarts:
+        return replace(run, resume=checkpoint_file(options.out, job).exists())
     if options.resume or options.overwrite:
-        return
+        return run
+    run.group.wait()  # nobody has written anything yet
     for file in (options.out / weights, checkpoint_file(options.out, job)):
         if file.exists():
             raise ConfigError(f"{file} is of an earlier training: --resume goes on with it, --overwrite begins anew")
+    run.group.wait()
+    return run
 
 
 def device_of(name: str) -> torch.device:
@@ -116,15 +135,19 @@ def train_settings(options: TrainOptions, phase: str = "training") -> config.Tra
 
 @contextmanager
 def run_of(options: TrainOptions) -> Iterator[Run]:
-    """How the command line asks for it to be run, with a progress bar."""
+    """How the command line asks for it to be run, with a progress bar where its figures are."""
     device = device_of(options.device)
     with ExitStack() as stack:
+        if device.type == "cuda":
+            device = torch.device("cuda", local_rank())
+        group = stack.enter_context(joined(device))
         watches: list[Watch] = []
         installed = importlib.util.find_spec("tensorboard") is not None
-        if options.tensorboard or (options.tensorboard is None and installed):
+        if group.first and (options.tensorboard or (options.tensorboard is None and installed)):
             watches.append(stack.enter_context(tensorboard(options.out / "tensorboard")))
-        watches.append(stack.enter_context(progress_bar()))
-        yield Run(options.resume, device, together(watches))
+        if group.first:
+            watches.append(stack.enter_context(progress_bar()))
+        yield Run(options.resume, device, together(watches), group, options.accumulate, options.scratch)
 
 
 def _timed(figures: dict[str, Any], began_s: float) -> dict[str, Any]:

@@ -26,12 +26,12 @@ from sfms_robot.frames import (
     Floats,
     ListenerEvent,
 )
+from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.events import runs
 
 NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay below 1800 deg/s^2
 _FADE: Final = FRAME_HZ
-_SMILE_S: Final = (2.0, 0.4, 1.0, 6.0)  # how long one is seen: median, deviation of its logarithm, least, most
 _CORNERS: Final = [SHAPE["mouthSmileLeft"], SHAPE["mouthSmileRight"]]
 _LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
 _MIRROR: Final = [
@@ -58,7 +58,8 @@ class Score:
 
     Attributes:
         nods, shakes, tilts, laughs, talk, backchannels, mm_hms: the listener's own.
-        gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away".
+        gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away". How
+            far and to which side goes by `signals.event_sizes`, since no robot sits at their table.
         shared_laughs: laughs of the others.
         asked, ends: instants at which the others asked something, and at which their phrases ended.
         mouth: (frames, 52) that belongs to his own recorded voice, or None: a recorded mouth that fits none.
@@ -273,15 +274,17 @@ class NodManner:
 
 def nod_habit(rng: np.random.Generator) -> NodHabit:
     """A person's: about 5 degrees, 1.8 to 3 swings a second."""
-    return NodHabit(float(np.deg2rad(rng.normal(5.0, 1.0))), float(rng.uniform(1.8, 3.0)))
+    usual = sizes.NOD_DEG[1]
+    size = np.deg2rad(rng.normal(usual, usual * sizes.HABIT_SPREAD))
+    return NodHabit(float(size), float(rng.uniform(*sizes.SWINGS_HZ)))
 
 
 def nod_manner(habit: NodHabit, length_s: float, rng: np.random.Generator) -> NodManner:
     """How this person makes a nod that is to last about so long: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12 degrees."""
-    swings = int(np.clip(round(length_s * habit.pace_hz), 1, 4))
-    each_s = float(np.clip(length_s / swings, 0.3, 0.66))
-    size = np.clip(habit.size_rad * np.exp(rng.normal(0, 0.35)), np.deg2rad(2.2), np.deg2rad(12))
-    return NodManner(float(size), swings, swings * each_s, float(rng.uniform(0.65, 0.95)))
+    swings, lasts_s = sizes.swings(length_s, habit.pace_hz)
+    least, _, most = np.deg2rad(sizes.NOD_DEG)
+    size = np.clip(habit.size_rad * np.exp(rng.normal(0, sizes.NOD_SPREAD)), least, most)
+    return NodManner(float(size), swings, lasts_s, float(rng.uniform(0.65, 0.95)))
 
 
 def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> Floats:
@@ -313,11 +316,11 @@ def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Gener
     habit = nod_habit(rng)
     for start, end in score.shakes.tolist():
         manner = nod_manner(habit, end - start, rng)
-        curve = 0.8 * nod_curve(manner, _pick(motions.shakes, rng), start, len(pose))
+        curve = sizes.SHAKE * nod_curve(manner, _pick(motions.shakes, rng), start, len(pose))
         pose[:, 2] += rng.choice([-1, 1]) * curve
         events.append(ListenerEvent("shake", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
     for start, end in score.tilts:
-        curve = np.deg2rad(rng.uniform(2, 6)) * edges(max(12, int((end - start) * FRAME_HZ) + 12), 12)
+        curve = np.deg2rad(rng.uniform(*sizes.TILT_DEG)) * edges(max(12, int((end - start) * FRAME_HZ) + 12), 12)
         pose[:, 0] += rng.choice([-1, 1]) * _placed(curve, start, len(pose))
         events.append(_event("tilt", start, curve, curve.max()))
     return events
@@ -336,18 +339,13 @@ def _bend(shape: Floats, length_s: float) -> float:
 
 def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[ListenerEvent]]:
     """Where he looks, (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead; and his gaze shifts."""
-    seats = np.deg2rad(rng.uniform(16, 28)) * np.array([-1, 1, 0.7, -0.7, 1])
+    seats: dict[str, tuple[float, float]] = {}
     out = np.zeros((score.frames, 2), np.float32)
     for start, end, where in score.gaze:
-        kind = where.split()[0]
-        if kind == "side":
-            target = (seats[ord(where[-1]) % len(seats)], 0.0)
-        elif kind == "down":
-            target = (np.deg2rad(rng.normal(0, 5)), np.deg2rad(rng.uniform(11, 18)))
-        elif kind == "screen":
-            target = (seats[0] * 1.2, np.deg2rad(-3))
-        else:
-            target = (np.deg2rad(rng.normal(0, 12)), np.deg2rad(rng.normal(0, 6)))
+        far, side, up = rng.random(3).tolist()
+        target = sizes.aside(sizes.aside_rad(far), side, up)
+        if where.startswith("side"):  # the same person sits where he sat
+            target = seats.setdefault(where, target)
         out[max(0, _first(start)) : max(0, _first(end))] = target
     return out, _shifts(out)
 
@@ -401,16 +399,19 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
 
     A smile that would begin during another one is left out.
     """
-    wanted = [("laugh", a, b - a + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7) for a, b in score.laughs]
+    wanted = [
+        ("laugh", a, b - a + rng.uniform(*sizes.LAUGH_LONGER_S), rng.uniform(*sizes.LAUGH), 0.7)
+        for a, b in score.laughs
+    ]
     wanted += [
-        ("smile", a, max(b - a, _smile_s(rng)), rng.uniform(0.35, 0.7), 0.2)
+        ("smile", a, max(b - a, smile_s(rng)), rng.uniform(0.35, 0.7), 0.2)
         for a, b in score.shared_laughs
         if rng.random() < 0.6
     ]
     wanted += [
-        ("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3
+        ("smile", a, smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3
     ]
-    wanted += [("smile", a, _smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.nods if rng.random() < 0.12]
+    wanted += [("smile", a, smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.nods if rng.random() < 0.12]
     events: list[ListenerEvent] = []
     for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):
         if any(event.start_s - seen_s < start < event.end_s for event in events):
@@ -420,8 +421,9 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
     return events
 
 
-def _smile_s(rng: np.random.Generator) -> float:
-    median_s, deviation, least_s, most_s = _SMILE_S
+def smile_s(rng: np.random.Generator) -> float:
+    """How long a smile that answers something is seen."""
+    median_s, deviation, least_s, most_s = sizes.SMILE_S
     return float(np.clip(median_s * np.exp(rng.normal(0, deviation)), least_s, most_s))
 
 
@@ -457,8 +459,8 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.
     for instant in sorted(at):
         if events and instant - 0.1 < events[-1].end_s:
             continue
-        curve, size = _pick(motions.brows, rng), rng.uniform(0.2, 0.5)
-        length = int(len(curve) * rng.uniform(0.7, 1.3))
+        curve, size = _pick(motions.brows, rng), rng.uniform(*sizes.BROW_RAISE)
+        length = int(len(curve) * rng.uniform(*sizes.BROW_STRETCH))
         curve = (size * stretched(curve, length) * edges(length, 6)[:, None]).astype(np.float32)
         np.copyto(shapes, _over(shapes, _placed(curve, instant - 0.1, len(shapes))))
         events.append(_event("brow_raise", instant - 0.1, curve, size))
@@ -475,7 +477,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
     short = {float(start) for start, _ in np.concatenate([score.backchannels, score.mm_hms])}
     for start, end in score.talk if score.mouth is None else ():
         length = max(4, int((end - start) * FRAME_HZ))
-        gain = rng.uniform(0.25, 0.45) if any(abs(start - other) < 0.3 for other in short) else rng.uniform(0.6, 0.9)
+        gain = rng.uniform(*sizes.MM_HM) if any(abs(start - other) < 0.3 for other in short) else rng.uniform(0.6, 0.9)
         offset = int(rng.integers(max(1, len(source) - length)))
         piece = source[offset : offset + length]
         said = said + _placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
@@ -503,7 +505,7 @@ def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Gener
         if events and instant - events[-1].start_s < 0.5:
             continue
         curve = _pick(motions.blinks, rng)
-        size = rng.uniform(0.55, 0.8) if rng.random() < 0.15 else rng.uniform(0.85, 1.0)
+        size = rng.uniform(*sizes.BLINK[0 if rng.random() < sizes.SLIGHT_BLINKS else 1])
         curve = (size * curve).astype(np.float32)
         np.maximum(shapes, _placed(curve, instant, len(shapes)), out=shapes)
         events.append(_event("blink", instant, curve, curve[:, _LIDS].mean(axis=1).max()))

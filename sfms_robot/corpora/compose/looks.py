@@ -1,8 +1,9 @@
 """Where listeners look: annotated looks away from whoever has the floor, and how long people look, learned from them.
 
 Across a table with papers people look away a lot more than in front of one face, and watch slides for minutes: a share
-of the looks is kept, and none lasts longer than a few seconds. What is drawn where nobody annotated gaze goes by these
-kept ones, at somebody and away in turns, each as long as some annotated one was. That they do not hang on what is
+of the looks is kept, and none lasts longer than a look aside by lot of those who had no table between them
+(`signals.event_sizes`), which is what a listener's own events go by. What is drawn where nobody annotated gaze goes by
+these kept ones, at somebody and away in turns, each as long as some annotated one was. That they do not hang on what is
 heard is ours.
 """
 
@@ -15,11 +16,11 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.corpora.compose.ami import Person
+from sfms_robot.signals.event_sizes import aside_s
 
 Look = tuple[float, float, str]  # start, end, where (`acting.Score.gaze`)
 
 _KEPT: Final = 0.4
-_LONGEST_S: Final = (1.5, 4.0)
 _NEAR_S: Final = 300.0  # no look is longer
 _PLACES: Final = {"table": "down", "slide-screen": "screen", "whiteboard": "screen"}
 
@@ -70,5 +71,5 @@ def away(person: Person, start_s: float, end_s: float, rng: np.random.Generator)
             if ((spoke[:, 0] < end + 1) & (spoke[:, 1] > start - 1)).any():
                 continue  # he speaks during the look, or is about to, or just has
         if rng.random() < _KEPT:
-            found.append((start, min(end, start + float(rng.uniform(*_LONGEST_S))), where))
+            found.append((start, min(end, start + aside_s(rng.random())), where))
     return found

@@ -51,7 +51,7 @@ ABLATIONS: Final[Mapping[int, Mapping[str, Mapping[str, Any]]]] = {
         "w/o visual modality in IBU": {"visual": False},
     },
     4: {
-        "w/o continuous AR modeling": {"discrete": True},
+        "w/o continuous AR modeling": {"discrete": True, "draws": "motion"},
         "w/o bidirectional-integrated learning": {"interaction": "linear"},
     },
 }

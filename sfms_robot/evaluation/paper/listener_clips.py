@@ -25,9 +25,13 @@ TRAIN_DYADS: Final = 200  # that the heuristics take their means from
 
 
 def shared_space(listeners: Mapping[str, Listener]) -> MotionSpace:
-    """The motion space of all listeners. Raises ConfigError when there are several."""
+    """The motion space of all listeners, of one that decides events that of its model of motion.
+
+    Raises ConfigError when there are several.
+    """
     spaces = {
-        name: getattr(listener, "space", MotionSpace("arkit58", np.zeros(58))) for name, listener in listeners.items()
+        name: getattr(getattr(listener, "how", listener), "space", MotionSpace("arkit58", np.zeros(58)))
+        for name, listener in listeners.items()
     }
     if len({space.name for space in spaces.values()}) > 1:
         named = ", ".join(f"{name}: {space.name}" for name, space in spaces.items())

@@ -3,7 +3,8 @@
 small    width 64, about a fifth of a million parameters, one to two minutes each on one core
 paper    about the parameters of table IV; for a GPU
 
-Names say what is in them: sparse-all-k10 has a keyframe set for each channel and 10 keyframes a window.
+Names say what is in them: sparse-all-k10 has a keyframe set for each channel and 10 keyframes a window; as-written ones
+have the paper's scores, learned by Algorithm 1, and its inpainter, which is not added to straight lines.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from sfms_robot.config import parse
 SizeName = Literal["small", "paper"]
 
 KEYFRAMES: Final = (3, 7, 10)  # of table III
+AS_WRITTEN: Final = "as-written"
 FSQ_256: Final = (4, 4, 4, 4)  # of all channels
 FSQ_256_SCALAR: Final = (256,)  # of one: four coarse digits of one number are harder to learn, and end twice as far off
 FSQ_1024: Final = (8, 5, 5, 5)
@@ -57,6 +59,7 @@ def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, con
             "tokenizer_layers": chosen.layers,
             "scores": {"width": chosen.score_width},
             "quantizer": more.pop("quantizer", "fsq"),
+            "inpainter": more.pop("inpainter", "residual"),
         }
         found[name] = _recipe(name, listener, training | more)
 
@@ -76,6 +79,12 @@ def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, con
     baseline("l2l-vq-256", "grouped", "vq", (256,))  # table IV
     baseline("dense-fsq-1024", "dense", "fsq", FSQ_1024)
     sparse("sparse-all-k10-vq-256", "all", FSQ_256_SCALAR, 10, quantizer="vq")
+    for k in KEYFRAMES:
+        sparse(f"sparse-all-k{k}-{AS_WRITTEN}", "all", FSQ_256_SCALAR, k, "learned_paper", inpainter="paper")
+    sparse(
+        f"sparse-all-k10-vq-256-{AS_WRITTEN}", "all", FSQ_256_SCALAR, 10, "learned_paper",
+        quantizer="vq", inpainter="paper",
+    )  # fmt: skip
     return found
 
 

@@ -16,7 +16,6 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
 from sfms_robot.learning.corpus import first_frames, windows
-from sfms_robot.listeners.sfms.placement import Strategy
 
 ANGLES: Final = slice(CHANNEL_INDEX["roll"], CHANNEL_INDEX["yaw"] + 1)
 
@@ -73,10 +72,10 @@ class Score:
         return {take: float(self.of_windows[names == take].mean()) for take in dict.fromkeys(self.takes)}
 
 
-def score(model: TableModel, seen: Windows, strategy: Strategy | None = None, k: int | None = None) -> Score:
-    """Score of a tokenizer; another placement or number of keyframes may be asked for."""
+def score(model: TableModel, seen: Windows, restored: Tensor | None = None) -> Score:
+    """Score of a tokenizer, of what it `restored` (W, T, 58), standardised, where that is at hand."""
     motion = model.standardise(seen.motion)
-    wrong = (model.restore(motion, strategy, k) - motion).double()
+    wrong = ((model.restore(motion) if restored is None else restored) - motion).double()
     plain = (wrong * model.motion_std).square().mean((0, 1))
     return Score(
         takes=seen.takes,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -16,15 +16,13 @@ from sfms_robot.evaluation.baselines.dense import DenseTokenizer, baseline_loss
 from sfms_robot.evaluation.paper.compared_tokenizer import TableModel, save
 from sfms_robot.evaluation.paper.score_history import ScoreHistory
 from sfms_robot.learning.corpus import first_frames, windows
-from sfms_robot.learning.job import Job, Run
+from sfms_robot.learning.job import Job, LossOf, Run
 from sfms_robot.learning.resume import checkpoint_file
 from sfms_robot.learning.sfms.tokenizer_trainer import amplified, loss_of_steps, optimizers_of
 from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners.sfms.model import Tokenizer
 
 GAIN: Final = 0.4  # of windows while learning (`amplified`): six minutes of faces are few
-
-LossOf = Callable[[int, torch.Generator], Tensor]
 
 
 def train(
@@ -55,10 +53,10 @@ def job(name: str, model: TableModel, takes: Sequence[Take], history: ScoreHisto
     lengths = [len(take.motion) for take in takes]
     loss_of = _loss_of(model, model.standardise(motion.to(model.motion_mean.device)), lengths)
 
-    def noted(step: int, generator: torch.Generator) -> Tensor:
+    def noted(step: int, generator: torch.Generator, batch: int) -> Tensor:
         if history is not None:
             history.take(step, phase.steps)
-        return loss_of(step, generator)
+        return loss_of(step, generator, batch)
 
     return Job(
         name=name,
@@ -89,8 +87,8 @@ def _loss_of(model: TableModel, motion: Tensor, lengths: Sequence[int]) -> LossO
         return loss_of_steps(tokenizer, motion, lengths, phase, GAIN)
     starts = first_frames(lengths, model.window)
 
-    def everywhere(step: int, generator: torch.Generator) -> Tensor:
-        chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
+    def everywhere(step: int, generator: torch.Generator, samples: int) -> Tensor:
+        chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
         batch = amplified(windows(motion, chosen, model.window), GAIN, generator)
         return baseline_loss(tokenizer, batch, phase.commitment, generator)
 

@@ -21,11 +21,13 @@ from sfms_robot.corpora.formats import open_dataset
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning import corpus as dyads
-from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales, without_gaze
+from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, without_gaze
+from sfms_robot.learning.staged_frames import Scratch
 from sfms_robot.listeners.arig import audio_frontend
-from sfms_robot.listeners.arig.csu import FEEDBACK, LISTENING, NODDING, QUANTILES, StateUnderstanding, with_feedback
+from sfms_robot.listeners.arig.csu import StateUnderstanding
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.sojourns import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
 from sfms_robot.signals.control import control_track
@@ -67,10 +69,15 @@ def open_scenes(data: Path, split: str) -> dict[str, Dataset]:
 
 
 def gather(
-    scenes: Mapping[str, Sequence[Conversation]], window: int, space: MotionSpace, width: int, events: bool = False
+    scenes: Mapping[str, Sequence[Conversation]],
+    window: int,
+    space: MotionSpace,
+    width: int,
+    events: bool = False,
+    scratch: Scratch | None = None,
 ) -> ArigCorpus:
     """`corpus.gather` in one motion space, for a listener with events or without; `width` of the sound features."""
-    return dyads.gather(scenes, window, partial(frames_of, space=space, width=width, events=events))
+    return dyads.gather(scenes, window, partial(frames_of, space=space, width=width, events=events), scratch)
 
 
 def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
@@ -93,7 +100,8 @@ def frames_of(dyad: Conversation, space: MotionSpace, width: int, events: bool =
     agent, agent_voiced, says = _audio_features(dyad, "agent", width)
     states = torch.from_numpy((np.full(frames, UNKNOWN) if dyad.states is None else dyad.states).astype(np.int64))
     if events:
-        states = with_feedback(torch.where((states == FEEDBACK) & ~agent_voiced, LISTENING, states), control)
+        quiet = torch.where((states == FEEDBACK) & ~agent_voiced, LISTENING, states)
+        states = torch.from_numpy(with_feedback(quiet.numpy(), control.numpy()))
     return LabelledDyad(
         user_sound=user,
         user_heard=torch.full((frames,), heard),
@@ -191,13 +199,13 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) ->
     of_dyads = torch.split(standard, list(corpus.lengths))
     last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(-1), slice(1, None)))
     _fit_steps(model, last, now)
-    if isinstance(model.head, Denoiser):
+    if isinstance(model.head, Denoiser) and model.settings.diffusion.clamp:
         drawn = model.target(now, last)
         model.head.low.copy_(drawn.amin(0))
         model.head.high.copy_(drawn.amax(0))
     if model.settings.events and model.states is not None:
         _fit_states(model.states, corpus)
-    rows = torch.cat([frames.user_sound[frames.user_heard], frames.agent_sound[frames.agent_heard]])
+    rows = some_sound((frames.user_sound, frames.user_heard), (frames.agent_sound, frames.agent_heard))
     if len(rows):
         mean, spread = sound_scales(rows)
         model.sound_mean.copy_(mean)

@@ -40,14 +40,15 @@ def train_arig(
     student = Student(ArigModel(listener))
     space, width = MotionSpace.of(listener), student.model.sound_width
     corpus, held_out = (
-        gather(open_scenes(data, split), phase.window_frames, space, width, listener.events)
+        gather(open_scenes(data, split), phase.window_frames, space, width, listener.events, run.staging(split))
         for split in ("train", "validation")
     )
     fit_scales(student.model, corpus, listener.channels)
     job = arig_job(settings, student, corpus, held_out, run.device)
     outcome = fit(job, out, run)
-    checkpoint.save_config(out, listener)
-    checkpoint.save_weights(out / checkpoint.WEIGHTS, student.model.cpu(), half=True)
+    if run.group.first:
+        checkpoint.save_config(out, listener)
+        checkpoint.save_weights(out / checkpoint.WEIGHTS, student.model.cpu(), half=True)
     parts = held_out_parts(student.to(run.device), held_out.to(run.device), phase)
     return {
         **asdict(outcome),
@@ -69,8 +70,8 @@ def arig_job(
     student.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
 
-    def loss_of(step: int, generator: torch.Generator) -> Tensor:
-        chosen = draw(starts, weights_of(phase.stage(step), starts), phase.batch, generator)
+    def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
+        chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator)
         dyad = cut(corpus, chosen.to(device), phase.window_frames)
         told, truth = augment(dyad, student.model, phase, generator)
         return _loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
@@ -119,7 +120,7 @@ def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase
     chosen = draw(starts, weights_of(phase.stages[-1], starts), HELD_OUT_WINDOWS, generator)
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
-        dyad = cut(corpus, some.to(corpus.frames.states.device), phase.window_frames)
+        dyad = cut(corpus, some.to(student.readout.weight.device), phase.window_frames)
         found.append(_loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
     mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
     return Parts(**mean)

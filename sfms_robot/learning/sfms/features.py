@@ -16,11 +16,14 @@ from sfms_robot.corpora.clips import Dyad, at_rate
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.learning import corpus as dyads
-from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, sound_scales, windows, without_gaze
+from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, windows, without_gaze
 from sfms_robot.learning.sfms.slow_motion import fit_sway, slow_part
+from sfms_robot.learning.staged_frames import Scratch
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.model import SfmsModel, head_channels
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
+from sfms_robot.listeners.sfms.channels import head_channels
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
@@ -62,6 +65,7 @@ def gather(
     space: MotionSpace,
     frontend: AudioFrontend | None = None,
     settings: config.Sfms | None = None,
+    scratch: Scratch | None = None,
 ) -> SfmsCorpus:
     """`corpus.gather` in one motion space.
 
@@ -69,7 +73,7 @@ def gather(
     `settings`: of a listener that may be told of events; None: one that is not.
     """
     one = partial(frames_of, space=space, frontend=frontend, settings=settings)
-    return dyads.gather({"listening": listened}, window, one)
+    return dyads.gather({"listening": listened}, window, one, scratch)
 
 
 def frames_of(
@@ -160,7 +164,7 @@ def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) ->
 
 def fit_sound_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
     """Set the means and deviations of the sound; without any they stay."""
-    rows = corpus.frames.sound[corpus.frames.heard]
+    rows = some_sound((corpus.frames.sound, corpus.frames.heard))
     if len(rows):
         mean, spread = sound_scales(rows)
         model.sound_mean.copy_(mean)
@@ -182,11 +186,11 @@ def context(
     `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms.
     `held` (N, G): what stands at a window's first frame, where the last keyframe is held on to (`tokens.held_tokens`).
     """
-    frames = corpus.frames
+    frames, device = corpus.frames, model.motion_mean.device
     index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it
     heard = frames.heard[index]
     heard[:, 0] &= ~corpus.begins[starts]
-    sound = frames.sound[index].float()
+    heard, sound = heard.to(device), frames.sound[index].to(device).float()
     if louder is not None:
         sound = sound + louder.view(-1, 1, 1, 1)
     sound = torch.where(heard[..., None, None], model.standardise_sound(sound), 0.0)
@@ -195,11 +199,11 @@ def context(
         own[:, 0] = held[starts]
     undecided = own.new_full((len(own), future, own.shape[2]), UNDECIDED)
     return Context(
-        face=model.standardise(windows(frames.face, starts, past)),
-        face_known=windows(frames.face_known, starts, past),
+        face=model.standardise(windows(frames.face, starts, past).to(device)),
+        face_known=windows(frames.face_known, starts, past).to(device),
         voice=model.predictor.speaker.listen(sound.flatten(1, 2)),
         heard=heard[:, 1:],
-        phase=windows(frames.phase, starts, past),
+        phase=windows(frames.phase, starts, past).to(device),
         tokens=torch.cat([own, undecided], dim=1),
-        control=windows(frames.control, starts, past + future),
+        control=windows(frames.control, starts, past + future).to(device),
     )

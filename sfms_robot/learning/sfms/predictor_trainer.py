@@ -27,10 +27,11 @@ from sfms_robot.learning.sfms.tokens import held_tokens, keyframe_tokens, tokeni
 from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
+from sfms_robot.listeners.sfms.networks import neutral_tokens
+from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
-from sfms_robot.listeners.sfms.stream import neutral_tokens
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.mel import LN_PER_DB
@@ -57,7 +58,10 @@ def train_listener(
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
     frontend = AudioFrontend.of(listener)
-    corpus, held_out = (gather(some, listener.window_frames, space, frontend, listener) for some in (dyads, unseen))
+    corpus, held_out = (
+        gather(some, listener.window_frames, space, frontend, listener, run.staging(split))
+        for some, split in ((dyads, "train"), (unseen, "validation"))
+    )
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
@@ -65,8 +69,9 @@ def train_listener(
     job = listener_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
-    checkpoint.save_config(out, corrected(settings))
-    checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
+    if run.group.first:
+        checkpoint.save_config(out, corrected(settings))
+        checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
     scores = keyframe_scores(model.cpu(), held_out, listener)
     return {**asdict(outcome), "held_out_loss": last, **scores}
 
@@ -85,21 +90,19 @@ def listener_job(
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
     held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
-    motion = model.standardise(corpus.frames.motion)
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
 
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
 
-    def loss_of(step: int, generator: torch.Generator) -> Tensor:
-        chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
+    def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
+        chosen = starts[torch.randint(len(starts), (batch,), generator=generator)]
         if phase.event_windows and len(eventful):
-            busy = torch.rand(phase.batch, generator=generator) < phase.event_windows
-            chosen = torch.where(
-                busy, eventful[torch.randint(len(eventful), (phase.batch,), generator=generator)], chosen
-            )
+            busy = torch.rand(batch, generator=generator) < phase.event_windows
+            chosen = torch.where(busy, eventful[torch.randint(len(eventful), (batch,), generator=generator)], chosen)
         gain = None
         if listener.audio == "mel":  # microphones differ
-            gain = (torch.rand(phase.batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
+            gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
             gain = gain.to(device)
         seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
         seen = augment(seen, levels, neutral, phase, generator)
@@ -148,7 +151,9 @@ def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms
 
 
 def corrected(settings: config.Training) -> config.Sfms:
-    """The listener with the weight of class 0 in (14) taken out of its probability again: p' ~ w p."""
+    """The listener with the weight of class 0 in (14) taken out of its probability again: p' ~ w p, if it is to be."""
+    if not settings.predictor.undo_weight:
+        return settings.listener
     bias = -math.log(settings.predictor.transition_weight)
     groups = {
         name: group.model_copy(update={"transition_bias": round(group.transition_bias + bias, 3)})
@@ -167,11 +172,13 @@ def _loss(
 ) -> Tensor:
     """Cross-entropy (14) and soft-DTW on the future behind a random number of frames that are drawn already.
 
-    None of them drawn is the paper's training; a stream of hop 4 plans with 4 of them drawn. `missing`: tokens
+    None of them drawn is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left
+    of the one before. A stream of hop 4 plans with 4 of them drawn. `missing`: tokens
     (B, P + H, G) and the first frame to draw (B,) -> those that are seen and learned instead.
     """
     training, (b, h, _) = settings.predictor, target.shape
-    count = torch.randint(h, (b, 1), generator=generator).to(target.device)
+    most = h if settings.listener.hop_frames < h else 1
+    count = torch.randint(most, (b, 1), generator=generator).to(target.device)
     drawn = torch.arange(h, device=target.device) < count  # (B, H)
     past = seen.tokens[:, :-h]
     meant = missing(torch.cat([past, target], dim=1), past.shape[1] + count[:, 0])

@@ -14,9 +14,10 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.corpora.collection import Order
 from sfms_robot.corpora.formats import open_for
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.learning.corpus import first_frames, windows
-from sfms_robot.learning.job import Job, Run
+from sfms_robot.learning.job import Job, LossOf, Run
 from sfms_robot.learning.sfms.features import SfmsCorpus, fit_scales, gather
 from sfms_robot.learning.sfms.imitation import imitation, lively
 from sfms_robot.learning.sfms.losses import masking, reconstruction
@@ -51,6 +52,8 @@ def train_tokenizer(
     `run.resume` goes on; the weights are written when the run is finished.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
+    if listener.quantizer == "vq" and run.group.size * (run.accumulate or 1) > 1:
+        raise ConfigError("listener.quantizer = 'vq' moves its codes beside gradients: one process, one piece a step")
     dyads = open_for(space.name, data, "train", order)
     if dyads.fps != FRAME_HZ:
         log.warning(
@@ -58,14 +61,18 @@ def train_tokenizer(
             data, dyads.fps, FRAME_HZ,
         )  # fmt: skip
     unseen = open_for(space.name, data, "validation", order)
-    corpus, held_out = (gather(some, listener.window_frames, space, None, listener) for some in (dyads, unseen))
+    corpus, held_out = (
+        gather(some, listener.window_frames, space, None, listener, run.staging(split))
+        for some, split in ((dyads, "train"), (unseen, "validation"))
+    )
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     fit_scales(model, corpus, listener.channels)
     job = tokenizer_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
-    checkpoint.save_config(out, listener)
-    checkpoint.save_weights(out / WEIGHTS, model)
+    if run.group.first:
+        checkpoint.save_config(out, listener)
+        checkpoint.save_weights(out / WEIGHTS, model)
     return {"mse": reconstruction_error(model, held_out.to(run.device)), **asdict(outcome)}
 
 
@@ -77,7 +84,7 @@ def tokenizer_job(
     fingerprint = corpus.fingerprint()
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
-    motion = model.standardise(corpus.frames.motion)
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     return Job(
         name="tokenizer",
         model=model,
@@ -117,7 +124,7 @@ def amplified(batch: Tensor, gain: float, generator: torch.Generator) -> Tensor:
 
 def loss_of_steps(
     tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], phase: config.TokenizerTraining, gain: float = 0.0
-) -> Callable[[int, torch.Generator], Tensor]:
+) -> LossOf:
     """Loss of one step on motion (N, C), standardised, of dyads of those lengths, by how keyframes are placed.
 
     `gain`: of `amplified` windows.
@@ -125,8 +132,8 @@ def loss_of_steps(
     if isinstance(tokenizer.score, ScoreNetwork):
         starts = first_frames(lengths, tokenizer.window)
 
-        def jointly(step: int, generator: torch.Generator) -> Tensor:
-            chosen = starts[torch.randint(len(starts), (phase.batch,), generator=generator)]
+        def jointly(step: int, generator: torch.Generator, samples: int) -> Tensor:
+            chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
             hot, cold = phase.temperature
             temperature = hot * (cold / hot) ** (step / max(1, phase.steps - 1))
             batch = amplified(windows(motion, chosen, tokenizer.window), gain, generator)
@@ -136,8 +143,8 @@ def loss_of_steps(
     draw = batches(tokenizer, motion, lengths, phase.steps * phase.batch)
     score, most = tokenizer.score, max(tokenizer.keyframes)
 
-    def beside(step: int, generator: torch.Generator) -> Tensor:
-        batch, mask = draw(phase.batch, generator)
+    def beside(step: int, generator: torch.Generator, samples: int) -> Tensor:
+        batch, mask = draw(samples, generator)
         batch = amplified(batch, gain, generator)
         loss = tokenizer_loss(tokenizer, batch, mask, phase, generator)[0]
         if score is None:
@@ -194,7 +201,11 @@ def learned_loss(
 def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Consecutive windows (W, T, C), standardised."""
     window = model.tokenizer.window
-    return windows(model.standardise(corpus.frames.motion), first_frames(corpus.lengths, window, window), window)
+    return windows(
+        model.standardise(corpus.frames.motion.to(model.motion_mean.device)),
+        first_frames(corpus.lengths, window, window),
+        window,
+    )
 
 
 def _held_out(model: SfmsModel, corpus: SfmsCorpus) -> Callable[[], float]:

@@ -44,7 +44,7 @@ def _stretches(frames: int, size: int, least: int) -> list[int]:
 @torch.no_grad()
 def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Tokens (N, G) of every listener in the corpus."""
-    motion = model.standardise(corpus.frames.motion)
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     mask = place_all(model.tokenizer, motion, corpus.lengths)
     return torch.where(mask > 0.5, keyframe_tokens(model, motion), 0)
 

@@ -23,6 +23,7 @@ from sfms_robot.listeners.arig.parts import Linear, Modulation, modulated, weigh
 from sfms_robot.listeners.layers import sinusoidal
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
+BEYOND_ALL = 1e4  # deviations: an estimate that is not clamped is clamped to this, which 16 bits hold
 COSINE_END = 0.98  # part of the quarter circle that the schedule goes
 
 
@@ -45,8 +46,9 @@ class Denoiser(nn.Module):
         super().__init__()
         channels, width = len(names), settings.width
         self.settings = settings
-        self.register_buffer("low", torch.full((channels,), -8.0))  # standardised motion that is possible at all
-        self.register_buffer("high", torch.full((channels,), 8.0))
+        most = 8.0 if settings.clamp else BEYOND_ALL
+        self.register_buffer("low", torch.full((channels,), -most))  # standardised motion that is possible at all
+        self.register_buffer("high", torch.full((channels,), most))
         self.register_buffer("alpha_bar", cosine_alpha_bar(settings.train_steps).float(), persistent=False)
         first, last = torch.tensor([settings.temperature_of(name) for name in names]).unbind(-1)
         late = torch.linspace(0, 1, max(1, settings.steps - 1))[:, None]

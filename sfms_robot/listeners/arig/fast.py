@@ -63,6 +63,15 @@ def with_precision(model: ArigModel, precision: str) -> ArigModel:
     return out
 
 
+def large_layers(model: ArigModel) -> list[str]:
+    """Weights of the layers that `with_precision` puts into integers, by name."""
+    return [
+        f"{name}.weight"
+        for name, part in model.named_modules()
+        if isinstance(part, nn.Linear) and name.split(".")[0] in PARTS and part.weight.numel() >= SMALLEST
+    ]
+
+
 def _replace(module: nn.Module) -> None:
     for name, child in module.named_children():
         if isinstance(child, nn.Linear):

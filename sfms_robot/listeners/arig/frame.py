@@ -1,20 +1,40 @@
 """What a stream computes of one frame, as two functions of tensors: `Frame` up to the sampler, `Draw` from there on.
 
 Offline the same parts run over all frames at once (`model.condition`, `model.generate`); that both agree is a law of
-the tests. As functions of tensors alone they can become graphs (`graphs`).
+the tests. As functions of tensors alone they can become graphs, or be exported. `Rest` is what a stream remembers
+before its first frame.
 
-N streams of one speaker, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of
-a chunk, S whole chunks in view.
+N streams, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of a chunk, S
+whole chunks that are remembered, L layers that look at them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
+from sfms_robot import config
+from sfms_robot.listeners.arig.audio_frontend import WIDTHS
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.parts import Part
+from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS
+from sfms_robot.signals.control import COLUMNS
+
+
+class Rest(Part):
+    """A still face and silence, as a stream remembers them: asked once, when a listener is loaded."""
+
+    def __init__(self, model: ArigModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, still: Tensor) -> tuple[Tensor, ...]:
+        """still (1, C) standardised -> embedded motion and silence (1, D), and the keys of each (1, 2D)."""
+        progress, motion, silence = self.model.progress, self.model.embed_motion(still), self.model.no_agent_sound[None]
+        return motion, silence + 0.0, progress.temporal.keys(motion), progress.coarse.keys(silence)
 
 
 class Frame(Part):
@@ -34,7 +54,7 @@ class Frame(Part):
         first: Tensor,
         state: Tensor,
         rotary: Tensor,
-        past: Tensor,
+        view: Tensor,
         agent_sound: Tensor,
         agent_behaviour: Tensor,
         user_behaviour: Tensor,
@@ -43,17 +63,18 @@ class Frame(Part):
         motion_keys: Tensor,
         sample: Tensor,
         rows: Tensor,
+        *past: Tensor,
     ) -> tuple[Tensor, ...]:
         """One frame.
 
         Args:
-            sounds: (2, A) of user and agent; heard: (2,) bool, which of them are there.
-            voiced: (1, 2) bool, speech of agent, user.
-            face: (1, C) standardised motion of the user; seen: (1,) bool.
-            first: () bool, of the stream: chunks begin as its behaviour repeated (A.2).
+            sounds: (N, 2, A) of user and agent; heard: (N, 2) bool, which of them are there.
+            voiced: (N, 2) bool, speech of agent, user.
+            face: (N, C) standardised motion of the user; seen: (N,) bool.
+            first: (N,) bool, of the stream: chunks begin as its behaviour repeated (A.2).
             state: (N,) conversational state of the frame before.
-            rotary, past: place and keys of `LongRange.step`.
-            agent_sound, ...: of `stream.Memory`, of N streams.
+            rotary, view, past: place, chunks that there have been, and keys and values of `LongRange.step`.
+            agent_sound, ...: of `stream.Memory`.
             rows: (N, 2K) control of the frame before and of the frame to be made; anything without events.
 
         Returns:
@@ -61,17 +82,16 @@ class Frame(Part):
             and values of the chunk in progress, and the next agent_sound, agent_behaviour, user_behaviour and
             sound_keys.
         """
-        model, n = self.model, motion.shape[0]
+        model = self.model
         absent = torch.stack([model.no_user_sound, model.no_agent_sound])
         embedded = model.embed_sound(sounds, heard, absent)
-        # Streams hear the same; memory holds no more than it needs.
-        user_sound, now = embedded[:1].expand(n, -1), embedded[1:].repeat(n, 1)
-        face, voiced = model.embed_face(face, seen).expand(n, -1), voiced.expand(n, -1)
+        user_sound, now = embedded[:, 0], embedded[:, 1]
+        face = model.embed_face(face, seen)
         agent_behaviour = _after(agent_behaviour, model.merge_agent(agent_sound, motion), first)
         user_behaviour = _after(user_behaviour, model.merge_user(user_sound, face), first)
         sound_keys = push(sound_keys, model.progress.coarse.keys(now))
         summary = model.short(agent_behaviour, user_behaviour, now, user_sound)
-        cis, made = model.long.step(summary, past, rotary)
+        cis, made = model.long.step(summary, past, view, rotary)
         feature, logits = None, cis[:, :0]
         if model.states is not None:
             feature, logits = model.states(model.states.condition(cis, voiced), state)
@@ -84,14 +104,21 @@ class Draw(Part):
     """What the sampler is told and its noise -> the agent's motion, and what the stream remembers of it."""
 
     levels: Tensor | None
+    places: Tensor | None
 
-    def __init__(self, model: ArigModel) -> None:
+    def __init__(self, model: ArigModel, kept: bool = True) -> None:
+        """`kept`: the noise levels, which are always the same, are embedded once; else in every frame, by weights that
+        may be others.
+        """
         super().__init__()
         self.model = model
-        head = model.head
-        with torch.no_grad():  # the noise levels are always the same
-            levels = head.level(torch.tensor(head.levels)) if isinstance(head, Denoiser) else None
+        head, levels, places = model.head, None, None
+        if isinstance(head, Denoiser):
+            places = head.places[head.levels]
+            with torch.no_grad():
+                levels = head.time(places) if kept else None
         self.register_buffer("levels", levels, persistent=False)
+        self.register_buffer("places", places, persistent=False)
 
     def forward(self, z: Tensor, noise: Tensor, standard: Tensor, motion_keys: Tensor) -> tuple[Tensor, ...]:
         """One frame.
@@ -105,15 +132,55 @@ class Draw(Part):
             (N, D), and the next motion_keys.
         """
         model = self.model
-        made = model.drawn(model.sample(z, noise, self.levels), standard)
+        levels = self.levels
+        if levels is None and self.places is not None and isinstance(model.head, Denoiser):
+            levels = model.head.time(self.places)
+        made = model.drawn(model.sample(z, noise, levels), standard)
         motion = model.embed_motion(made)
         keys = push(motion_keys, model.progress.temporal.keys(motion))
         return model.restore(made), made, model.target(made, standard), motion, keys
 
 
-def repeated(x: Tensor, count: int) -> Tensor:
-    """(1, D) -> (1, count, D)."""
-    return x[:, None].repeat(1, count, 1)
+def networks(model: ArigModel, kept: bool = True) -> dict[str, Part]:
+    """All of them, by name. `kept`: see `Draw`."""
+    return {"rest": Rest(model), "frame": Frame(model), "draw": Draw(model, kept)}
+
+
+def examples(settings: config.Arig, streams: int) -> Mapping[str, dict[str, Tensor]]:
+    """Inputs of every network by its name and theirs, of as many streams."""
+    n, d, h, chunk, channels = streams, settings.width, settings.heads, settings.chunk_frames, len(settings.channels)
+    room = settings.context_chunks - 1
+    told = d + d * settings.events + channels * (settings.draws == "innovation")
+    motion_keys = torch.zeros(n, settings.motion_frames, 2 * d)
+    names = [f"{part}_{layer}" for layer in range(settings.context_layers) for part in ("keys", "values")]
+    frame = {
+        "sounds": torch.zeros(n, 2, WIDTHS[settings.sound]),
+        "heard": torch.ones(n, 2, dtype=torch.bool),
+        "voiced": torch.zeros(n, 2, dtype=torch.bool),
+        "face": torch.zeros(n, channels),
+        "seen": torch.ones(n, dtype=torch.bool),
+        "first": torch.zeros(n, dtype=torch.bool),
+        "state": torch.zeros(n, dtype=torch.long),
+        "rotary": torch.zeros(n, 2, d // h),
+        "view": torch.ones(n, room, dtype=torch.bool),
+        "agent_sound": torch.zeros(n, d),
+        "agent_behaviour": torch.zeros(n, chunk, d),
+        "user_behaviour": torch.zeros(n, chunk, d),
+        "sound_keys": torch.zeros(n, settings.sound_frames, 2 * d),
+        "motion": torch.zeros(n, d),
+        "motion_keys": motion_keys,
+        "sample": torch.zeros(n, channels),
+        "rows": torch.zeros(n, CONTROL_ROWS * len(COLUMNS) * settings.events),
+        **{name: torch.zeros(n, h, room, d // h) for name in names},
+    }
+    noise = (1, 1) if settings.discrete else (settings.diffusion.steps, channels)
+    draw = {
+        "z": torch.zeros(n, told),
+        "noise": torch.zeros(n, *noise),
+        "standard": torch.zeros(n, channels),
+        "motion_keys": motion_keys.clone(),
+    }
+    return {"rest": {"still": torch.zeros(1, channels)}, "frame": frame, "draw": draw}
 
 
 def push(queue: Tensor, new: Tensor) -> Tensor:
@@ -123,4 +190,4 @@ def push(queue: Tensor, new: Tensor) -> Tensor:
 
 def _after(queue: Tensor, new: Tensor, first: Tensor) -> Tensor:
     """(N, S, D) with `new` (N, D) as its newest, or all of it new."""
-    return torch.where(first, new[:, None], push(queue, new))
+    return torch.where(first[:, None, None], new[:, None], push(queue, new))

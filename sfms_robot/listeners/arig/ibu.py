@@ -10,6 +10,8 @@ N samples, c frames of a chunk, D width, h heads; B batch, T frames.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -25,8 +27,7 @@ from sfms_robot.listeners.arig.parts import (
     modulated,
     split_heads,
 )
-
-ROPE_BASE = 10_000.0
+from sfms_robot.listeners.arig.rotary import rates
 
 
 class Merge(Part):
@@ -156,21 +157,22 @@ class ContextLayer(Part):
         self.ffn = FeedForward(width, hidden)
 
     def project(self, x: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """x (B, T, D), rotary (2, T, D/h) -> queries, keys, values (B, h, T, D/h), turned to their places."""
+        """x (B, T, D), rotary (2, T, D/h) or (2, B, 1, 1, D/h) -> queries, keys, values (B, h, T, D/h), turned."""
         qkv = split_heads(self.qkv(self.norm(x)), 3 * self.heads)
         q, k = _rotated(qkv.narrow(1, 0, 2 * self.heads), rotary).chunk(2, dim=1)
         return q, k, qkv.narrow(1, 2 * self.heads, self.heads)
 
-    def forward(self, x: Tensor, own: tuple[Tensor, Tensor, Tensor], past: Tensor, seen: Tensor | None) -> Tensor:
-        """x (B, T, D), `own` of `project`, past (2, B, h, S, D/h): keys and values of whole chunks -> (B, T, D).
+    def forward(
+        self, x: Tensor, own: tuple[Tensor, Tensor, Tensor], past: tuple[Tensor, Tensor], seen: Tensor
+    ) -> Tensor:
+        """x (B, T, D), `own` of `project`, past (B, h, S, D/h) twice: keys and values of whole chunks -> (B, T, D).
 
-        `seen` (T, S): which of them each token may look at; None: all.
+        `seen` (T, S) or (B, 1, 1, S): which of them each token may look at.
         """
         q, k, v = own
         q = q * q.shape[-1] ** -0.5
         scores = q @ past[0].transpose(-1, -2)  # (B, h, T, S)
-        if seen is not None:
-            scores = scores.masked_fill(~seen, -torch.inf)
+        scores = torch.where(seen, scores, -torch.inf)
         self_score = (q * k).sum(-1, keepdim=True)  # the token itself stands beside the cache: nothing is copied
         weights = torch.cat([scores, self_score], dim=-1).softmax(dim=-1)
         y = weights[..., :-1] @ past[1] + weights[..., -1:] * v
@@ -189,8 +191,7 @@ class LongRange(nn.Module):
         super().__init__()
         self.chunk, self.capacity = chunk, capacity
         half = width // heads // 2
-        rates = ROPE_BASE ** (-torch.arange(half, dtype=torch.float64) / half)
-        self.register_buffer("rates", rates.repeat(2), persistent=False)
+        self.register_buffer("rates", torch.from_numpy(rates(width // heads)), persistent=False)
         self.register_buffer("signs", torch.ones(2 * half).index_fill(0, torch.arange(half), -1.0), persistent=False)
         self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(layers))
         self.norm = LayerNorm(width)
@@ -199,10 +200,7 @@ class LongRange(nn.Module):
         return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
 
     def rotary(self, chunks: Tensor) -> Tensor:
-        """Rotary places (Su et al. 2021): chunk numbers (T,) -> cosines and sines (2, T, D/h).
-
-        Computed in double precision: after days of running the angles still differ by what the chunks do.
-        """
+        """`rotary.rotary` as a tensor."""
         angles = chunks[:, None] * self.rates
         return torch.stack([angles.cos(), angles.sin() * self.signs]).float()
 
@@ -220,32 +218,33 @@ class LongRange(nn.Module):
         rotary, x = self.rotary(of), summaries
         for layer in self._layers():
             own = layer.project(x, rotary)
-            x = layer(x, own, torch.stack(own[1:])[:, :, :, whole], seen)
+            x = layer(x, own, (own[1][:, :, whole], own[2][:, :, whole]), seen)
         out: Tensor = self.norm(x)
         return out
 
-    def step(self, summary: Tensor, past: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, summary: Tensor, past: Sequence[Tensor], seen: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor]:
         """One frame of N streams.
 
         Args:
             summary: (N, D) of the chunk in progress.
-            past: (L, 2, N, h, S, D/h) keys and values of the S whole chunks in view, oldest first.
-            rotary: (2, 1, D/h) of this chunk.
+            past: (N, h, S, D/h) keys and values of the last S whole chunks, oldest first, layer by layer: 2L of them.
+            seen: (N, S) bool, which of them there have been.
+            rotary: (N, 2, D/h) of this chunk.
 
         Returns:
-            cis-token (N, D), and keys and values (L, 2, N, h, 1, D/h) of this summary, should it be the last of its
-            chunk.
+            cis-token (N, D), and keys and values (N, 2L, h, D/h) of this summary, should it be the last of its chunk.
         """
         x, made = summary[:, None], []
-        for layer, cached in zip(self._layers(), past, strict=True):
-            own = layer.project(x, rotary)
-            x = layer(x, own, cached, None)
-            made.append(torch.stack(own[1:]))
-        return self.norm(x)[:, 0], torch.stack(made)
+        turned, view = rotary.transpose(0, 1)[:, :, None, None], seen[:, None, None]
+        for layer, keys, values in zip(self._layers(), past[::2], past[1::2], strict=True):
+            own = layer.project(x, turned)
+            x = layer(x, own, (keys, values), view)
+            made += [part[:, :, 0] for part in own[1:]]
+        return self.norm(x)[:, 0], torch.stack(made, dim=1)
 
 
 def _rotated(x: Tensor, rotary: Tensor) -> Tensor:
-    """x (B, h, T, D/h) turned by (2, T, D/h): its halves are the two coordinates of each plane."""
+    """x (B, h, T, D/h) turned by (2, T, D/h) or (2, B, 1, 1, D/h): its halves are the two coordinates of each plane."""
     first, second = x.chunk(2, dim=-1)
     cosine, sine = rotary.unbind(0)
     return torch.addcmul(x * cosine, torch.cat([second, first], dim=-1), sine)

@@ -39,15 +39,16 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
 from sfms_robot.listeners.arig.codes import CodeHead
-from sfms_robot.listeners.arig.csu import FIRST, StateUnderstanding
+from sfms_robot.listeners.arig.csu import StateUnderstanding
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
 from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
 from sfms_robot.listeners.arig.pmp import Progressive
+from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST
+from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
 MEAN_WIDTH = 256
-CONTROL_ROWS = 2  # that are told: of the frame before and of the frame
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,8 @@ class ArigModel(nn.Module):
         self.register_buffer("is_drawn", is_drawn, persistent=False)
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
         self.register_buffer("sound_std", torch.ones(self.sound_width))
-        self.sound_in = nn.Sequential(Linear(self.sound_width, d), nn.GELU(), Linear(d, d))
+        self.sounds_read = self.sound_width - (0 if settings.phase else phase.FEATURES)  # the place in a phrase is last
+        self.sound_in = nn.Sequential(Linear(self.sounds_read, d), nn.GELU(), Linear(d, d))
         self.motion_in = Linear(self.channels, d)
         self.no_user_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_agent_sound = nn.Parameter(torch.randn(d) * 0.02)
@@ -247,7 +249,8 @@ class ArigModel(nn.Module):
 
     def embed_sound(self, sound: Tensor, heard: Tensor, absent: Tensor) -> Tensor:
         """Features (..., A), heard (...) bool, embedding (D,) or (..., D) of what is not heard -> (..., D)."""
-        out: Tensor = self.sound_in((sound - self.sound_mean) / self.sound_std)
+        standard = (sound - self.sound_mean) / self.sound_std
+        out: Tensor = self.sound_in(standard[..., : self.sounds_read])
         return torch.where(heard[..., None], out, absent)
 
     def embed_motion(self, motion: Tensor) -> Tensor:

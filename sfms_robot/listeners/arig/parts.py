@@ -84,7 +84,7 @@ class Modulation(Part):
     def of_tokens(self, condition: Tensor) -> tuple[Tensor, ...]:
         """Condition (N, D) -> (N, 1, size) per letter, for all tokens of a sample; of a single sample (size,)."""
         parts = self.linear(condition)
-        return (parts[0] if len(parts) == 1 else parts[:, None]).chunk(self.parts, dim=-1)
+        return (parts[0] if parts.shape[0] == 1 else parts[:, None]).chunk(self.parts, dim=-1)
 
 
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:

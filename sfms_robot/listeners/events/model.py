@@ -25,10 +25,11 @@ from sfms_robot.data import data_dir
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
 from sfms_robot.listeners.events import chance
 from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
-from sfms_robot.listeners.events.hazards import FILE, STEP_FRAMES, STEP_S, EventTables, HazardBank, Shape, load_tables
+from sfms_robot.listeners.events.hazards import FILE, STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
 from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
+from sfms_robot.signals.event_sizes import SWINGS_HZ, aside, swings
 
-LEAD_FRAMES: Final = 2
+LEAD_FRAMES: Final = 2  # an event decided with frame n begins behind frame n + 1 + LEAD_FRAMES
 LISTENING_S: Final = 2.0  # somebody else spoke this recently
 AT_PERSON: Final = (0.0, 0.0)
 # What one thing at a time does: while one of a group is under way none of it begins.
@@ -43,9 +44,6 @@ GROUPS: Final = (
 ALWAYS: Final = frozenset(("blink", "gaze_shift"))  # the others only while listening
 SWINGING: Final = frozenset(("nod", "shake"))
 ANGLES: Final = frozenset(("nod", "shake", "tilt", "gaze_shift"))  # sizes are degrees
-MOST_SWINGS: Final = 4
-SWING_S: Final = (0.3, 0.66)  # there and back
-SIDEWAYS, UP = 0.75, 0.75  # shares of looks away: rather sideways than not, rather up than down
 _EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
     kind: frozenset().union(*(group for group in GROUPS if kind in group)) for kind in EVENT_KINDS
 }
@@ -182,11 +180,11 @@ class EventModel:
         size = quantile(shape.size, large) * quantile(shape.habit, habit)
         size = min(max(size, shape.size[0]), shape.size[-1])
         size = math.radians(size) if kind in ANGLES else size
-        swings = 1
+        times = 1
         if kind in SWINGING:
-            swings, duration_s = _swings(duration_s, shape, pace)
-        target = _aside(size, side, up) if kind == "gaze_shift" else None
-        return ListenerEvent(kind, _begin_s(frame), duration_s, size, swings, target)
+            times, duration_s = swings(duration_s, quantile(shape.swings_hz or SWINGS_HZ, pace))
+        target = aside(size, side, up) if kind == "gaze_shift" else None
+        return ListenerEvent(kind, _begin_s(frame), duration_s, size, times, target)
 
 
 def quantile(values: Sequence[float], share: float) -> float:
@@ -210,18 +208,3 @@ def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) 
     if shift is not None and (shift.target_rad != AT_PERSON or shift.start_s > now_s):
         under_way.add("gaze_shift")
     return frozenset(kind for kind in EVENT_KINDS if (listening or kind in ALWAYS) and not _EXCLUDES[kind] & under_way)
-
-
-def _swings(duration_s: float, shape: Shape, pace: float) -> tuple[int, float]:
-    """How often the head goes there and back in about that time, and how long that takes it."""
-    pace_hz = quantile(shape.swings_hz or (2.0, 2.0), pace)
-    swings = min(max(round(duration_s * pace_hz), 1), MOST_SWINGS)
-    return swings, swings * min(max(duration_s / swings, SWING_S[0]), SWING_S[1])
-
-
-def _aside(angle_rad: float, side: float, up: float) -> tuple[float, float]:
-    """(yaw, pitch) that far away, to either side alike."""
-    share = 2 * side % 1.0
-    steep = 45.0 * (share / SIDEWAYS if share < SIDEWAYS else 1 + (share - SIDEWAYS) / (1 - SIDEWAYS))
-    yaw = math.copysign(math.cos(math.radians(steep)), 0.5 - side)
-    return angle_rad * yaw, angle_rad * math.copysign(math.sin(math.radians(steep)), up - UP)  # pitch + is down

@@ -61,7 +61,8 @@ class Inpainter(nn.Module):
         seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
         # Other frames are neither looked at nor kept; but a gradient, which learned placement needs, passes there.
         every = torch.arange(seen.shape[1], device=seen.device)
-        keys = every if torch.is_grad_enabled() else seen.any(0).nonzero()[:, 0]
+        whole = torch.is_grad_enabled() or torch.compiler.is_exporting()  # how many there are is not known in a graph
+        keys = every if whole else seen.any(0).nonzero()[:, 0]
         seen, z_keys = seen[:, keys], z_kf[:, keys]
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
-from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.listeners.sfms.audio_frontend import SHAPES
+from sfms_robot.listeners.sfms.channels import head_channels
 from sfms_robot.listeners.sfms.inpainter import Inpainter
 from sfms_robot.listeners.sfms.placement import Strategy, place
 from sfms_robot.listeners.sfms.predictor import Predictor
@@ -19,16 +19,6 @@ from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
 from sfms_robot.listeners.sfms.sway import BANDS
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
-
-# Channels of any motion space that turn or move the head.
-HEAD = frozenset(
-    {*POSE_CHANNELS, *(f"{part}_{axis}" for part in ("rotation", "translation", "head") for axis in "xyz")}
-)
-
-
-def head_channels(channels: Sequence[str]) -> list[int]:
-    """Which of the channels move the head."""
-    return [index for index, name in enumerate(channels) if name in HEAD]
 
 
 def membership(groups: Sequence[config.ChannelGroup], channels: Sequence[str]) -> Tensor:

@@ -37,8 +37,8 @@ class Neighbours:
         t = mask.shape[1]
         frame = torch.arange(t, device=mask.device)[:, None]
         key = mask > 0.5
-        before = torch.where(key, frame, -1).cummax(1).values
-        after = torch.where(key, frame, t).flip(1).cummin(1).values.flip(1)
+        before = _highest_so_far(torch.where(key, frame, -1))
+        after = t - 1 - _highest_so_far(torch.where(key, t - 1 - frame, -1).flip(1)).flip(1)
         has_before, has_after = before >= 0, after < t
         return cls(
             frame,
@@ -83,5 +83,14 @@ class Neighbours:
         """Binary sliding positions (B, T, G, 2 * bits + 3): T^tf of equation (10)."""
         powers = 2 ** torch.arange(POSITION_BITS, device=self.before.device)
         bits = (torch.stack([self.since, self.until], dim=-1)[..., None] & powers) > 0
-        ends = torch.stack([self.has_before, self.has_after, self.weight], dim=-1)
-        return torch.cat([bits.flatten(-2), ends], dim=-1)
+        ends = torch.stack([self.has_before.to(self.weight), self.has_after.to(self.weight), self.weight], dim=-1)
+        return torch.cat([bits.flatten(-2).to(ends), ends], dim=-1)
+
+
+def _highest_so_far(numbers: Tensor) -> Tensor:
+    """Running maximum along the frames of (B, T, G)."""
+    if not torch.compiler.is_exporting():
+        return numbers.cummax(1).values
+    t = numbers.shape[1]  # cummax is not known to ONNX
+    past = torch.ones(t, t, dtype=torch.bool).tril()[None, :, :, None]  # (1, T, T, 1): frame s up to frame t
+    return torch.where(past, numbers[:, None], -1).amax(2)

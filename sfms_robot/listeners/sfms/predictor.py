@@ -23,7 +23,6 @@ from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
 from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
 
 AGE_SCALE_FRAMES = 4.0
-UNDECIDED = -1  # a future token nobody has drawn yet
 
 
 @dataclass(frozen=True)
@@ -145,8 +144,8 @@ class Predictor(nn.Module):
         c = context
         speaker = self.speaker(c.face, c.face_known, c.voice, c.heard, c.phase)
         own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent, c.control)
-        newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(len(own), -1)
-        speaker = speaker.expand(len(own), -1, -1)
+        newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(own.shape[0], -1)
+        speaker = speaker.expand(own.shape[0], -1, -1)
         if absent is not None:
             speaker, own = torch.cat([speaker, absent.expand_as(speaker)]), own.repeat(2, 1, 1)
             newest = torch.cat([newest, torch.zeros_like(newest)])
@@ -191,12 +190,16 @@ class Predictor(nn.Module):
 
         A sequential predictor needs the last keyframes (..., G) up to the frame before each, and that frame's number.
         """
+        logits = nn.functional.pad(self.flat_logits(slots, recent, frame), (0, 1), value=-torch.inf)
+        return logits.index_select(-1, self.place).view(*slots.shape[:-1], self.groups, -1)
+
+    def flat_logits(self, slots: Tensor, recent: LastKeyframes | None = None, frame: Tensor | int = 0) -> Tensor:
+        """`classes` as the network has them: (..., all classes of all groups), without those that a group lacks."""
         if self.trail_in is not None and self.chain is not None and recent is not None:
             slots = slots + self.trail_in(self.describe(recent, frame))
             slots = slots + self.chain(slots)
-        logits = self.classify(self.norm(slots))
-        logits = nn.functional.pad(logits, (0, 1), value=-torch.inf).index_select(-1, self.place)
-        return logits.view(*slots.shape[:-1], self.groups, -1)
+        out: Tensor = self.classify(self.norm(slots))
+        return out
 
     def teacher_forced(self, context: Context, target: Tensor) -> Tensor:
         """Logits (B, H, G, V) of every future frame, told the true ones (B, H, G) before it where it is sequential."""

@@ -33,10 +33,10 @@ def quantize(latent: Tensor, levels: Tensor) -> Tensor:
     return bounded + (code - bounded).detach()
 
 
-def codes_to_indices(codes: Tensor, levels: Tensor) -> Tensor:
-    """(..., G, D) on the grid -> (..., G) int64 in 0..prod(levels) - 1."""
+def codes_to_indices(codes: Tensor, levels: Tensor, radix: Tensor | None = None) -> Tensor:
+    """(..., G, D) on the grid -> (..., G) int64 in 0..prod(levels) - 1. `radix`: of the levels, if it is at hand."""
     digits = torch.round((codes + 1) / 2 * (levels - 1)).long()
-    return (digits * _radix(levels)).sum(-1)
+    return (digits * (_radix(levels) if radix is None else radix)).sum(-1)
 
 
 def indices_to_codes(indices: Tensor, levels: Tensor) -> Tensor:
@@ -54,12 +54,14 @@ class Grid(nn.Module):
     """The fixed codebook of finite scalar quantization: nothing to learn."""
 
     levels: Tensor
+    radix: Tensor
     table: Tensor
     group: Tensor
 
     def __init__(self, levels: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.register_buffer("levels", as_levels(levels), persistent=False)
+        self.register_buffer("radix", _radix(self.levels), persistent=False)
         every = torch.arange(max(map(math.prod, levels)))[:, None].expand(-1, len(levels))
         self.register_buffer("table", indices_to_codes(every, self.levels), persistent=False)  # (V, G, D)
         self.register_buffer("group", torch.arange(len(levels)), persistent=False)
@@ -71,7 +73,7 @@ class Grid(nn.Module):
 
     def indices(self, codes: Tensor) -> Tensor:
         """(..., G, D) -> (..., G)."""
-        return codes_to_indices(codes, self.levels)
+        return codes_to_indices(codes, self.levels, self.radix)
 
     def codes(self, indices: Tensor) -> Tensor:
         """(..., G) -> (..., G, D)."""

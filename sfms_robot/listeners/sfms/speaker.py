@@ -61,7 +61,7 @@ class SpeakerEncoder(nn.Module):
         # As a matrix product: for the few rows of one frame Conv1d takes several times as long.
         near = sound[:, self.rows - KERNEL_ROWS + 1 :].unfold(1, KERNEL_ROWS, 1)  # (B, n * rows, bins, K)
         y = F.linear(near.flatten(2), self.conv.weight.flatten(1), self.conv.bias)
-        return F.gelu(y.view(len(y), -1, self.rows, y.shape[-1]).amax(2))
+        return F.gelu(y.view(y.shape[0], -1, self.rows, y.shape[-1]).amax(2))
 
     def forward(self, face: Tensor, face_known: Tensor, voice: Tensor, heard: Tensor, phase: Tensor) -> Tensor:
         """face (B, P, C), voice (B, P, W) of `listen`, phase (B, P, F); (B, P) bool say which frames count."""

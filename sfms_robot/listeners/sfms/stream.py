@@ -12,33 +12,29 @@ which the next plan may correct: it starts where the motion was, at the speed it
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+from numpy.typing import NDArray
 
 from sfms_robot import config
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats, Plan, SpeakerFrame
-from sfms_robot.listeners.graphs import graph
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.listeners.engine import Engine, model_of
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
-from sfms_robot.listeners.sfms.draw import Sampler
-from sfms_robot.listeners.sfms.model import HEAD, SfmsModel
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, last_keyframes
+from sfms_robot.listeners.sfms.channels import HEAD, head_channels
+from sfms_robot.listeners.sfms.draw import Sampler, Seen
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, later, neutral_mask, passed, revoked
+from sfms_robot.listeners.sfms.reachable import Reach
 from sfms_robot.listeners.sfms.sway import draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 
-NEUTRAL_STRIDE = 8  # frames between the keyframes of the neutral face a stream begins with
-KEPT_FRAMES = 1  # of the future, whatever is told
-SAME = 1e-5  # what is told of a frame differs by more, or does not
-
 
 @dataclass(frozen=True)
 class SpeakerState:
-    """The speaker's last P frames, the newest last, as `predictor.Context` wants them (no batch).
+    """The speaker's last P frames, the newest last, as `draw.Seen` wants them (no batch).
 
     Attributes:
         audio: what unfinished features still need.
@@ -46,12 +42,12 @@ class SpeakerState:
     """
 
     audio: AudioState
-    rows: Tensor
-    voice: Tensor
-    heard: Tensor
-    phase: Tensor
-    face: Tensor
-    face_known: Tensor
+    rows: Floats
+    voice: Floats
+    heard: NDArray[np.bool_]
+    phase: Floats
+    face: Floats
+    face_known: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -59,73 +55,62 @@ class Memory:
     """What one stream remembers; values only: a step makes a new one.
 
     Attributes:
+        seed: what it draws hangs on it (`lots`).
         frames: how many have been heard.
         speaker: of the last P frames.
         tokens: (P + H, G) own tokens up to now, those drawn for the future, UNDECIDED.
         control: (P + H, K) what was told of each of those frames when they were drawn.
         path: (2 + H, C) standardised: the frame before, this frame, then the plan in force.
         sway: what `sway.draw_sway` made for this stream; empty without.
-        random: state of the stream's own generator.
     """
 
+    seed: int
     frames: int
     speaker: SpeakerState
-    tokens: Tensor
-    control: Tensor
-    path: Tensor
-    sway: Tensor
-    random: Tensor
-
-
-@torch.no_grad()
-def neutral_tokens(model: SfmsModel, space: MotionSpace, frames: int) -> Tensor:
-    """(frames, G): a still, neutral face up to now, as tokens."""
-    still = model.standardise(still_face(space, frames))[None]
-    mask = torch.zeros(1, frames, model.tokenizer.member.shape[0])
-    mask[:, (frames - 1) % NEUTRAL_STRIDE :: NEUTRAL_STRIDE] = 1.0
-    return model.tokenizer.encode(still, mask)[0]
-
-
-class Decode(nn.Module):
-    """Tokens (B, P + H, G) -> the motion of their last frames (B, last, C)."""
-
-    def __init__(self, model: SfmsModel, last: int) -> None:
-        super().__init__()
-        self.tokenizer, self.last = model.tokenizer, last
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        return self.tokenizer.decode(tokens, last=self.last)
+    tokens: Tokens
+    control: Floats
+    path: Floats
+    sway: Doubles
 
 
 class SfmsListener:
-    """`ports.Listener` over an SfmsModel. Holds weights only."""
+    """`ports.BatchListener`. Holds weights only: its engine does, which runs `networks`."""
 
     def __init__(
         self,
         settings: config.Sfms,
-        model: SfmsModel,
+        engine: Engine,
         space: MotionSpace | None = None,
         frontend: AudioFrontend | None = None,
     ) -> None:
         self.settings = settings
-        self.model = model.eval()
+        self.engine = engine
         self.space = space or MotionSpace.of(settings)
         self.frontend = frontend or AudioFrontend.of(settings)
-        self.sampler = Sampler(settings, self.model)
-        head = [float(channel in HEAD) for channel in settings.channels]
-        self._smoothing = settings.sampling.smoothing * torch.tensor(head)
-        self._neutral = neutral_tokens(self.model, self.space, settings.past_frames)
+        self._scales = engine.tensors
+        self._head = head_channels(settings.channels) if settings.sway else []
+        self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
+        self._smoothing *= np.float32(settings.sampling.smoothing)
         self._columns = len(COLUMNS) if settings.events else 0
         # Behind the last keyframe is what it was: then one that leaves the window has to be held on to.
         self.holds = settings.placement == "penalised"
-        self._decode = Decode(self.model, settings.future_frames + 2).eval()
-        self._decode_one: Callable[..., Any] = self._decode
+        mask = neutral_mask(settings.past_frames, len(settings.groups))
+        neutral, codes = engine.run("rest", self._still(settings.past_frames)[None], mask[None])
+        self._neutral = neutral[0]
+        groups = settings.groups.values()
+        own = [[settings.channels.index(name) for name in group.channels] for group in groups]
+        sizes, bounded = [group.codes for group in groups], settings.sampling.reach
+        reach = Reach(codes[0], own, sizes, self._scales["motion_speed"], bounded)
+        self.sampler = Sampler(settings, engine, reach)
 
-    def build_graphs(self) -> SfmsListener:
-        """The weights stay as they are from now on: what a single stream computes of a plan becomes graphs. Itself."""
-        memory = self.start(0)
-        self.sampler.build_graphs(_context(memory.speaker, memory.tokens[None], memory.control[None]))
-        self._decode_one = graph(self._decode, (memory.tokens[None],))
+    @property
+    def model(self) -> Any:
+        """The torch model behind it. Raises ModelError where it runs on another engine."""
+        return model_of(self.engine)
+
+    def build_graphs(self) -> Self:
+        """See `engine.Engine`. Itself."""
+        self.engine.build_graphs()
         return self
 
     @property
@@ -138,7 +123,7 @@ class SfmsListener:
         return range(1, self.horizon + 1) if self.settings.hop == "auto" else (self.hop,)
 
     def at_hop(self, hop: int) -> SfmsListener:
-        """The same weights and graphs, planning every `hop` frames."""
+        """The same weights, planning every `hop` frames."""
         other = copy.copy(self)
         other.settings = self.settings.model_copy(update={"hop": hop})
         return other
@@ -152,35 +137,32 @@ class SfmsListener:
         """How many frames up to the newest heard, and how many after it, `step` wants to be told of; none without."""
         return (self.settings.past_frames, self.horizon) if self._columns else (0, 0)
 
-    @torch.no_grad()
     def start(self, seed: int) -> Memory:
         """Memory of a stream that has heard nothing and looked neutral so far."""
         p = self.settings.past_frames
         speaker = SpeakerState(
             audio=self.frontend.start(),
-            rows=torch.zeros(self.frontend.shape),
-            voice=torch.zeros(p, self.settings.predictor_width),
-            heard=torch.zeros(p, dtype=torch.bool),
-            phase=torch.zeros(p, self.frontend.phase_features),
-            face=torch.zeros(p, self.space.dim),
-            face_known=torch.zeros(p, dtype=torch.bool),
+            rows=np.zeros(self.frontend.shape, np.float32),
+            voice=np.zeros((p, self.settings.predictor_width), np.float32),
+            heard=np.zeros(p, np.bool_),
+            phase=np.zeros((p, self.frontend.phase_features), np.float32),
+            face=np.zeros((p, self.space.dim), np.float32),
+            face_known=np.zeros(p, np.bool_),
         )
         tokens, path = self.at_rest()
-        generator = torch.Generator().manual_seed(seed)
-        sway = self.draw_sway(generator)
-        control = torch.zeros(len(tokens), self._columns)
-        return Memory(0, speaker, tokens, control, path, sway, generator.get_state())
+        control = np.zeros((len(tokens), self._columns), np.float32)
+        return Memory(seed, 0, speaker, tokens, control, path, self.draw_sway(seed))
 
-    def draw_sway(self, generator: torch.Generator) -> Tensor:
-        """A stream's own sway, as `sway_at` takes it; empty, and nothing drawn, for a listener whose tokens hold it."""
-        if not self.model.head:
-            return torch.zeros(3, 0, 0)
-        return draw_sway(self.model.sway_amplitude, self.model.sway_spread, generator)
+    def draw_sway(self, seed: int) -> Doubles:
+        """A stream's own sway, as `sway_at` takes it; empty for a listener whose tokens hold it."""
+        if not self._head:
+            return np.zeros((3, 0, 0))
+        return draw_sway(self._scales["sway_amplitude"], float(self._scales["sway_spread"]), seed)
 
-    def at_rest(self) -> tuple[Tensor, Tensor]:
+    def at_rest(self) -> tuple[Tokens, Floats]:
         """Tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
-        undecided = torch.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
-        return torch.cat([self._neutral, undecided]), self.model.standardise(still_face(self.space, 2 + self.horizon))
+        undecided = np.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
+        return np.concatenate([self._neutral, undecided]), self._still(2 + self.horizon)
 
     def step(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Plan | None, Memory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place.
@@ -190,144 +172,178 @@ class SfmsListener:
 
         Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
         """
-        plans, (now,) = self.step_many(speaker, [memory], None if control is None else [control])
-        return plans[0] if plans else None, now
+        return self.step_each([speaker], [memory], None if control is None else [control])[0]
 
-    @torch.inference_mode()
+    def step_each(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Memory], controls: Sequence[Floats] | None = None
+    ) -> list[tuple[Plan | None, Memory]]:
+        """See `ports.BatchListener`; controls as of `step`. Those that are due are planned together."""
+        heard = self._hear([*speakers], [memory.speaker for memory in memories])
+        return self._stepped([frame.time_s for frame in speakers], heard, memories, controls)
+
     def step_many(
         self, speaker: SpeakerFrame, memories: Sequence[Memory], controls: Sequence[Floats] | None = None
     ) -> tuple[list[Plan], list[Memory]]:
         """`step` of streams that began together and heard the same speaker ever since; no plans between hops.
 
-        Each is told of its own events, and draws from its own randomness, as it would alone, at a fraction of the time.
+        As `step_each`, and the speaker is listened to once.
         """
-        told = self._told(controls, len(memories))
-        heard = self._hear(speaker, memories[0].speaker)
-        frames = memories[0].frames
-        tokens, path = (torch.stack([getattr(m, name) for m in memories]) for name in ("tokens", "path"))
-        tokens, path = passed(tokens, path, holds=self.holds)
-        control = later(torch.stack([m.control for m in memories]))
-        random = [memory.random for memory in memories]
-        plans: list[Plan] = []
-        if frames % self.hop == 0:
-            generators = [torch.Generator().set_state(state) for state in random]
-            tokens = revoked(tokens, control, told, self.horizon)
-            tokens, path = self.plan(_context(heard, tokens, told), path, generators)
-            control = told
-            random = [generator.get_state() for generator in generators]
-            shown = self.with_sway(self.shown(path), torch.stack([m.sway for m in memories]), frames + 1)
-            plans = [self._plan(speaker.time_s, one) for one in shown]
-        drawn = zip(tokens, control, path, (m.sway for m in memories), random, strict=True)
-        return plans, [Memory(frames + 1, heard, *own) for own in drawn]
+        heard = self._hear([speaker], [memories[0].speaker]) * len(memories)
+        found = self._stepped([speaker.time_s] * len(memories), heard, memories, controls)
+        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
 
-    def _told(self, controls: Sequence[Floats] | None, streams: int) -> Tensor:
+    def _stepped(
+        self,
+        times_s: Sequence[float],
+        heard: Sequence[SpeakerState],
+        memories: Sequence[Memory],
+        controls: Sequence[Floats] | None,
+    ) -> list[tuple[Plan | None, Memory]]:
+        """Every stream one frame on, what its speaker did in it heard already."""
+        told = self._told(controls, len(memories))
+        tokens, path = passed(_stacked(memories, "tokens"), _stacked(memories, "path"), holds=self.holds)
+        control = later(_stacked(memories, "control"))
+        plans: list[Plan | None] = [None] * len(memories)
+        due = [row for row, memory in enumerate(memories) if memory.frames % self.hop == 0]
+        if due:
+            speaking = [heard[row] for row in due]
+            planned = [memories[row] for row in due]
+            tokens[due] = revoked(tokens[due], control[due], told[due], self.horizon)
+            seen = _seen(speaking, tokens[due], told[due])
+            newest = [memory.frames for memory in planned]
+            tokens[due], path[due] = self.plan(seen, path[due], [memory.seed for memory in planned], newest)
+            control[due] = told[due]
+            shown = self.shown(path[due])
+            for at, (row, memory) in enumerate(zip(due, planned, strict=True)):
+                motion = self.with_sway(shown[at], memory.sway, memory.frames + 1)
+                plans[row] = self._plan(times_s[row], motion)
+        after = [
+            Memory(memory.seed, memory.frames + 1, heard[row], tokens[row], control[row], path[row], memory.sway)
+            for row, memory in enumerate(memories)
+        ]
+        return list(zip(plans, after, strict=True))
+
+    def _told(self, controls: Sequence[Floats] | None, streams: int) -> Floats:
         """(B, P + H, K). Raises ValueError for another shape, and where nothing is told to one that must be."""
         rows = sum(self.control_frames)
         if controls is None and not self._columns:
-            return torch.zeros(streams, self.settings.window_frames, 0)
+            return np.zeros((streams, self.settings.window_frames, 0), np.float32)
         if controls is None:
             raise ValueError(f"this listener is told of events: control ({rows}, {self._columns}) is missing")
         if len(controls) != streams or any(one.shape != (rows, self._columns) for one in controls):
             shapes = ", ".join(str(one.shape) for one in controls)
             raise ValueError(f"control has shape {shapes}, not {streams} times ({rows}, {self._columns})")
-        return torch.from_numpy(np.stack(controls).astype(np.float32))
+        return np.stack(controls).astype(np.float32)
 
-    def with_sway(self, shown: Tensor, sway: Tensor, first: int) -> Tensor:
-        """Motion (B, N, C), standardised, of frames `first`, `first` + 1, ... -> in the model's space, with the slow
-        motion (B, 3, L, S) of each stream.
+    def with_sway(self, shown: Floats, sway: Doubles, first: int) -> Floats:
+        """Motion (..., N, C), standardised, of frames `first`, `first` + 1, ... -> in the model's space, with the slow
+        motion (..., 3, L, S) of each stream.
         """
-        motion = self.model.restore(shown)
-        if self.model.head:
-            times_s = FRAME_S * (first + 1 + torch.arange(shown.shape[-2], dtype=torch.float64))
-            motion[..., self.model.head] += sway_at(sway, times_s)
+        motion = shown * self._scales["motion_std"] + self._scales["motion_mean"]
+        if self._head:
+            motion[..., self._head] += sway_at(sway, FRAME_S * (first + 1.0 + np.arange(shown.shape[-2])))
         return motion
 
-    def shown(self, path: Tensor) -> Tensor:
+    def shown(self, path: Floats) -> Floats:
         """Path (..., 2 + H, C) -> what is seen of its future (..., H, C), both standardised: the head is smoothed."""
         if not self.settings.sampling.smoothing:
             return path[..., 2:, :]
         beyond = 2 * path[..., -1:, :] - path[..., -2:-1, :]
-        before, own, after = path[..., 1:-1, :], path[..., 2:, :], torch.cat([path[..., 3:, :], beyond], dim=-2)
-        return own + self._smoothing * ((before + after) / 2 - own)
+        before, own = path[..., 1:-1, :], path[..., 2:, :]
+        after = np.concatenate([path[..., 3:, :], beyond], axis=-2)
+        return np.asarray(own + self._smoothing * ((before + after) / 2 - own))
 
-    def _plan(self, made_at_s: float, shown: Tensor) -> Plan:
+    def _plan(self, made_at_s: float, shown: Floats) -> Plan:
         times_s = np.asarray(made_at_s + FRAME_S * np.arange(1, self.horizon + 1), dtype=np.float64)
-        motion, jaw_rad = self.space.decode(shown.numpy())
+        motion, jaw_rad = self.space.decode(shown)
         return Plan(made_at_s, times_s, motion, jaw_rad)
 
-    def plan(self, seen: Context, path: Tensor, generators: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
-        """New plans of B streams: tokens (B, P + H, G), path (B, 2 + H, C). `path` is the old one, as played so far."""
-        tokens = self.sampler.draw(seen, generators)
-        decoded = (self._decode_one if len(tokens) == 1 else self._decode)(tokens)
+    def plan(self, seen: Seen, path: Floats, seeds: Sequence[int], newest: Sequence[int]) -> tuple[Tokens, Floats]:
+        """New plans of B streams: tokens (B, P + H, G), path (B, 2 + H, C). `path` is the old one, as played so far.
+
+        `newest`: the frame that each has heard last, from 0 at its beginning.
+        """
+        tokens = self.sampler.draw(seen, seeds, [frame + self.horizon for frame in newest])
+        (decoded,) = self.engine.run("decode", tokens)
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
-    def _hear(self, speaker: SpeakerFrame, before: SpeakerState) -> SpeakerState:
-        """With the newest frame in place of the oldest."""
-        present = len(speaker.audio) > 0
-        if present and len(speaker.audio) != FRAME_SAMPLES:
-            raise ValueError(f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(speaker.audio)}")
-        sound, phase, audio = self.frontend.step(speaker.audio, before.audio)
-        rows = self.model.standardise_sound(torch.from_numpy(sound)) * present
-        face = torch.zeros(1, self.space.dim)
-        known = speaker.face is not None and bool(np.isfinite(speaker.face.motion).all())
-        if speaker.face is not None and known:
-            face = self.model.standardise(torch.from_numpy(self.space.encode(speaker.face.motion[None])))
-        voice = self.model.predictor.speaker.listen(torch.cat([before.rows, rows])[None])[0]
-        return SpeakerState(
-            audio,
-            rows,
-            voice=_push(before.voice, voice),
-            heard=_push(before.heard, torch.tensor([present])),
-            phase=_push(before.phase, torch.from_numpy(phase)[None]),
-            face=_push(before.face, face),
-            face_known=_push(before.face_known, torch.tensor([known])),
+    def voices(self, rows: Floats) -> Floats:
+        """Standardised sound (N, 2R, bins) of N frames, each behind the one before it -> (N, W)."""
+        return self.engine.run("hear", rows)[0]
+
+    def standardise(self, motion: Floats) -> Floats:
+        """Motion (..., C) of the model's motion space -> the units it works in."""
+        return np.asarray((motion - self._scales["motion_mean"]) / self._scales["motion_std"], np.float32)
+
+    def standardise_sound(self, rows: Floats) -> Floats:
+        """Rows (..., bins) of sound features, likewise."""
+        return np.asarray((rows - self._scales["sound_mean"]) / self._scales["sound_std"], np.float32)
+
+    def _still(self, frames: int) -> Floats:
+        """(frames, C) of a face at rest, standardised."""
+        return np.repeat(self.standardise(self.space.neutral.astype(np.float32)[None]), frames, axis=0)
+
+    def _hear(self, speakers: Sequence[SpeakerFrame], before: Sequence[SpeakerState]) -> list[SpeakerState]:
+        """Of every stream, with the newest frame in place of the oldest."""
+        for speaker in speakers:
+            if len(speaker.audio) not in (0, FRAME_SAMPLES):
+                raise ValueError(
+                    f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(speaker.audio)}"
+                )
+        found = [self.frontend.step(one.audio, state.audio) for one, state in zip(speakers, before, strict=True)]
+        rows = [
+            self.standardise_sound(sound) * np.float32(len(speaker.audio) > 0)
+            for speaker, (sound, _, _) in zip(speakers, found, strict=True)
+        ]
+        voices = self.voices(
+            np.stack([np.concatenate(two) for two in zip((s.rows for s in before), rows, strict=True)])
         )
+        out = []
+        for speaker, state, (_, phase, audio), row, voice in zip(speakers, before, found, rows, voices, strict=True):
+            face, known = self._face(speaker)
+            out.append(
+                SpeakerState(
+                    audio,
+                    row,
+                    voice=_push(state.voice, voice),
+                    heard=_push(state.heard, np.bool_(len(speaker.audio) > 0)),
+                    phase=_push(state.phase, phase),
+                    face=_push(state.face, face),
+                    face_known=_push(state.face_known, np.bool_(known)),
+                )
+            )
+        return out
+
+    def _face(self, speaker: SpeakerFrame) -> tuple[Floats, bool]:
+        """(C,) standardised, and whether it is known."""
+        if speaker.face is None or not np.isfinite(speaker.face.motion).all():
+            return np.zeros(self.space.dim, np.float32), False
+        return self.standardise(self.space.encode(speaker.face.motion[None]))[0], True
 
 
-def still_face(space: MotionSpace, frames: int) -> Tensor:
-    """(frames, C) of a face at rest."""
-    return torch.tensor(space.neutral, dtype=torch.float32).expand(frames, -1)
+def _push(queue: NDArray[Any], new: NDArray[Any] | np.bool_) -> NDArray[Any]:
+    """(P, ...) without its oldest row and with `new` (...) as its newest."""
+    out = np.empty_like(queue)
+    out[:-1] = queue[1:]
+    out[-1] = new
+    return out
 
 
-def passed(tokens: Tensor, path: Tensor, frames: int = 1, holds: bool = False) -> tuple[Tensor, Tensor]:
-    """Tokens (..., P + H, G) and path (..., 2 + H, C) of `frames` later.
-
-    What has passed without having been planned, before the first plan, was the neutral face: no keyframe. `holds`: the
-    last keyframe that has left the window stands at its first frame.
-    """
-    horizon = path.shape[-2] - 2
-    moved = torch.cat([tokens[..., frames:, :], torch.full_like(tokens[..., :frames, :], UNDECIDED)], dim=-2)
-    moved[..., :-horizon, :].clamp_(min=0)
-    if holds:
-        moved[..., 0, :] = last_keyframes(tokens[:, : frames + 1]).tokens[:, -1, :, 0]
-    return moved, torch.cat([path[..., frames:, :], path[..., -1:, :].expand(*path.shape[:-2], frames, -1)], dim=-2)
+def _stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:
+    return np.stack([getattr(part, name) for part in parts])
 
 
-def later(control: Tensor, frames: int = 1) -> Tensor:
-    """Control (..., P + H, K) of `frames` later; of frames that nothing was told of yet it is 0."""
-    return torch.cat([control[..., frames:, :], torch.zeros_like(control[..., :frames, :])], dim=-2)
+def _seen(speakers: Sequence[SpeakerState], tokens: Tokens, control: Floats) -> Seen:
+    """One batch; one speaker alone where all streams have the same."""
+    if all(speaker is speakers[0] for speaker in speakers):
+        speakers = speakers[:1]
+    face, known, voice, heard, phase = (
+        _stacked(speakers, name) for name in ("face", "face_known", "voice", "heard", "phase")
+    )
+    return Seen(face, known, voice, heard, phase, tokens, control)
 
 
-def revoked(tokens: Tensor, drawn_under: Tensor, told: Tensor, horizon: int) -> Tensor:
-    """Tokens (B, P + H, G) without those of the future that what is told now, (B, P + H, K), has overtaken."""
-    changed = ((told - drawn_under)[:, -horizon:].abs() > SAME).any(-1)
-    stale = changed.cumsum(1) > 0
-    stale[:, :KEPT_FRAMES] = False
-    future = torch.where(stale[..., None], UNDECIDED, tokens[:, -horizon:])
-    return torch.cat([tokens[:, :-horizon], future], dim=1)
-
-
-def _push(queue: Tensor, new: Tensor) -> Tensor:
-    return torch.cat([queue[len(new) :], new])
-
-
-def _context(speaker: SpeakerState, tokens: Tensor, control: Tensor) -> Context:
-    """A batch of one speaker."""
-    s = speaker
-    return Context(s.face[None], s.face_known[None], s.voice[None], s.heard[None], s.phase[None], tokens, control)
-
-
-def join(tail: Tensor, decoded: Tensor, seam: int) -> Tensor:
+def join(tail: Floats, decoded: Floats, seam: int) -> Floats:
     """Plan that goes on from where the motion was.
 
     Args:
@@ -341,6 +357,6 @@ def join(tail: Tensor, decoded: Tensor, seam: int) -> Tensor:
     gap = tail - decoded[..., :2, :]
     before, offset = gap[..., :1, :], gap[..., 1:, :]
     speed = offset - before
-    u = (torch.arange(1, decoded.shape[-2] - 1) / seam).clamp(max=1.0)[:, None]
+    u = np.minimum(np.arange(1, decoded.shape[-2] - 1, dtype=np.float32) / np.float32(seam), 1)[:, None]
     fade = offset * (1 - u) ** 2 * (1 + 2 * u) + speed * seam * u * (1 - u) ** 2
-    return torch.cat([tail, decoded[..., 2:, :] + fade], dim=-2)
+    return np.concatenate([tail, decoded[..., 2:, :] + fade], axis=-2)

@@ -16,8 +16,11 @@ from __future__ import annotations
 
 import math
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.frames import Doubles, Floats
+from sfms_robot.listeners.lots import Use, normals, uniforms
 
 BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1
@@ -25,32 +28,31 @@ LINES = 3  # of each band
 EASE_S = 3.0
 
 
-def draw_sway(amplitude: Tensor, spread: Tensor, generator: torch.Generator) -> Tensor:
+def draw_sway(amplitude: Floats, spread: float, seed: int) -> Doubles:
     """What one stream's sway is made of.
 
     Args:
         amplitude: (BANDS, S) deviation of each channel within each band.
-        spread: () deviation of the logarithm of sizes between people.
-        generator: draws it.
+        spread: deviation of the logarithm of sizes between people.
+        seed: of the stream.
 
     Returns:
         (3, BANDS * LINES, S) frequencies [Hz], factors of cosine and of sine in units of the motion.
     """
     bands, channels = amplitude.shape
-    edges = torch.tensor(BANDS_HZ, dtype=torch.float64)
-    uniform = torch.rand(bands, LINES, channels, generator=generator, dtype=torch.float64)
+    edges = np.array(BANDS_HZ)
+    uniform = uniforms(seed, 0, Use.SWAY, bands * LINES * channels).reshape(bands, LINES, channels)
     frequency_hz = edges[:-1, None, None] + uniform * (edges[1:] - edges[:-1])[:, None, None]
-    size = torch.exp(spread.double() * torch.randn((), generator=generator, dtype=torch.float64))
-    factors = torch.randn(2, bands, LINES, channels, generator=generator, dtype=torch.float64)
-    factors = size * factors * (amplitude.double() / math.sqrt(LINES))[:, None]
-    return torch.cat([frequency_hz[None], factors]).flatten(1, 2)
+    drawn = normals(seed, 1, Use.SWAY, 1 + 2 * bands * LINES * channels).astype(np.float64)
+    size, factors = math.exp(spread * drawn[0]), drawn[1:].reshape(2, bands, LINES, channels)
+    factors = size * factors * (amplitude.astype(np.float64) / math.sqrt(LINES))[:, None]
+    return np.concatenate([frequency_hz[None], factors]).reshape(3, bands * LINES, channels)
 
 
-def sway_at(sway: Tensor, times_s: Tensor) -> Tensor:
+def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
     """Sway (..., 3, L, S) at times (T,) since the stream began -> (..., T, S) in units of the motion; 0 before that."""
-    frequency_hz, cosine, sine = sway.unbind(-3)
-    turn = 2 * math.pi * times_s.double()[:, None, None] * frequency_hz[..., None, :, :]  # (..., T, L, S)
-    wave = cosine[..., None, :, :] * turn.cos() + sine[..., None, :, :] * turn.sin()
-    begun = (times_s / EASE_S).clamp(0, 1)
-    out: Tensor = (wave.sum(-2) * (begun**2 * (3 - 2 * begun))[:, None]).float()
-    return out
+    frequency_hz, cosine, sine = np.moveaxis(sway, -3, 0)
+    turn = 2 * math.pi * times_s[:, None, None] * frequency_hz[..., None, :, :]  # (..., T, L, S)
+    wave = cosine[..., None, :, :] * np.cos(turn) + sine[..., None, :, :] * np.sin(turn)
+    begun = np.clip(times_s / EASE_S, 0, 1)
+    return np.asarray(wave.sum(-2) * (begun**2 * (3 - 2 * begun))[:, None], np.float32)

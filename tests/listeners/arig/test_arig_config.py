@@ -27,6 +27,7 @@ LISTENERS = data_dir("configs") / "listeners"
         ({"diffusion": {"temperature": "hot"}}, "diffusion.temperature = 'hot'"),
         ({"chunks": 6}, "'chunks' is not a known key.*chunk_frames"),
         ({"code_levels": []}, "code_levels"),
+        ({"discrete": True, "draws": "step"}, "discrete: true is of draws: motion, not step"),
         ({"kind": "argi"}, "kind = 'argi' is not a kind of listener.*arig"),
     ],
 )

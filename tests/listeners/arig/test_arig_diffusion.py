@@ -19,6 +19,14 @@ def denoiser(**changes) -> Denoiser:
     return model
 
 
+def test_without_a_clamp_there_is_no_range_to_keep_to():
+    settings = config.Diffusion(width=12, steps=5, train_steps=40, clamp=False)
+    model = Denoiser(("jawOpen",), 8, settings)
+    far = float(model.high)
+    assert far >= 1e4 and float(model.low) == -far
+    assert torch.isfinite(model.high.half()).all(), "weights are kept in 16 bits"
+
+
 @torch.no_grad()
 def test_sampling_is_equation_4_where_nothing_is_clamped():
     model = denoiser()

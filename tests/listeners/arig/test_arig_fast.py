@@ -5,9 +5,8 @@ import torch
 from tiny_arig import arig_listener, arig_model, talk
 from torch import nn
 
-from sfms_robot.listeners.arig import fast
+from sfms_robot.listeners.arig import fast, torch_engine
 from sfms_robot.listeners.arig.fast import Int8Linear
-from sfms_robot.listeners.arig.stream import ArigListener
 
 MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8, "precision": "int8"}
 
@@ -46,7 +45,7 @@ def test_motion_differs_by_less_than_a_twentieth_of_its_spread():
 def test_the_model_given_stays_as_it_is():
     model = arig_model(**MIDDLE)
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    assert integers(ArigListener(model.settings, model).model)
+    assert integers(torch_engine(model.settings, model).model)
     assert not integers(model)
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
 

@@ -49,6 +49,6 @@ def test_a_listener_from_a_folder_runs_on_graphs(tmp_path):
     checkpoint.save_config(tmp_path, model.settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, model)
     found = arig.load(tmp_path).build_graphs()
-    assert all(isinstance(part, torch.jit.ScriptModule) for part in (found._frame_of_one, found._draw_of_one))
+    assert all(isinstance(part, torch.jit.ScriptModule) for part in found.engine._graphs.values())
     speaker = talk(5)
     np.testing.assert_allclose(streamed(found, speaker), streamed(arig_listener(), speaker), atol=1e-5)

@@ -1,5 +1,6 @@
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -8,10 +9,12 @@ from tiny_arig import arig_model
 
 from sfms_robot.config.arig import STATES
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
-from sfms_robot.listeners.arig.csu import FIRST
 from sfms_robot.listeners.arig.ibu import LongRange
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.parts import windows
+from sfms_robot.listeners.arig.rotary import rotary
+from sfms_robot.listeners.arig.sojourns import FIRST
+from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
 ABLATIONS = [
@@ -25,7 +28,9 @@ ABLATIONS = [
     {"sound": "wav2vec2"},
     {"draws": "innovation"},
     {"events": True},
-    {"events": True, "draws": "innovation", "discrete": True},
+    {"events": True, "draws": "innovation"},
+    {"events": True, "discrete": True},
+    {"phase": False},
 ]
 
 
@@ -149,6 +154,16 @@ def test_widths_follow_space_and_sound():
     assert WIDTHS["mel"] == 4 * 128 + 21
 
 
+def test_without_phase_it_hears_the_sound_alone():
+    model = arig_model(phase=False)
+    sound, heard, absent = torch.randn(3, model.sound_width), torch.ones(3, dtype=torch.bool), torch.zeros(16)
+    other = sound.clone()
+    other[:, -phase.FEATURES :] += 1.0
+    torch.testing.assert_close(model.embed_sound(sound, heard, absent), model.embed_sound(other, heard, absent))
+    other[:, 0] += 1.0
+    assert not torch.equal(model.embed_sound(sound, heard, absent), model.embed_sound(other, heard, absent))
+
+
 def test_windows_repeat_the_first_frame():
     x = torch.arange(4.0).view(1, 4, 1)
     assert windows(x, 3)[0, :, :, 0].tolist() == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]
@@ -177,10 +192,14 @@ def test_context_depends_on_how_far_apart_chunks_are_not_on_when():
     past, summary = torch.randn(3, 1, 8), torch.randn(1, 8)
 
     def cis(first: int) -> torch.Tensor:
-        cache = torch.zeros(2, 2, 1, 2, 0, 4)
+        cache = [torch.zeros(1, 2, 3, 4)] * 4
         for index, each in enumerate([*past, summary]):
-            made, keys = long.step(each, cache, long.rotary(torch.tensor([first + index])))
-            cache = torch.cat([cache, keys], dim=-2)
+            place = torch.from_numpy(rotary(np.array([first + index]), 4))
+            made, keys = long.step(each, cache, torch.arange(3)[None] >= 3 - index, place)
+            cache = [
+                torch.cat([old[:, :, 1:], new[:, :, None]], dim=2)
+                for old, new in zip(cache, keys.unbind(1), strict=True)
+            ]
         return made
 
     torch.testing.assert_close(cis(0), cis(500_000), rtol=1e-4, atol=1e-5)  # days later

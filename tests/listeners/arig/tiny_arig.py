@@ -5,9 +5,10 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
-from sfms_robot.listeners.arig import audio_frontend
+from sfms_robot.listeners.arig import audio_frontend, torch_engine
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.stream import ArigListener
+from sfms_robot.listeners.lots import Use, normals
 
 RAW = {
     "kind": "arig",
@@ -30,7 +31,7 @@ def arig_model(**changes) -> ArigModel:
 
 def arig_listener(**changes) -> ArigListener:
     model = arig_model(**changes)
-    return ArigListener(model.settings, model)
+    return ArigListener(model.settings, torch_engine(model.settings, model))
 
 
 def talk(frames: int, seed: int = 0, face: bool = True, audio: bool = True, agent: bool = True) -> list[SpeakerFrame]:
@@ -59,8 +60,9 @@ def streamed(
 
 def noise_of(listener: ArigListener, frames: int, seed: int = 1) -> torch.Tensor:
     """What a stream of that seed draws: (1, frames, steps, channels)."""
-    generator = torch.Generator().manual_seed(seed)
-    return torch.stack([torch.randn(listener.model.noise_shape, generator=generator) for _ in range(frames)])[None]
+    shape = listener.model.noise_shape
+    noise = [normals(seed, frame, Use.NOISE, *shape) for frame in range(1, 1 + frames)]
+    return torch.from_numpy(np.stack(noise))[None]
 
 
 def dyad_of(

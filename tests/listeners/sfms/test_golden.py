@@ -7,7 +7,8 @@ import pytest
 import torch
 from tiny_sfms import guided_listener, plans_of, speech, tiny_listener
 
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED
+from sfms_robot.listeners.sfms.predictor import Context
 
 GOLDEN = Path(__file__).parents[2] / "assets" / "sfms_tiny.npz"
 

@@ -4,7 +4,8 @@ import pytest
 import torch
 from tiny_sfms import tiny_listener
 
-from sfms_robot.listeners.sfms.predictor import UNDECIDED, Context, LastKeyframes, last_keyframes
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED
+from sfms_robot.listeners.sfms.predictor import Context, LastKeyframes, last_keyframes
 from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)

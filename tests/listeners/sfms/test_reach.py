@@ -1,3 +1,4 @@
+import numpy as np
 import torch
 from tiny_sfms import tiny_listener
 
@@ -5,16 +6,18 @@ from sfms_robot.listeners.sfms.quantizer import indices_to_codes
 from sfms_robot.listeners.sfms.reachable import Reach
 
 
-def listener_with_speed(speed: float):
+def listener_with_speed(speed: float, bounded: bool = True):
     listener = tiny_listener()
     listener.model.motion_speed.fill_(speed)
-    return listener.model, Reach(listener.model)
+    groups = [range(6), range(6, 58)]
+    codes = listener.engine.run("rest", np.zeros((1, 40, 58), np.float32), np.zeros((1, 40, 2), np.float32))[1][0]
+    return listener.model, Reach(codes, groups, [6, 8], listener.engine.tensors["motion_speed"], bounded)
 
 
 def test_a_code_may_follow_itself_and_class_0_anything():
     _, reach = listener_with_speed(1e-6)
     for code in range(1, 7):
-        allowed = ~reach.too_soon(torch.tensor([code, code]), torch.tensor([1, 1]))
+        allowed = ~reach.too_soon(np.array([[code, code]]), np.array([[1, 1]]))[0]
         assert allowed[:, 0].all() and allowed[:, code].all()
 
 
@@ -24,15 +27,20 @@ def test_allowed_codes_are_exactly_those_no_channel_has_to_hurry_for():
     codes = indices_to_codes(torch.arange(6)[:, None].expand(6, 2), quantizer.levels)
     neck = quantizer.decode(codes[None])[0, :, :6].detach()
     for gap in (1, 5, 20):
-        allowed = ~reach.too_soon(torch.tensor([3, 0]), torch.tensor([gap, gap]))[0, 1:7]
-        assert torch.equal(allowed, ((neck - neck[2]).abs() <= 0.1 * gap).all(-1))
+        allowed = ~reach.too_soon(np.array([[3, 0]]), np.array([[gap, gap]]))[0, 0, 1:7]
+        np.testing.assert_array_equal(allowed, ((neck - neck[2]).abs() <= 0.1 * gap).all(-1))
+
+
+def test_without_bounds_every_code_may_follow_at_once():
+    _, reach = listener_with_speed(1e-6, bounded=False)
+    assert (~reach.too_soon(np.array([[1, 1]]), np.array([[1, 1]])))[0].sum(1).tolist() == [7, 9]
 
 
 def test_a_group_with_fewer_codes_never_gets_one_it_lacks():
     _, reach = listener_with_speed(1e6)
-    assert (~reach.too_soon(torch.tensor([1, 1]), torch.tensor([9, 9]))).sum(1).tolist() == [7, 9]
+    assert (~reach.too_soon(np.array([[1, 1]]), np.array([[9, 9]])))[0].sum(1).tolist() == [7, 9]
 
 
 def test_without_a_keyframe_so_far_every_code_is_allowed():
     _, reach = listener_with_speed(1e-6)
-    assert (~reach.too_soon(torch.tensor([0, 0]), torch.tensor([1, 1]))).sum(1).tolist() == [7, 9]
+    assert (~reach.too_soon(np.array([[0, 0]]), np.array([[1, 1]])))[0].sum(1).tolist() == [7, 9]

@@ -50,4 +50,4 @@ def test_a_listener_from_a_folder_runs_on_graphs(tmp_path):
     checkpoint.save_config(tmp_path, plain.settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, plain.model)
     found = sfms.load(tmp_path).build_graphs()
-    assert isinstance(found._decode_one, torch.jit.ScriptModule) and found.sampler._graphs is not None
+    assert all(isinstance(part, torch.jit.ScriptModule) for part in found.engine._graphs.values())

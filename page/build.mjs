@@ -1,0 +1,52 @@
+// Builds src/ into ../sfms_robot/viewer/static/. With --check: says whether what is there is what src/ gives.
+
+import { build } from 'esbuild';
+import { cpSync, existsSync, mkdirSync, mkdtempSync, readFileSync, readdirSync, rmSync, statSync, writeFileSync } from 'node:fs';
+import { tmpdir } from 'node:os';
+import { dirname, join, relative } from 'node:path';
+import { fileURLToPath } from 'node:url';
+
+const here = dirname(fileURLToPath(import.meta.url));
+const target = join(here, '..', 'sfms_robot', 'viewer', 'static');
+const VISION = ['vision_wasm_internal.js', 'vision_wasm_internal.wasm'];
+const LICENSES = `urdf-loader: Apache License 2.0, Copyright Garrett Johnson, https://github.com/gkjohnson/urdf-loaders
+@mediapipe/tasks-vision: Apache License 2.0, Copyright The MediaPipe Authors, https://github.com/google-ai-edge/mediapipe
+three: as follows
+
+`;
+
+async function built(folder) {
+  await build({
+    absWorkingDir: here,
+    entryPoints: { app: 'src/main.js', 'voice-worklet': 'src/voice-worklet.js' },
+    outdir: folder, bundle: true, splitting: true, format: 'esm', minify: true, target: 'es2022',
+    chunkNames: '[name]', legalComments: 'none', logLevel: 'warning',
+  });
+  await build({ absWorkingDir: here, entryPoints: ['src/app.css'], outdir: folder, minify: true, logLevel: 'warning' });
+  cpSync(join(here, 'src', 'index.html'), join(folder, 'index.html'));
+  mkdirSync(join(folder, 'vision'), { recursive: true });
+  for (const file of VISION) cpSync(join(here, 'node_modules/@mediapipe/tasks-vision/wasm', file), join(folder, 'vision', file));
+  writeFileSync(join(folder, 'LICENSES.txt'), LICENSES + readFileSync(join(here, 'node_modules/three/LICENSE'), 'utf8'));
+}
+
+function files(folder) {
+  return readdirSync(folder, { recursive: true }).filter((name) => statSync(join(folder, name)).isFile()).sort();
+}
+
+if (process.argv.includes('--check')) {
+  const fresh = mkdtempSync(join(tmpdir(), 'page-'));
+  await built(fresh);
+  const names = [...new Set([...files(fresh), ...(existsSync(target) ? files(target) : [])])];
+  const differ = names.filter((name) => {
+    const [a, b] = [join(fresh, name), join(target, name)];
+    return !existsSync(a) || !existsSync(b) || !readFileSync(a).equals(readFileSync(b));
+  });
+  rmSync(fresh, { recursive: true });
+  if (differ.length) {
+    console.error(`${relative(process.cwd(), target)} is not what src/ gives: ${differ.join(', ')}; npm run build`);
+    process.exit(1);
+  }
+} else {
+  rmSync(target, { recursive: true, force: true });
+  await built(target);
+}

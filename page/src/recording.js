@@ -1,0 +1,23 @@
+// Record the run, take the file along, look at the run again.
+
+import { make } from './dom.js';
+
+export function recordingPanel(hello, connection, replays) {
+  const state = hello.record;
+  const on = state?.on ?? false;
+  const record = make('button', { type: 'button', 'aria-pressed': String(on), onclick: () => connection.send('record', { on: record.getAttribute('aria-pressed') !== 'true' }) }, on ? 'Stop recording' : 'Record');
+  const token = connection.token ? `?token=${encodeURIComponent(connection.token)}` : '';
+  const download = make('a', { href: `recording${token}`, download: '' }, 'Download');
+  const said = make('p', { className: 'sent', role: 'status' });
+  const replay = make('button', { type: 'button', onclick: async () => {
+    try { await replays(); said.textContent = ''; } catch (error) { said.textContent = error.message; }
+  } }, 'Replay the run so far');
+  download.hidden = !state;
+  const show = (now) => {
+    record.setAttribute('aria-pressed', String(now.on));
+    record.textContent = now.on ? `Stop recording (${(now.seconds ?? 0).toFixed(0)} s)` : 'Record';
+    download.hidden = false;
+  };
+  connection.addEventListener('record', ({ detail }) => show(detail));
+  return [make('div', { className: 'row' }, record, download, replay), said];
+}

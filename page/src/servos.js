@@ -1,0 +1,54 @@
+// The table of servos: what each was asked, what it read, and how it is.
+
+import { make } from './dom.js';
+
+const HOT_C = 60;
+const COLUMNS = [
+  ['asked °', (joint) => degrees(joint.goal_rad)],
+  ['read °', (joint) => degrees(joint.present_rad)],
+  ['age ms', (joint) => number(joint.age_s, 1000, 0)],
+  ['°C', (joint) => number(joint.temperature_C, 1, 0)],
+  ['load', (joint) => number(joint.load ?? joint.load_fraction ?? joint.current_A, 1, 2)],
+  ['V', (joint) => number(joint.voltage_V, 1, 1)],
+  ['errors', (joint) => number(joint.errors ?? joint.hardware_error, 1, 0)],
+];
+
+const number = (value, by, digits) => (Number.isFinite(value) ? (value * by).toFixed(digits) : '–');
+const degrees = (rad) => number(rad, 180 / Math.PI, 1);
+
+export class ServoTable {
+  constructor(choose) {
+    this.body = make('tbody');
+    this.summary = make('p', { className: 'quiet' });
+    this.choose = choose;
+    const head = make('tr', {}, ...['joint', ...COLUMNS.map(([name]) => name), 'fault'].map((name) => make('th', { scope: 'col' }, name)));
+    this.table = make('table', {}, make('thead', {}, head), this.body);
+    this.element = make('div', {}, this.summary, make('div', { className: 'scroll', tabIndex: 0, role: 'region', 'aria-label': 'Servos' }, this.table));
+    this.facts = {};
+  }
+
+  begin(joints) {
+    this.facts = Object.fromEntries(joints.map((joint) => [joint.name, joint]));
+    this.body.replaceChildren();
+  }
+
+  /** The status document's `joints` and `faults`, once a second. */
+  show(status) {
+    const faults = status.faults ?? {};
+    const rows = Object.entries(status.joints ?? {}).map(([name, joint]) => {
+      const { bus, id, model } = this.facts[name] ?? {};
+      const title = `${model ?? ''} id ${id ?? '?'} on ${bus ?? '?'}; click: its curve`;
+      const row = make('tr', { title, onclick: () => this.choose(name) }, make('td', {}, name), ...COLUMNS.map(([, of]) => make('td', {}, of(joint))), make('td', {}, faults[name] ?? ''));
+      row.className = faults[name] ? 'bad' : joint.temperature_C >= HOT_C ? 'hot' : '';
+      return row;
+    });
+    this.body.replaceChildren(...rows);
+    const hottest = status.hottest;
+    const tick = status.tick?.achieved_hz ?? status.tick?.hz;
+    this.summary.textContent = [
+      tick ? `${tick.toFixed(0)} ticks a second` : '',
+      hottest ? `warmest: ${hottest.joint}, ${hottest.temperature_C.toFixed(0)} °C` : '',
+      `${Object.keys(faults).length || 'no'} fault${Object.keys(faults).length === 1 ? '' : 's'}`,
+    ].filter(Boolean).join(' · ');
+  }
+}

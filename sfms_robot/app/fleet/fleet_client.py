@@ -1,0 +1,124 @@
+"""`sfms-robot fleet`: who is there, and halt or resume of some or all. The other side of `fleet_head`."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from sfms_robot.app.fleet.fleet_head import ROOT, fleet_name
+from sfms_robot.errors import PortError
+from sfms_robot.network import AWAY_S, LOOPBACK, Connection, session_config
+
+ASK_S: Final = 2.0  # that heads have to answer
+GONE_S: Final = 3.0  # a head that has told nothing for so long is away
+
+Document = Mapping[str, Any]
+
+
+class Fleet:
+    """A connection to whatever joins the heads. Opens in `__enter__`, which waits for `AWAY_S` at most.
+
+    Raises PortError when nobody answers there, ConfigError, MissingExtra.
+    """
+
+    def __init__(self, file: Path | None = None) -> None:
+        self._file = file
+        self._connection: Connection | None = None
+        self._session: Any = None
+
+    def __enter__(self) -> Self:
+        self._connection = Connection(session_config("call", self._file))
+        self._session = self._connection.wait(AWAY_S)
+        if self._session is None:
+            where = LOOPBACK if self._file is None else f"the endpoints of {self._file}"
+            self._connection.close()
+            raise PortError(f"nobody answers at {where}: is `sfms-robot serve`, or another zenoh router, running?")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._connection is not None:
+            self._connection.close()
+
+    def states(self) -> list[Document]:
+        """The status document of every head that answers, by name. Blocks for `ASK_S` at most."""
+        found = self._ask(f"{ROOT}/*/state", b"")
+        return sorted(found, key=lambda each: str(each.get("name")))
+
+    def command(self, heads: Sequence[str], command: Mapping[str, Any]) -> list[Document]:
+        """What each of `heads` answers to a command; all heads where none is named."""
+        keys = [f"{ROOT}/{fleet_name(head)}/command" for head in heads] or [f"{ROOT}/*/command"]
+        return [answer for key in keys for answer in self._ask(key, json.dumps(dict(command)).encode())]
+
+    def halt(self, heads: Sequence[str], by: str) -> list[Document]:
+        """Halt `heads`, or all; said twice: on the keys for halting, which ask for no answer, and as a command."""
+        for key in [f"{ROOT}/{fleet_name(head)}/halt" for head in heads] or [f"{ROOT}/*/halt"]:
+            self._session.put(key, by.encode())
+        return self.command(heads, {"command": "halt", "by": by})
+
+    def follow(self, tell: Callable[[Document], None]) -> None:
+        """`tell` of every document from now on, in a thread of zenoh's."""
+        self._session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._tell(sample.payload.to_bytes(), tell))
+
+    def _ask(self, key: str, payload: bytes) -> list[Document]:
+        answers: list[Document] = []
+        for reply in self._session.get(key, payload=payload, timeout=ASK_S):
+            if reply.ok is not None:
+                self._tell(reply.ok.payload.to_bytes(), answers.append)
+        return answers
+
+    @staticmethod
+    def _tell(message: bytes, tell: Callable[[Document], None]) -> None:
+        try:
+            told = json.loads(message)
+        except ValueError:
+            return
+        if isinstance(told, dict):
+            tell(told)
+
+
+class FleetBoard:
+    """The newest of every head, and who went away. From any thread."""
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._heads: dict[str, tuple[float, Document]] = {}
+        self._lock = threading.Lock()
+
+    def told(self, document: Document) -> None:
+        with self._lock:
+            self._heads[str(document.get("name", "?"))] = (self._now_s(), document)
+
+    def tiles(self) -> list[dict[str, Any]]:
+        """One per head, by name: what a page shows of it."""
+        with self._lock:
+            heads = sorted(self._heads.items())
+        return [tile(name, document, self._now_s() - at_s) for name, (at_s, document) in heads]
+
+
+def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
+    """A head in a few words; `here` False: it has told nothing for `GONE_S`, or it has ended."""
+    state = str(document.get("state", "?"))
+    hottest = document.get("hottest")
+    return {
+        "name": name,
+        "head": document.get("head"),
+        "listener": document.get("listener"),
+        "port": document.get("port"),
+        "here": age_s < GONE_S and state not in ("stopped", "fault"),
+        "age_s": round(age_s, 1),
+        "state": state,
+        "why": document.get("why", []),
+        "note": document.get("note"),
+        "time_s": document.get("time_s"),
+        "voice_db": (document.get("person") or {}).get("voice_db"),
+        "motion": document.get("motion"),
+        "hottest": hottest,
+        "faults": document.get("faults", {}),
+    }

@@ -1,0 +1,191 @@
+"""`run --fleet NAME`: a head among others, over zenoh.
+
+    sfms/NAME/state     the status document (`runtime.status`) as JSON: once a second, at every change of state, and to
+                        whoever asks (a query)
+    sfms/NAME/command   JSON, as a query that is answered {"done": command} or {"error": line}, or as a put:
+                        {"command": "halt"} {"command": "resume"} {"command": "end"}
+                        {"command": "calm", "rates": {kind: per minute}}
+                        {"command": "knobs", "intensity": {region: value}, "style": {region: value}}
+    sfms/NAME/halt      whatever is put here halts the head; the text says who. sfms/*/halt halts all
+
+The network may be away: the head goes on, and tells again when it is back. Halting by network is a convenience: an
+emergency stop is a switch on the head (docs/safety.md).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sfms_robot.app.listen.knobs import LiveKnobs
+from sfms_robot.config import Calmness
+from sfms_robot.config.base import parse
+from sfms_robot.errors import ConfigError, RobotError
+from sfms_robot.network import Connection, check_name, session_config
+from sfms_robot.ports import Observer, Tick
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt
+
+if TYPE_CHECKING:
+    import zenoh
+
+ROOT: Final = "sfms"
+TAKEN: Final = ("listen",)  # names whose keys mean something else
+TELL_S: Final = 1.0
+COMMANDS: Final = ("halt", "resume", "end", "calm", "knobs")
+_LONGEST: Final = 4096
+_LONGEST_NAME: Final = 80
+
+log = logging.getLogger(__name__)
+
+
+def fleet_name(name: str) -> str:
+    """`name`, which a head may have. Raises ConfigError."""
+    if name in TAKEN:
+        raise ConfigError(f"--fleet {name!r}: that name is taken ({', '.join(TAKEN)})")
+    return check_name(name, "--fleet")
+
+
+class FleetControls:
+    """What a command may do to a run, from any thread."""
+
+    def __init__(
+        self,
+        halt: HaltLatch,
+        interrupt: Interrupt,
+        knobs: LiveKnobs | None,
+        calm: Callable[[Calmness], None] | None,
+    ) -> None:
+        self._halt, self._interrupt, self._knobs, self._calm = halt, interrupt, knobs, calm
+
+    def halt(self, by: str) -> None:
+        """`by` as who asked calls themselves."""
+        self._halt.close(_plain(by) or "the fleet")
+
+    def obey(self, message: bytes) -> dict[str, str]:
+        """The effect of a command, or why it has none. Never raises."""
+        try:
+            asked = json.loads(message[:_LONGEST]) if len(message) <= _LONGEST else None
+            if not isinstance(asked, dict) or asked.get("command") not in COMMANDS:
+                raise ConfigError(f'no command: {{"command": ...}} with one of {", ".join(COMMANDS)}')
+            self._do(asked["command"], asked)
+        except (RobotError, ValueError, TypeError, RecursionError) as error:
+            return {"error": (str(error).splitlines() or ["no command"])[0]}
+        return {"done": asked["command"]}
+
+    def _do(self, command: str, asked: Mapping[str, Any]) -> None:
+        if command == "halt":
+            self.halt(str(asked.get("by", "")))
+        elif command == "resume":
+            self._halt.open()
+        elif command == "end":
+            self._interrupt.ask()
+        elif command == "calm":
+            calmness = parse(Calmness, _mapping(asked, "rates"), "calm")
+            if self._calm is None:
+                raise ConfigError("calm: this run's listener decides no events")
+            self._calm(calmness)
+        else:
+            self._turn(asked)
+
+    def _turn(self, asked: Mapping[str, Any]) -> None:
+        if self._knobs is None:
+            raise ConfigError("knobs: this run has none")
+        for kind in ("intensity", "style"):
+            for region, value in _mapping(asked, kind).items():
+                if not isinstance(value, int | float):
+                    raise ConfigError(f"knobs: {kind} of {region} = {value!r} is no number")
+                setattr(self._knobs[region], kind, float(value))
+
+
+class FleetHead(Observer):
+    """`ports.Observer`; tells from a thread of its own.
+
+    Args:
+        name: of this head among others.
+        document: what is told.
+        file: zenoh's configuration; None: loopback.
+
+    Raises ConfigError, MissingExtra.
+    """
+
+    def __init__(
+        self, name: str, document: Callable[[], Mapping[str, Any]], controls: FleetControls, file: Path | None = None
+    ) -> None:
+        self._name, self._document, self._controls = fleet_name(name), document, controls
+        self._connection = Connection(session_config("call", file))
+        self._changed = threading.Condition()
+        self._news = self._over = False
+        self._state: tuple[str, tuple[str, ...]] = ("", ())
+        self._thread = threading.Thread(target=self._work, name="fleet", daemon=True)
+        self._thread.start()
+
+    def tick(self, seen: Tick) -> None:
+        state = seen.state, seen.why
+        if state != self._state:
+            self._state = state
+            with self._changed:
+                self._news = True
+                self._changed.notify()
+
+    def close(self) -> None:
+        """Idempotent; tells how it ended first."""
+        with self._changed:
+            self._over = True
+            self._changed.notify()
+        self._thread.join(TELL_S)
+        self._connection.close()
+
+    def _work(self) -> None:
+        session = None
+        while session is None:
+            try:
+                session = self._connection.wait(TELL_S)
+            except RobotError as error:
+                log.error("fleet: %s; the head goes on without", error)
+                return
+            if self._over:
+                return
+        key = f"{ROOT}/{self._name}"
+        session.declare_queryable(f"{key}/state", lambda query: query.reply(f"{key}/state", self._told()))
+        session.declare_queryable(f"{key}/command", self._on_query)
+        session.declare_subscriber(f"{key}/command", lambda sample: self._obey(sample.payload.to_bytes()))
+        session.declare_subscriber(f"{key}/halt", self._on_halt)
+        while True:
+            session.put(f"{key}/state", self._told())
+            with self._changed:
+                if self._over:
+                    return
+                self._changed.wait_for(lambda: self._news or self._over, TELL_S)
+                self._news = False
+
+    def _told(self) -> bytes:
+        return json.dumps({**self._document(), "name": self._name}, allow_nan=False).encode()
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        answer = self._obey(b"" if query.payload is None else query.payload.to_bytes())
+        query.reply(f"{ROOT}/{self._name}/command", json.dumps({"name": self._name, **answer}).encode())
+
+    def _obey(self, message: bytes) -> dict[str, str]:
+        answer = self._controls.obey(message)
+        if "error" in answer:
+            log.warning("fleet: %s", answer["error"])
+        return answer
+
+    def _on_halt(self, sample: zenoh.Sample) -> None:
+        self._controls.halt(sample.payload.to_bytes()[:_LONGEST_NAME].decode(errors="replace"))
+
+
+def _mapping(asked: Mapping[str, Any], key: str) -> dict[str, Any]:
+    given = asked.get(key, {})
+    if not isinstance(given, dict):
+        raise ConfigError(f"{key} is no mapping")
+    return given
+
+
+def _plain(text: str) -> str:
+    return "".join(each for each in text if each.isprintable())[:_LONGEST_NAME].strip()

@@ -1,0 +1,51 @@
+"""A head's picture with its forward kinematics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from sfms_robot.config import Head, load_head
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.errors import ConfigError
+from sfms_robot.face.robot_scene import RobotScene
+from sfms_robot.retarget.kinematics import build_neck
+
+_CELL_PX: Final = (300, 290)
+_COLUMNS: Final = 3
+
+
+def scene_of(head: Head) -> RobotScene | None:
+    """The robot to be drawn; None for a head of somebody's own whose file names no URDF. Raises ConfigError."""
+    neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
+    return RobotScene.of(head, neck)
+
+
+def draw_scene(name: str, png: Path) -> dict[str, Any]:
+    """Draw a head at rest, and tell which URDF it is and what its joints follow. Raises ConfigError, MissingExtra."""
+    head = load_head(name)
+    scene = scene_of(head)
+    if scene is None:
+        raise ConfigError(f"{head.folder or name}/head.yaml: urdf says what the head looks like, and is not there")
+    from sfms_robot.face.robot_drawing import render_robot
+
+    render_robot(png, scene, scene.rest())
+    return {
+        "name": name,
+        "urdf": str(scene.urdf),
+        "picture": str(png),
+        "follows": dict(scene.follows),
+        "by_kinematics": [joint for joint in scene.joints if joint not in scene.follows.values()],
+        "undriven": list(scene.undriven),
+    }
+
+
+def draw_shipped_heads(png: Path) -> None:
+    """Every shipped head at rest, side by side. Raises ConfigError, MissingExtra."""
+    from sfms_robot.face.robot_drawing import render_robots
+
+    robots = []
+    for name in shipped_names(data_dir("configs") / "heads", "head.yaml"):
+        if (scene := scene_of(load_head(name))) is not None:
+            robots.append((name, scene, scene.rest()))
+    render_robots(png, robots, _COLUMNS, _CELL_PX)

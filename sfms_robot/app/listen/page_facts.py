@@ -1,0 +1,64 @@
+"""What a page is told of a run when it begins: the `hello` of docs/page.md, but for what differs between visitors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
+from sfms_robot.app.listen.knobs import LiveKnobs
+from sfms_robot.app.listen.named_expressions import NAMED_EXPRESSIONS
+from sfms_robot.config import Calmness, Head
+from sfms_robot.frames import CHANNELS
+from sfms_robot.viewer.visitor_commands import VERSION
+
+
+def page_facts(
+    head: Head,
+    *,
+    port: str,
+    listener: str,
+    speaker: str | None,
+    seed: int,
+    calmness: Calmness,
+    knobs: LiveKnobs,
+    source: Mapping[str, bool],
+    choices: bool,
+) -> dict[str, Any]:
+    """`speaker`: name of the recorded person; None: somebody live. `source`: what a visitor may bring of the person.
+
+    `choices`: another listener, speaker or seed may be chosen.
+    """
+    return {
+        "version": VERSION,
+        "head": head.name,
+        "port": port,
+        "listener": Path(listener).name,
+        "speaker": speaker,
+        "seed": seed,
+        "listeners": _lines(shipped_listeners(), "description") if choices else [],
+        "speakers": _lines(shipped_speakers(), "description") if choices else [],
+        "joints": [
+            {
+                "name": name, "min_rad": joint.min_rad, "max_rad": joint.max_rad, "rest_rad": joint.rest_rad,
+                "bus": joint.bus, "id": joint.id, "model": joint.model,
+            }
+            for name, joint in head.joints.items()
+        ],
+        "urdf_joints": list(head.joints),
+        "urdf": None,
+        "channels": list(CHANNELS),
+        "regions": list(knobs),
+        "expressions": NAMED_EXPRESSIONS,
+        "intensity": knobs.values["intensity"],
+        "style": knobs.values["style"],
+        "calmness": calmness.model_dump(exclude={"addressed"}),
+        "human": "human/head.bin",
+        "source": dict(source),
+        "replay": False,
+    }  # fmt: skip
+
+
+def _lines(rows: list[dict[str, Any]], line: str) -> list[dict[str, str]]:
+    return [{"name": row["name"], "line": row[line]} for row in rows]

@@ -1,0 +1,141 @@
+"""A run as its page shows it: 25 pictures a second, events as they are decided, once a second how it is.
+
+The loop pays for a few assignments a tick. Numbers are put together in the thread that sends them, and turned into text
+in the page's process.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final, TypeVar
+
+import numpy as np
+
+from sfms_robot.frames import FRAME_HZ, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.planned_events import PlannedEvents
+from sfms_robot.signals import voice_activity
+from sfms_robot.signals.audio import energy_db
+from sfms_robot.viewer.frame_record import NOTHING, Picture, pack_picture, rare_json
+from sfms_robot.viewer.page_process import PageProcess
+
+EVENTS_S: Final = 1.0  # between two looks for events in the plans of a listener that decides none
+STATUS_S: Final = 1.0
+_WAITING: Final = 25  # frames and plans, of a second, that nobody has looked at
+_EPS_FRAMES: Final = 1e-6
+
+T = TypeVar("T")
+
+
+class PageObserver:
+    """`ports.Observer`.
+
+    Args:
+        joints: names, in the order of `Tick.goals_rad`.
+
+    Attributes:
+        document: how the run is, for who looks: see `runtime.status`; None: not known yet.
+    """
+
+    def __init__(self, page: PageProcess, joints: Sequence[str]) -> None:
+        self.document: Callable[[], Mapping[str, Any]] | None = None
+        self._page, self._joints = page, tuple(joints)
+        self._index = -1
+        self._tick: Tick | None = None
+        self._frames: deque[SpeakerFrame] = deque(maxlen=_WAITING)
+        self._plans: deque[Plan] = deque(maxlen=_WAITING)
+        # Below: of the thread that sends.
+        self._frame: SpeakerFrame | None = None
+        self._voice_db = self._own_db = NOTHING
+        self._ear = voice_activity.start()
+        self._events = PlannedEvents()
+        self._hazards_hz: Mapping[str, float] = {}
+        self._looked_s = self._told_s = -math.inf
+        self._rare: tuple[Any, bytes] = (None, b"")
+
+    def tick(self, seen: Tick) -> None:
+        index = math.floor(seen.time_s * FRAME_HZ + _EPS_FRAMES)
+        if index != self._index:
+            self._index = index
+            self._tick = replace(seen, readings=dict(seen.readings))  # the bus may go on changing its own
+            self._page.show(self._pack)
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        self._frames.append(frame)
+
+    def planned(self, plan: Plan) -> None:
+        self._plans.append(plan)
+
+    def close(self) -> None:
+        """The page is closed by who opened it."""
+
+    def _pack(self) -> bytes:
+        """The newest tick, for the page's process."""
+        seen = self._tick
+        assert seen is not None
+        self._hear()
+        self._look(seen.time_s)
+        if self.document is not None and self._page.visitors and seen.time_s - self._told_s >= STATUS_S:
+            self._told_s = seen.time_s
+            self._page.say("status", status=self.document())
+        frame = self._frame
+        place_m = None if frame is None else frame.place_m
+        attention = None if frame is None else frame.attention
+        return pack_picture(
+            Picture(
+                seen.time_s, seen.motion, seen.goals_rad, self._read_rad(seen), self._rare_json(seen),
+                self._voice_db, self._own_db, NOTHING if attention is None else attention,
+                (NOTHING, NOTHING, NOTHING) if place_m is None else place_m, self._ear.active,
+            )
+        )  # fmt: skip
+
+    def _hear(self) -> None:
+        for frame in _drained(self._frames):
+            self._frame = frame
+            self._voice_db = energy_db(frame.audio) if len(frame.audio) else NOTHING
+            if len(frame.audio):
+                self._ear = voice_activity.step(self._voice_db, self._ear)
+            self._own_db = NOTHING if frame.agent_audio is None else energy_db(frame.agent_audio)
+
+    def _look(self, now_s: float) -> None:
+        """Events of the plans; looking for those that a listener does not tell takes a millisecond: once a second."""
+        decides = False
+        for plan in _drained(self._plans):
+            self._events.join(plan)
+            self._hazards_hz = plan.hazards_hz
+            decides = bool(plan.events or plan.hazards_hz)
+        if decides or now_s - self._looked_s >= EVENTS_S:
+            self._looked_s = now_s
+            for event in self._events.news():
+                self._page.say("event", **_event(event))
+
+    def _read_rad(self, seen: Tick) -> Floats:
+        read = (seen.readings[joint].position_rad if joint in seen.readings else None for joint in self._joints)
+        return np.fromiter((math.nan if each is None else each for each in read), np.float32, len(self._joints))
+
+    def _rare_json(self, seen: Tick) -> bytes:
+        faults = {joint: reading.fault for joint, reading in seen.readings.items() if reading.fault}
+        key = (seen.state, seen.why, faults, self._hazards_hz)
+        if key != self._rare[0]:
+            self._rare = (key, rare_json(*key))
+        return self._rare[1]
+
+
+def _drained(waiting: deque[T]) -> Iterator[T]:
+    while waiting:
+        yield waiting.popleft()
+
+
+def _event(event: ListenerEvent) -> dict[str, Any]:
+    return {
+        "event": event.kind,
+        "at_s": round(event.start_s, 3),
+        "lasts_s": round(event.duration_s, 3),
+        "size": round(event.size, 4),
+        "swings": event.swings,
+        "probability": None if event.probability is None else round(event.probability, 5),
+        "evidence": {name: round(float(value), 3) for name, value in event.evidence.items()},
+    }

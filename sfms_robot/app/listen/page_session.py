@@ -1,0 +1,246 @@
+"""A page, and the runs behind it: one, or one after the other where visitors may choose listener, speaker and seed.
+
+A visitor's choice brings the head to rest, and the next run begins with it; the page stays.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import asdict, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from sfms_robot.app import session
+from sfms_robot.app.head.head_scene import scene_of
+from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.page_commands import PageCommands, Reach
+from sfms_robot.app.listen.page_facts import page_facts
+from sfms_robot.app.listen.page_observer import PageObserver
+from sfms_robot.app.listen.page_recorder import PageRecorder
+from sfms_robot.app.listen.preflight import begin_listening
+from sfms_robot.app.listen.run_facts import run_facts
+from sfms_robot.config import Calmness, load_head
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.errors import InputError
+from sfms_robot.listeners.open_feed import NamedFeed
+from sfms_robot.ports import Observer, Tick
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.retarget.puppet import Puppet
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.sources.browser import Visitor
+from sfms_robot.sources.registry import BROWSER, open_source, split_kind
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER, speakers
+from sfms_robot.viewer.page_process import PageProcess
+
+AWAY_S: Final = 5.0  # nobody has looked for so long: a page that is loaded anew is back sooner
+LEFT_S: Final = 30.0
+_LOOK_S: Final = 0.5
+MAX_SEED: Final = 2**32 - 1
+
+logger = logging.getLogger(__name__)
+
+
+class PageSession:
+    """One page, from `open_page` on, and what runs behind it.
+
+    Args:
+        options: of the first run.
+        choices: visitors may choose another listener, speaker and seed, and be the person themselves.
+
+    Attributes:
+        options: of the run that goes on, or went on last.
+        released: a visitor has ended that run.
+    """
+
+    def __init__(self, page: PageProcess, options: session.RunOptions, folder: Path, choices: bool) -> None:
+        self.page, self.options, self.released = page, options, False
+        self._folder, self._choices = folder, choices
+        shipped = shipped_names(data_dir("configs") / "listeners", "config.yaml")
+        self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in shipped}}
+        self._person = Visitor()
+        self._interrupt: Interrupt | None = None
+        self._wanted: session.RunOptions | None = None
+        self._chosen = threading.Event()
+        self._commands = PageCommands(self._choose, self._feeds, self._person)
+        page.answered_by(self._commands)
+
+    def run(
+        self,
+        panel: session.Panel | None = None,
+        feed: NamedFeed | None = None,
+        observers: Sequence[Observer] = (),
+    ) -> dict[str, Any]:
+        """Once, with `options`. Blocks until it is over; returns its report. Raises as `session.run`.
+
+        `feed`: a listener of these options that loads already; None: it is started here, and ended.
+        """
+        options = self.options
+        head = load_head(options.head)
+        knobs = turned(head, options.intensity, options.style)
+        calmness = options.calmness or Calmness()
+        watcher = PageObserver(self.page, list(head.joints))
+        self._interrupt = interrupt = Interrupt()
+        self._chosen.clear()
+        self.released = False
+        with ExitStack() as stack:
+            feed = feed or self._listener(stack)
+            halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
+            scene_of(head)  # a picture that is broken is said before anything moves
+            self.page.say("begin", scene=str(options.head), **self._facts(head, knobs, calmness))
+            facts = run_facts(head, options.listener, {**asdict(options), "audio": options.hears, "calmness": None})
+            recorder = PageRecorder(self.page, self._folder, list(head.joints), facts)
+            lonely = self._lonely(interrupt)
+            stack.callback(recorder.close)
+            self._commands.reach = Reach(halt, puppet, knobs, calmness, feed.calm, recorder.record, self._release)
+            stack.callback(self._out_of_reach)
+            report = session.run(
+                options, _told_to(watcher, panel), source=self._source(stack), feed=feed,
+                observers=[watcher, recorder, *lonely, *observers], knobs=knobs,
+                overlay=puppet.overlay, interrupt=interrupt, halt=halt,
+            )  # fmt: skip
+        if report["exit"] == "interrupted" and any(each.ended for each in lonely):  # its proper end
+            report |= {"exit": "done", "exit_code": 0}
+        if self._wanted is None:
+            self.page.say("end", report=report)
+        return report
+
+    def next(self, stay: bool) -> bool:
+        """Whether a visitor has chosen another run, which `options` now name.
+
+        `stay`: while somebody looks that is waited for. Blocks until then, or until all have gone for `AWAY_S`.
+        """
+        alone_s = 0.0
+        while self._wanted is None and stay and self.page.visited.is_set() and alone_s < AWAY_S:
+            self._chosen.wait(_LOOK_S)
+            alone_s = 0.0 if self.page.visitors else alone_s + _LOOK_S
+        if self._wanted is None:
+            return False
+        self.options, self._wanted = self._wanted, None
+        return True
+
+    def _lonely(self, interrupt: Interrupt) -> list[EndsAlone]:
+        """A demo of which a visitor is the person ends when nobody looks any more: nothing else would end it."""
+        endless = self._choices and any(_taken_of_visitors(self.options).values())
+        return [EndsAlone(self.page, interrupt)] if endless else []
+
+    def _out_of_reach(self) -> None:
+        self._commands.reach = None
+
+    def _listener(self, stack: ExitStack) -> NamedFeed:
+        feed = begin_listening(self.options.listener, self.options.seed, self.options.calmness, self.options.zenoh)
+        stack.callback(feed.close)
+        return feed
+
+    def _source(self, stack: ExitStack) -> Any:
+        """Where a visitor is the person; None: the run opens what its options name."""
+        options = self.options
+        if not any(_taken_of_visitors(options).values()):
+            return None
+        source = open_source(
+            options.hears, options.face, options.duration_s, agent_audio=options.agent_audio, play=options.play,
+            visitor=self._person,
+        )  # fmt: skip
+        stack.callback(source.close)
+        return source
+
+    def _facts(self, head: Any, knobs: Any, calmness: Calmness) -> dict[str, Any]:
+        options = self.options
+        by_visitor = _taken_of_visitors(options)
+        speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
+        return page_facts(
+            head, port=options.port, listener=options.listener, seed=options.seed, calmness=calmness,
+            speaker=speaker if speaker in speakers() else None,
+            knobs=knobs, source={feed: self._choices or by for feed, by in by_visitor.items()}, choices=self._choices,
+        )  # fmt: skip
+
+    # --- what visitors choose; in the page's thread ---
+
+    def _choose(self, what: str, value: Any) -> None:
+        if not self._choices:
+            raise InputError(f"{what}: this run keeps what it was started with (`sfms-robot demo` lets you choose)")
+        # By name alone: a visitor reaches no folder of this machine, and no address of another.
+        offered = {"listener": list(self._listeners), "speaker": speakers()}.get(what)
+        if offered is not None and value not in offered:
+            raise InputError(f"{what} {value!r} is not there ({', '.join(offered)})")
+        changes: dict[str, dict[str, Any]] = {
+            "listener": {"listener": self._listeners.get(value)},
+            "speaker": {"audio": value, "face": "auto", "duration_s": None},
+            "seed": {"seed": value},
+        }
+        self._want(changes[what])
+
+    def _feeds(self, visitor: int, feeds: list[str]) -> None:
+        options = self._wanted or self.options
+        takes = _taken_of_visitors(options)
+        if feeds and self._choices and not all(takes.values()):
+            self._want({"audio": BROWSER, "face": BROWSER, "duration_s": None})
+        elif missing := [feed for feed in feeds if not takes[feed]]:
+            flag = "--audio" if missing[0] == "voice" else "--face"
+            raise InputError(f"source: this run takes no {missing[0]} from a visitor ({flag} {BROWSER})")
+        self._person.came(visitor, feeds)
+
+    def _release(self) -> None:
+        self.released = True
+        if self._interrupt is not None:
+            self._interrupt.ask()
+            self._interrupt.ask()
+
+    def _want(self, changes: Mapping[str, Any]) -> None:
+        """Another run, with these options; the one that goes on comes to rest."""
+        self._wanted = replace(self._wanted or self.options, record=None, **changes)
+        self._chosen.set()
+        interrupt = self._interrupt
+        if interrupt is not None and not interrupt():
+            interrupt.ask()
+
+
+class EndsAlone(Observer):
+    """Ends a run at which nobody has looked for `LEFT_S`.
+
+    Attributes:
+        ended: it has done so.
+    """
+
+    def __init__(self, page: PageProcess, interrupt: Interrupt) -> None:
+        self._page, self._interrupt = page, interrupt
+        self.ended = False
+        self._seen_s = 0.0
+
+    def tick(self, seen: Tick) -> None:
+        if self._page.visitors or self._interrupt():
+            self._seen_s = seen.time_s
+        elif seen.time_s - self._seen_s > LEFT_S:
+            self.ended = True
+            self._interrupt.ask()
+
+
+@contextmanager
+def page_session(page: PageProcess, options: session.RunOptions, choices: bool = False) -> Iterator[PageSession]:
+    """What runs behind a page whose process has begun, while inside. Blocks until the page can be opened.
+
+    Raises PortError, ConfigError where it cannot.
+    """
+    page.wait()
+    logger.warning("page: %s", page)
+    with TemporaryDirectory(prefix="sfms-robot-", ignore_cleanup_errors=True) as folder:
+        yield PageSession(page, options, Path(folder), choices)
+
+
+def _taken_of_visitors(options: session.RunOptions) -> dict[str, bool]:
+    """Which of voice and face a visitor brings."""
+    return {"voice": split_kind(options.hears)[0] == BROWSER, "face": split_kind(options.face)[0] == BROWSER}
+
+
+def _told_to(watcher: PageObserver, panel: session.Panel | None) -> session.Panel:
+    """A panel that is shown as well, and before that the page is told where the status is."""
+
+    def shown(document: session.Document, interrupt: Interrupt, halt: HaltLatch, turn: Callable[[float], None]) -> Any:
+        watcher.document = document
+        return nullcontext() if panel is None else panel(document, interrupt, halt, turn)
+
+    return shown

@@ -1,0 +1,84 @@
+"""What a piece of torch code costs, counted as it runs: operations, bytes, calls. None of it depends on the machine.
+
+An operation is one multiplication or addition of a matrix product, a convolution or an attention (torch's own
+formulas), or one number made by anything else. Bytes are those of all tensors that each call reads and writes, as if
+nothing stayed in a cache: what streams from memory where tensors are large, more than that where they are small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
+
+
+def _attention(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
+    return int(sdpa_flop_count(query, key, value))  # type: ignore[no-untyped-call]
+
+
+def _attention_backward(gradient: Any, query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
+    return int(sdpa_backward_flop_count(gradient, query, key, value))  # type: ignore[no-untyped-call]
+
+
+_CPU_ATTENTION = {  # torch has the formulas for other devices' kernels alone
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention,
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward: _attention_backward,
+}
+
+
+_DRAWING = ("rand", "normal", "uniform", "exponential", "bernoulli", "multinomial")
+
+
+class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Counts while it is entered.
+
+    Attributes:
+        matrix, other: operations of products, and numbers made otherwise.
+        bytes, calls: moved, and made; views of tensors are none.
+        drawn: random numbers.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._products = FlopCounterMode(display=False, custom_mapping=_CPU_ATTENTION)
+        self._known: set[Any] = set(self._products.flop_registry)
+        self.other = self.bytes = self.calls = self.drawn = 0
+
+    @property
+    def matrix(self) -> int:
+        return self._products.get_total_flops()
+
+    @property
+    def operations(self) -> int:
+        return self.matrix + self.other
+
+    def __enter__(self) -> OperationCount:
+        self._products.__enter__()  # type: ignore[no-untyped-call]
+        super().__enter__()  # type: ignore[no-untyped-call]
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        super().__exit__(kind, value, at)  # type: ignore[no-untyped-call]
+        self._products.__exit__(kind, value, at)  # type: ignore[no-untyped-call]
+
+    def __torch_dispatch__(
+        self, func: Any, types: Sequence[type], args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if func.is_view:
+            return out
+        made = [each for each in tree_leaves(out) if isinstance(each, Tensor)]
+        used = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
+        self.calls += 1
+        self.bytes += sum(each.numel() * each.element_size() for each in [*made, *used])
+        if func._overloadpacket not in self._known:
+            self.other += sum(each.numel() for each in made)
+        if func._overloadpacket.__name__.startswith(_DRAWING):
+            self.drawn += sum(each.numel() for each in made)
+        return out

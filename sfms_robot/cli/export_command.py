@@ -1,0 +1,32 @@
+"""`sfms-robot export`: a listener's networks for a machine without torch."""
+
+from __future__ import annotations
+
+import json as json_module
+from pathlib import Path
+
+import typer
+
+from sfms_robot.cli import names
+
+
+def export(
+    listener: str = typer.Argument(
+        ..., autocompletion=names.listeners, help="Shipped listener, or a folder with config.yaml."
+    ),
+    out: Path | None = typer.Option(None, metavar="DIR", help="Write below this folder. Default: the listener's own."),
+    int8: bool = typer.Option(False, "--int8", help="Also with large layers in 8 bits (kind: arig), for large models."),
+    json: bool = typer.Option(False, "--json", help="Print the files as one JSON object."),
+) -> None:
+    """Write a listener's networks as ONNX graphs, which run without torch. Takes a minute.
+
+    They hold no weights: trained anew for the same configuration, a listener needs no new ones.
+    """
+    from sfms_robot.app.export.graph_export import export_listener
+
+    files = export_listener(listener, out, int8)
+    if json:
+        print(json_module.dumps({"listener": listener, "int8": int8, "files": [str(file) for file in files]}))
+    else:
+        for file in files:
+            print(f"{file.stat().st_size / 1000:8.1f} kB  {file}")

@@ -1,0 +1,50 @@
+"""`sfms-robot serve`: one listener for many heads."""
+
+from __future__ import annotations
+
+import json as json_module
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import typer
+
+from sfms_robot.cli import names
+
+
+def serve(
+    listener: str = typer.Option(
+        "sfms-small", autocompletion=names.listeners, help="Shipped listener, or a folder with config.yaml and weights."
+    ),
+    name: str | None = typer.Option(None, help="What robots ask for, zenoh/NAME. Default: the listener's name."),
+    zenoh: Path | None = typer.Option(
+        None, metavar="FILE", help="zenoh's configuration (JSON5: endpoints, TLS). Default: tcp/127.0.0.1:7447."
+    ),
+    metrics: str | None = typer.Option(
+        None, metavar="[HOST:]PORT", help="Serve figures for Prometheus at /metrics, on loopback (0: any free port)."
+    ),
+    hop: int | None = typer.Option(None, min=1, help="A plan every so many frames. Default: as a robot would choose."),
+    workers: int | None = typer.Option(None, min=1, max=64, help="Batches stepped side by side. Default: 2."),
+    everybody: bool = typer.Option(
+        False, "--everybody", help="Admit robots without asking whether they can be answered in time."
+    ),
+    engine: str = typer.Option("auto", metavar="auto|onnx|torch", help="What computes the listener, as of `run`."),
+    json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object when it ends."),
+) -> None:
+    """Listen for robots elsewhere: `sfms-robot run --listener zenoh/NAME`. Until Ctrl-C."""
+    from sfms_robot.app.listen.preflight import engine_named
+    from sfms_robot.app.serve.service import ServeOptions
+    from sfms_robot.app.serve.service import serve as serve_until
+
+    runs_on = engine_named(engine)
+    over = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: over.set())
+    figures = serve_until(ServeOptions(listener, name, zenoh, metrics, hop, workers, everybody, runs_on), over, _say)
+    if json:
+        print(json_module.dumps(figures))
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

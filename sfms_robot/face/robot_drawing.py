@@ -1,0 +1,154 @@
+"""Pictures of a robot's URDF, off-screen, by vtk (extra `pictures`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.face.drawing import BACKGROUND, add_renderer, load_vtk, open_window, save
+from sfms_robot.face.robot_scene import RobotScene
+from sfms_robot.face.urdf import Visual
+from sfms_robot.frames import Doubles
+
+_ROUND: Final = 48  # corners of a circle
+_FROM: Final = (1.0, 0.42, 0.22)  # where the camera stands, seen from the robot's middle
+_ANGLE_DEG: Final = 24.0
+_ZOOM: Final = 1.12
+_LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
+_INK: Final = (0.16, 0.17, 0.20)
+_READERS: Final = {".stl": "STLReader", ".obj": "OBJReader", ".ply": "PLYReader"}
+
+
+def render_robot(file: Path | str, scene: RobotScene, values: Doubles, size_px: tuple[int, int] = (640, 640)) -> None:
+    """Draw a scene with these joint values (U,) as a PNG. Raises ConfigError, MissingExtra without vtk."""
+    vtk = load_vtk()
+    window = open_window(vtk, size_px)
+    add_robot(vtk, add_renderer(vtk, window, (0, 0, 1, 1), BACKGROUND), scene, values)
+    save(vtk, window, file)
+
+
+def render_robots(
+    file: Path | str, robots: Sequence[tuple[str, RobotScene, Doubles]], columns: int, cell_px: tuple[int, int]
+) -> None:
+    """Draw several, each with its name below, as one PNG. Raises ConfigError, MissingExtra without vtk."""
+    vtk = load_vtk()
+    rows, (wide, high), caption = -(-len(robots) // columns), cell_px, 26
+    size = (columns * wide, rows * (high + caption))
+    window = open_window(vtk, size)
+    paper = add_renderer(vtk, window, (0, 0, 1, 1), BACKGROUND)
+    for index, (name, scene, values) in enumerate(robots):
+        left, low = index % columns * wide, size[1] - (index // columns + 1) * (high + caption) + caption
+        box = (left / size[0], low / size[1], (left + wide) / size[0], (low + high) / size[1])
+        add_robot(vtk, add_renderer(vtk, window, box, BACKGROUND), scene, values)
+        _caption(vtk, paper, name, (left + wide // 2, low - caption + 8))
+    save(vtk, window, file)
+
+
+def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
+    """Every visual in its place, three lights, and the camera before it. Raises ConfigError for a bad mesh."""
+    places = scene.robot.link_places(dict(zip(scene.joints, values.tolist(), strict=True)))
+    for visual in scene.robot.visuals:
+        renderer.AddActor(_actor(vtk, visual, places[visual.link] @ visual.place, scene.meshes))
+    bounds = np.array(renderer.ComputeVisiblePropBounds()).reshape(3, 2)
+    middle, size = bounds.mean(axis=1), float(np.linalg.norm(np.ptp(bounds, axis=1)))
+    camera = renderer.GetActiveCamera()
+    camera.SetViewAngle(_ANGLE_DEG)
+    camera.SetFocalPoint(*middle)
+    camera.SetPosition(*(middle + size * np.array(_FROM)))
+    camera.SetViewUp(0, 0, 1)
+    renderer.ResetCamera()
+    camera.Zoom(_ZOOM)
+    renderer.ResetCameraClippingRange()
+    renderer.AutomaticLightCreationOff()
+    for place, strength in _LIGHTS:
+        light = vtk.Light()
+        light.SetLightTypeToSceneLight()
+        light.SetPosition(*(middle + size * np.array(place)))
+        light.SetFocalPoint(*middle)
+        light.SetIntensity(strength)
+        renderer.AddLight(light)
+
+
+def _actor(vtk: Any, visual: Visual, place: Doubles, meshes: Mapping[str, Path]) -> Any:
+    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+    matrix, mapper, actor = vtkMatrix4x4(), vtk.PolyDataMapper(), vtk.Actor()
+    full = place @ _upright(visual)
+    matrix.DeepCopy(full.ravel().tolist())
+    source = _source(visual, meshes)
+    source.Update()
+    mapper.SetInputData(source.GetOutput())
+    mapper.ScalarVisibilityOff()
+    actor.SetMapper(mapper)
+    actor.SetUserMatrix(matrix)
+    style = actor.GetProperty()
+    style.SetColor(*visual.color[:3])
+    style.SetOpacity(visual.color[3])
+    style.SetInterpolationToPhong()
+    style.SetAmbient(0.12)
+    style.SetSpecular(0.18)
+    style.SetSpecularPower(24)
+    return actor
+
+
+def _upright(visual: Visual) -> Doubles:
+    """(4, 4): vtk's cylinders lie along y, those of URDF along z; a mesh has a scale."""
+    out = np.eye(4)
+    if visual.shape == "cylinder":
+        out[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    elif visual.shape == "mesh":
+        out[:3, :3] = np.diag(visual.size)
+    return out
+
+
+def _source(visual: Visual, meshes: Mapping[str, Path]) -> Any:
+    from vtkmodules import vtkFiltersSources as sources
+
+    if visual.shape == "mesh":
+        return _mesh(meshes[visual.mesh])
+    if visual.shape == "box":
+        box = sources.vtkCubeSource()
+        for axis, length in zip("XYZ", visual.size, strict=True):
+            getattr(box, f"Set{axis}Length")(length)
+        return box
+    if visual.shape == "sphere":
+        ball = sources.vtkSphereSource()
+        ball.SetRadius(visual.size[0])
+        ball.SetThetaResolution(_ROUND)
+        ball.SetPhiResolution(_ROUND // 2)
+        return ball
+    rod = sources.vtkCylinderSource()
+    rod.SetRadius(visual.size[0])
+    rod.SetHeight(visual.size[1])
+    rod.SetResolution(_ROUND)
+    return rod
+
+
+def _mesh(file: Path) -> Any:
+    from vtkmodules import vtkIOGeometry, vtkIOPLY
+
+    name = _READERS.get(file.suffix.lower())
+    if name is None:
+        raise ConfigError(f"{file}: a picture needs one of {', '.join(_READERS)}")
+    reader = getattr(vtkIOPLY if name == "PLYReader" else vtkIOGeometry, f"vtk{name}")()
+    reader.SetFileName(str(file))
+    reader.Update()
+    if not reader.GetOutput().GetNumberOfPoints():
+        raise ConfigError(f"{file}: not a mesh that can be read")
+    return reader
+
+
+def _caption(vtk: Any, renderer: Any, text: str, place_px: tuple[int, int]) -> None:
+    actor = vtk.TextActor()
+    actor.SetInput(text)
+    actor.SetPosition(*place_px)
+    style = actor.GetTextProperty()
+    style.SetFontFamilyToArial()
+    style.SetFontSize(15)
+    style.SetColor(*_INK)
+    style.SetJustificationToCentered()
+    renderer.AddViewProp(actor)

@@ -1,0 +1,229 @@
+"""The picture of a robot: its URDF, and the values of that URDF's joints for the angles that the servos read.
+
+A joint of the URDF follows the joint of the head that has its name, or the one that `urdf.joints` of the head's file
+gives it; its value is that angle [rad]. What slides, and what several parts do at once, are `mimic` joints of the file.
+A neck whose servos do not turn the head's axes themselves (a platform, a differential) moves the joints
+
+    pose_x, pose_y, pose_z [m], pose_roll, pose_pitch, pose_yaw [rad]     the head's pose against the base
+    LEG_rod_swing, LEG_rod_lean [rad]                                     the rod of a platform's leg
+
+by forward kinematics, where the URDF has joints of these names. What follows nothing keeps to 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+
+from sfms_robot.config import FollowingJoint, Head, RobotDescription
+from sfms_robot.config.kinematics import StewartPlatform
+from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.errors import ConfigError
+from sfms_robot.face.platform_rods import PlatformRods
+from sfms_robot.face.urdf import MOVING, Urdf, read_urdf
+from sfms_robot.frames import POSE_CHANNELS, Doubles
+
+URDF_FILE: Final = "robot.urdf"
+_POSE: Final = tuple(f"pose_{channel}" for channel in POSE_CHANNELS)
+
+
+class ForwardNeck(Protocol):
+    """What a scene needs of a neck (`retarget.kinematics.Neck`)."""
+
+    @property
+    def joints(self) -> Sequence[str]: ...
+
+    @property
+    def turns_body(self) -> bool: ...
+
+    def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
+        """Angles (..., J) in the order of `joints`, a pose (..., 6) nearby -> poses (..., 6), NaN where none fits."""
+
+
+class RobotScene:
+    """One head as a URDF.
+
+    Attributes:
+        urdf: the file.
+        robot: what it holds.
+        meshes: file name of a mesh as the URDF has it -> the file; empty for a URDF of primitive shapes.
+        joints: the URDF joints that `values` gives, in its order; mimic joints are left to who draws.
+        follows: joint of the head -> the URDF joint that it moves.
+        undriven: joints of the head that move nothing in the picture.
+    """
+
+    def __init__(self, head: Head, urdf: Path, neck: ForwardNeck | None = None) -> None:
+        """Raises ConfigError of one line: the URDF is broken, a mesh is not there, a joint named for it is not."""
+        self.urdf, self.robot = urdf, read_urdf(urdf)
+        description = head.urdf or RobotDescription(file=URDF_FILE)
+        self.meshes = _meshes(self.robot, urdf, _packages(head, description))
+        self._names = tuple(head.joints)
+        self._rest = np.array([joint.rest_rad for joint in head.joints.values()])
+        self._read = self._rest.copy()  # the last angles that were finite
+        follows = _following(head, self.robot, urdf, description)
+        self.follows = {name: each.joint for name, each in follows.items()}
+        self.undriven = tuple(name for name in self._names if name not in follows)
+        parts: list[tuple[str, ...]] = [tuple(each.joint for each in follows.values())]
+        steps: list[Callable[[Doubles], Doubles]] = [_Followers(self._names, follows).values]
+        if neck is not None and (pose := _NeckPose.of(head, neck, self.robot, set(parts[0]))) is not None:
+            parts.append(pose.joints)
+            steps.append(pose.values)
+            self.undriven = tuple(name for name in self.undriven if name not in neck.joints)
+        self._steps = steps
+        self.joints = tuple(name for part in parts for name in part)
+        if not self.joints:
+            ours, theirs = ", ".join(self._names), ", ".join(_free(self.robot)) or "none"
+            raise ConfigError(
+                f"{urdf}: none of its joints ({theirs}) follows a joint of this head ({ours}): urdf.joints"
+            )
+
+    @classmethod
+    def of(cls, head: Head, neck: ForwardNeck | None = None) -> RobotScene | None:
+        """The scene of a head, or None for a head of somebody's own without `urdf`.
+
+        `neck`: the head's forward kinematics, for a platform or a differential. Raises ConfigError.
+        """
+        file = urdf_file(head)
+        return None if file is None else cls(head, file, neck)
+
+    def values(self, read_rad: Doubles) -> Doubles:
+        """Angles (J,) in the head's order -> values (U,) of `joints`; an angle that is not finite stays as it last was.
+
+        A platform is searched from the pose that was found last; where the angles fit none, it stays there.
+        """
+        read = np.asarray(read_rad, dtype=np.float64)
+        if read.shape != self._read.shape:
+            raise ValueError(f"angles are ({len(self._read)},), not {read.shape}")
+        self._read = np.where(np.isfinite(read), read, self._read)
+        return np.concatenate([step(self._read) for step in self._steps])
+
+    def rest(self) -> Doubles:
+        """The values (U,) of the head at rest."""
+        return self.values(self._rest)
+
+
+def urdf_file(head: Head) -> Path | None:
+    """The URDF that the head's file names, else the shipped one of that name, else None. Raises ConfigError."""
+    shipped = data_dir("sim") / "heads"
+    if head.urdf is None:
+        file = shipped / head.name / URDF_FILE
+        return file if file.is_file() else None
+    named = head.urdf.file
+    for file in (shipped / named / URDF_FILE, (head.folder or Path()) / named):
+        if file.is_file():
+            return file
+    where, names = (head.folder or Path()) / "head.yaml", shipped_names(shipped, URDF_FILE)
+    raise ConfigError.at(where, "urdf.file", named, "is neither a file nor a shipped head", names)
+
+
+def _free(robot: Urdf) -> list[str]:
+    """Joints that somebody has to give a value."""
+    return [joint.name for joint in robot.joints.values() if joint.kind in MOVING and joint.mimic is None]
+
+
+def _following(head: Head, robot: Urdf, file: Path, description: RobotDescription) -> dict[str, FollowingJoint]:
+    """Our joint -> what follows it, in the head's order. Raises ConfigError for one that cannot."""
+    free = _free(robot)
+    for name, follows in description.joints.items():
+        if follows.joint not in robot.joints:
+            problem = f"is not a joint of {file}"
+        elif follows.joint not in free:
+            problem = f"does not move by itself in {file}: it is fixed, or mimics another"
+        else:
+            continue
+        where = (head.folder or Path()) / "head.yaml"
+        raise ConfigError.at(where, f"urdf.joints.{name}.joint", follows.joint, problem, free)
+    taken = {follows.joint for follows in description.joints.values()}
+    same = {name: FollowingJoint(joint=name) for name in head.joints if name in free and name not in taken}
+    both = same | description.joints
+    return {name: both[name] for name in head.joints if name in both}
+
+
+class _Followers:
+    """Joints that follow one of ours each."""
+
+    def __init__(self, names: Sequence[str], follows: Mapping[str, FollowingJoint]) -> None:
+        self._columns = np.array([names.index(name) for name in follows], dtype=np.intp)
+        self._scale = np.array([each.scale for each in follows.values()])
+        self._offset = np.array([each.offset for each in follows.values()])
+
+    def values(self, read: Doubles) -> Doubles:
+        return np.asarray(self._offset + self._scale * read[self._columns])
+
+
+class _NeckPose:
+    """Joints that show where a neck's forward kinematics has the head, and the rods below it."""
+
+    def __init__(self, head: Head, neck: ForwardNeck, joints: Sequence[str], rods: PlatformRods | None) -> None:
+        self.joints = tuple(joints)
+        self._neck, self._rods, self._pose = neck, rods, np.zeros(6)
+        self._columns = np.array([list(head.joints).index(name) for name in neck.joints], dtype=np.intp)
+        legs = neck.joints[-6:]
+        table = _POSE + tuple(f"{leg}_rod_{part}" for leg in legs for part in ("swing", "lean"))
+        self._order = np.array([table.index(name) for name in joints], dtype=np.intp)
+
+    @classmethod
+    def of(cls, head: Head, neck: ForwardNeck, robot: Urdf, taken: set[str]) -> _NeckPose | None:
+        """None where the URDF has none of these joints."""
+        legs = neck.joints if isinstance(head.kinematics, StewartPlatform) else ()
+        rods = [f"{leg}_rod_{part}" for leg in legs for part in ("swing", "lean")]
+        joints = [name for name in _free(robot) if name in (*_POSE, *rods) and name not in taken]
+        if not joints:
+            return None
+        platform = head.kinematics if isinstance(head.kinematics, StewartPlatform) else None
+        return cls(head, neck, joints, PlatformRods(platform) if platform else None)
+
+    def values(self, read: Doubles) -> Doubles:
+        angles = read[self._columns]
+        pose = self._neck.forward(angles, self._pose)
+        if np.isfinite(pose).all():
+            self._pose = pose
+        table = self._pose if self._rods is None else np.concatenate([self._pose, self._rod_angles(angles)])
+        return np.asarray(table[self._order])
+
+    def _rod_angles(self, angles: Doubles) -> Doubles:
+        """(12,) swing and lean of each leg."""
+        assert self._rods is not None
+        roll, pitch, yaw = self._pose[:3]
+        body = angles[0] if self._neck.turns_body else 0.0
+        rotation, place = _turn(roll, pitch, yaw - body), _turn(0.0, 0.0, -body) @ self._pose[3:]
+        return self._rods.angles(angles[-6:], rotation, place).ravel()
+
+
+def _turn(roll: float, pitch: float, yaw: float) -> Doubles:
+    """R = Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _packages(head: Head, description: RobotDescription) -> dict[str, Path]:
+    return {name: (head.folder or Path()) / folder for name, folder in description.packages.items()}
+
+
+def _meshes(robot: Urdf, urdf: Path, packages: Mapping[str, Path]) -> dict[str, Path]:
+    """Every mesh that the URDF names, and where it lies. Raises ConfigError for one that is not there."""
+    found = {}
+    for visual in robot.visuals:
+        if visual.shape == "mesh":
+            file = _mesh_file(visual.mesh, urdf.parent, packages)
+            if not file.is_file():
+                hint = " (urdf.packages says where packages lie)" if visual.mesh.startswith("package://") else ""
+                raise ConfigError(f"{urdf}: link {visual.link!r}: no mesh {visual.mesh!r} at {file}{hint}")
+            found[visual.mesh] = file
+    return found
+
+
+def _mesh_file(name: str, folder: Path, packages: Mapping[str, Path]) -> Path:
+    if name.startswith("package://"):
+        package, _, inside = name.removeprefix("package://").partition("/")
+        return packages.get(package, folder / package) / inside
+    return folder / name.removeprefix("file://")

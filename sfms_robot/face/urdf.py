@@ -1,0 +1,286 @@
+"""URDF files: links, joints and what is drawn of them; and where every link is for given joint values.
+
+What the format says is at http://wiki.ros.org/urdf/XML. Read: visuals (box, cylinder, sphere, mesh), materials with a
+colour, joints of every type but floating and planar, mimic. Left alone: inertia, collision, transmissions, textures.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import Doubles
+
+TURNING: Final = ("revolute", "continuous")
+MOVING: Final = (*TURNING, "prismatic")
+_TYPES: Final = (*MOVING, "fixed")
+_GREY: Final = (0.7, 0.7, 0.7, 1.0)
+
+Color = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Visual:
+    """A shape on a link.
+
+    Attributes:
+        place: (4, 4) shape -> link.
+        shape, size: box (x, y, z), cylinder (radius, length along z), sphere (radius,), mesh (scale x, y, z); metres.
+        mesh: its file name as the URDF has it; empty for the others.
+    """
+
+    link: str
+    place: Doubles
+    shape: Literal["box", "cylinder", "sphere", "mesh"]
+    size: tuple[float, ...]
+    color: Color
+    mesh: str = ""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint whose value is `offset` + `multiplier` x that of another."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class JointElement:
+    """A joint: `place` (4, 4) child at value 0 -> parent, `axis` (3,) of unit length in the child's frame."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    place: Doubles
+    axis: Doubles
+    lower: float
+    upper: float
+    mimic: Mimic | None
+
+    def motion(self, value: float) -> Doubles:
+        """(4, 4) child -> child at value 0."""
+        out = np.eye(4)
+        if self.kind in TURNING:
+            out[:3, :3] = _about(self.axis, value)
+        elif self.kind == "prismatic":
+            out[:3, 3] = self.axis * value
+        return out
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A robot. `joints` by name, parents before children."""
+
+    name: str
+    root: str
+    joints: Mapping[str, JointElement]
+    visuals: tuple[Visual, ...]
+
+    def link_places(self, values: Mapping[str, float]) -> dict[str, Doubles]:
+        """Joint values [rad, m], 0 where none is given -> every link's place (4, 4) in the root's axes."""
+        places = {self.root: np.eye(4)}
+        for joint in self.joints.values():
+            value = self._value(joint, values)
+            places[joint.child] = places[joint.parent] @ joint.place @ joint.motion(value)
+        return places
+
+    def _value(self, joint: JointElement, values: Mapping[str, float]) -> float:
+        if joint.mimic is None:
+            return values.get(joint.name, 0.0)
+        return joint.mimic.offset + joint.mimic.multiplier * self._value(self.joints[joint.mimic.joint], values)
+
+
+def read_urdf(file: Path) -> Urdf:
+    """Raises ConfigError of one line that names the file and the link or joint that is wrong."""
+    try:
+        root = ElementTree.fromstring(file.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
+    except ElementTree.ParseError as error:
+        raise ConfigError(f"{file}: not XML: {error}") from error
+    if any(str(element.tag).startswith("{http://www.ros.org/wiki/xacro}") for element in root.iter()) or any(
+        str(element.tag).startswith("{http://ros.org/wiki/xacro}") for element in root.iter()
+    ):
+        raise ConfigError(f"{file}: a xacro file: make a URDF of it (xacro {file.name} > robot.urdf)")
+    if root.tag != "robot":
+        raise ConfigError(f"{file}: not a URDF: its first element is <{root.tag}>, not <robot>")
+    return _Reader(file, root).robot()
+
+
+class _Reader:
+    """One file: everything that may be wrong is told with the file and the element's name."""
+
+    def __init__(self, file: Path, root: Element) -> None:
+        self._file, self._root = file, root
+        self._colors: dict[str, Color] = {}
+        for material in root.iter("material"):
+            if (color := material.find("color")) is not None:
+                self._colors[material.get("name", "")] = self._color(color)
+
+    def robot(self) -> Urdf:
+        links = [self._name(link) for link in self._root.findall("link")]
+        if not links:
+            raise ConfigError(f"{self._file}: a URDF without a <link>")
+        joints = {}
+        for element in self._root.findall("joint"):
+            joint = self._joint(element, links)
+            if joint.name in joints:
+                raise self._wrong("joint", joint.name, "is there twice")
+            joints[joint.name] = joint
+        root, ordered = self._tree(links, joints)
+        for joint in ordered.values():
+            self._check_mimic(joint, ordered)
+        visuals = [v for link in self._root.findall("link") for v in self._visuals(link)]
+        return Urdf(self._root.get("name", self._file.stem), root, ordered, tuple(visuals))
+
+    def _joint(self, element: Element, links: list[str]) -> JointElement:
+        name, kind = self._name(element), element.get("type", "")
+        if kind not in _TYPES:
+            raise self._wrong("joint", name, f"has the type {kind!r}; one of {', '.join(_TYPES)} can be drawn")
+        ends = []
+        for tag in ("parent", "child"):
+            end = element.find(tag)
+            link = "" if end is None else end.get("link", "")
+            if link not in links:
+                raise self._wrong("joint", name, f"has as its {tag} {link!r}, which is no link of this file")
+            ends.append(link)
+        axis = self._triple(element.find("axis"), "xyz", (1.0, 0.0, 0.0), f"joint {name}")
+        length = float(np.linalg.norm(axis))
+        if kind in MOVING and length < 1e-9:
+            raise self._wrong("joint", name, "has an axis of length 0")
+        limit, copied = element.find("limit"), element.find("mimic")
+        where = f"joint {name}"
+        lower, upper = (self._number(limit, key, math.nan, where) for key in ("lower", "upper"))
+        mimic = None
+        if copied is not None:
+            factors = (self._number(copied, key, at, where) for key, at in (("multiplier", 1.0), ("offset", 0.0)))
+            mimic = Mimic(copied.get("joint", ""), *factors)
+        place = self._origin(element, where)
+        return JointElement(name, kind, ends[0], ends[1], place, axis / max(length, 1e-9), lower, upper, mimic)
+
+    def _tree(self, links: list[str], joints: dict[str, JointElement]) -> tuple[str, dict[str, JointElement]]:
+        """The link on which all hangs, and the joints from there on."""
+        above: dict[str, str] = {}
+        for joint in joints.values():
+            if above.setdefault(joint.child, joint.name) != joint.name:
+                other = above[joint.child]
+                raise self._wrong("joint", joint.name, f"has the child {joint.child!r}, which is that of {other} too")
+        roots = [link for link in links if link not in above]
+        ordered: dict[str, JointElement] = {}
+        if roots:
+            reached, left = {roots[0]}, dict(joints)
+            while ready := [joint for joint in left.values() if joint.parent in reached]:
+                for joint in ready:
+                    reached.add(joint.child)
+                    ordered[joint.name] = left.pop(joint.name)
+        for name in joints:
+            if name not in ordered:
+                raise self._wrong("joint", name, "does not hang on the robot's first link")
+        if len(roots) != 1:
+            raise ConfigError(f"{self._file}: link {roots[1]!r} hangs on nothing; {roots[0]!r} is the robot's root")
+        return roots[0], ordered
+
+    def _check_mimic(self, joint: JointElement, joints: Mapping[str, JointElement]) -> None:
+        seen, at = {joint.name}, joint
+        while at.mimic is not None:
+            if at.mimic.joint not in joints:
+                raise self._wrong("joint", at.name, f"mimics {at.mimic.joint!r}, which is no joint of this file")
+            at = joints[at.mimic.joint]
+            if at.name in seen:
+                raise self._wrong("joint", joint.name, "mimics itself")
+            seen.add(at.name)
+
+    def _visuals(self, link: Element) -> list[Visual]:
+        found, name = [], self._name(link)
+        where = f"link {name}"
+        for visual in link.findall("visual"):
+            geometry = visual.find("geometry")
+            shape = None if geometry is None else next(iter(geometry), None)
+            if shape is None:
+                raise self._wrong("link", name, "has a visual without a geometry")
+            place, color = self._origin(visual, where), self._material(visual)
+            if shape.tag == "box":
+                size = self._triple(shape, "size", None, where)
+                found.append(Visual(name, place, "box", tuple(size), color))
+            elif shape.tag == "cylinder":
+                radius, length = (self._number(shape, key, None, where) for key in ("radius", "length"))
+                found.append(Visual(name, place, "cylinder", (radius, length), color))
+            elif shape.tag == "sphere":
+                found.append(Visual(name, place, "sphere", (self._number(shape, "radius", None, where),), color))
+            elif shape.tag == "mesh":
+                scale = self._triple(shape, "scale", (1.0, 1.0, 1.0), where)
+                found.append(Visual(name, place, "mesh", tuple(scale), color, shape.get("filename", "")))
+            else:
+                raise self._wrong("link", name, f"has the shape <{shape.tag}>, not box, cylinder, sphere or mesh")
+        return found
+
+    def _material(self, visual: Element) -> Color:
+        material = visual.find("material")
+        if material is None:
+            return _GREY
+        color = material.find("color")
+        return self._colors.get(material.get("name", ""), _GREY) if color is None else self._color(color)
+
+    def _color(self, element: Element) -> Color:
+        values = self._floats(element.get("rgba", ""), 4, "a colour's rgba")
+        return (values[0], values[1], values[2], values[3])
+
+    def _origin(self, element: Element, where: str) -> Doubles:
+        origin, out = element.find("origin"), np.eye(4)
+        roll, pitch, yaw = self._triple(origin, "rpy", (0.0, 0.0, 0.0), where)
+        x, y, z = np.eye(3)
+        out[:3, :3] = _about(z, yaw) @ _about(y, pitch) @ _about(x, roll)
+        out[:3, 3] = self._triple(origin, "xyz", (0.0, 0.0, 0.0), where)
+        return out
+
+    def _triple(
+        self, element: Element | None, key: str, default: tuple[float, float, float] | None, where: str
+    ) -> Doubles:
+        text = None if element is None else element.get(key)
+        if text is None and default is not None:
+            return np.array(default)
+        return np.array(self._floats(text or "", 3, f"{where}: {key}"))
+
+    def _number(self, element: Element | None, key: str, default: float | None, where: str) -> float:
+        text = None if element is None else element.get(key)
+        if text is None and default is not None:
+            return default
+        return self._floats(text or "", 1, f"{where}: {key}")[0]
+
+    def _floats(self, text: str, count: int, where: str) -> list[float]:
+        try:
+            values = [float(part) for part in text.split()]
+        except ValueError:
+            values = []
+        if len(values) != count or not all(math.isfinite(value) for value in values):
+            wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+            raise ConfigError(f"{self._file}: {where} = {text!r} is not {wanted}")
+        return values
+
+    def _name(self, element: Element) -> str:
+        name = element.get("name")
+        if not name:
+            raise ConfigError(f"{self._file}: a <{element.tag}> without a name")
+        return name
+
+    def _wrong(self, kind: str, name: str, problem: str) -> ConfigError:
+        return ConfigError(f"{self._file}: {kind} {name!r} {problem}")
+
+
+def _about(axis: Doubles, angle: float) -> Doubles:
+    """Rotation (3, 3) about an axis of unit length (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    out: Doubles = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    return out

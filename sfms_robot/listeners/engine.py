@@ -1,0 +1,64 @@
+"""What computes a listener's networks: the seam between a stream, which is numpy, and the library that multiplies.
+
+A stream asks networks by name: arrays in, arrays out, nothing kept. An engine holds their weights. There are two,
+`torch_engine` and `onnx_engine`; the second one never imports torch, and starts in a fraction of the time and memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.errors import ModelError
+
+Array = NDArray[Any]
+EngineName = Literal["auto", "torch", "onnx"]
+
+
+class Engine(Protocol):
+    """Networks of one listener, by name.
+
+    Attributes:
+        name: "torch" or "onnx", and what else tells how it computes: "onnx int8, 2 threads".
+        tensors: the listener's tensors that are no weights of a network, by their name in model.safetensors: scales of
+            its motion and sound, what streams draw from. Not to be changed.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def tensors(self) -> Mapping[str, Array]: ...
+
+    def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
+        """Outputs of a network, each (N, ...), N streams.
+
+        `inputs` are (N, ...) in the network's order; one of (1, ...) is the same for all streams.
+        """
+        ...
+
+    def build_graphs(self) -> None:
+        """The weights stay as they are from now on: what a single stream asks is made as fast as it gets.
+
+        Takes a second with torch, nothing with onnx.
+        """
+
+    def set_threads(self, threads: int) -> None:
+        """Use so many from now on."""
+
+
+def model_of(engine: Engine) -> Any:
+    """The torch model that an engine runs. Raises ModelError for one that has none."""
+    try:
+        return engine.model  # type: ignore[attr-defined]
+    except AttributeError:
+        raise ModelError(f"this listener runs on {engine.name}: what looks into its model needs torch") from None
+
+
+def one_of(array: Array, streams: int) -> Array:
+    """An input (N or 1, ...) as an array of its own of (N, ...)."""
+    whole = array if len(array) == streams else np.broadcast_to(array, (streams, *array.shape[1:]))
+    return np.ascontiguousarray(whole)

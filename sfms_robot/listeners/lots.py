@@ -1,0 +1,43 @@
+"""What a stream draws: numbers that hang on its seed, the frame they are for and their use, and on nothing else.
+
+They come from Philox, a counter-based generator. So it does not matter when a frame is drawn, how often, or beside
+which other streams: a plan made again draws the same for the same frames.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import Doubles, Floats
+
+TO_UNIT: Final = 2.0**-53
+
+
+class Use(IntEnum):
+    """What numbers are for. Events (`events.chance`) have the uses below these."""
+
+    TOKENS = 16
+    SWAY = 17
+    NOISE = 18
+    STATE = 19
+
+
+def philox(seed: int, frame: int, use: int, part: int = 0) -> np.random.Philox:
+    """The generator of one use in one frame; `part` of it: any number."""
+    # The lowest word of the counter rises with every four numbers; the rest says what they are for.
+    counter = np.array([0, frame % 2**64, use, part], np.uint64)
+    return np.random.Philox(key=seed % 2**64, counter=counter)
+
+
+def uniforms(seed: int, frame: int, use: int, count: int, part: int = 0) -> Doubles:
+    """(count,) in 0..1."""
+    words = philox(seed, frame, use, part).random_raw(count)
+    return np.asarray((words >> np.uint64(11)) * TO_UNIT, np.float64)
+
+
+def normals(seed: int, frame: int, use: int, *shape: int) -> Floats:
+    """Standard normal numbers of a shape."""
+    return np.random.Generator(philox(seed, frame, use)).standard_normal(shape, np.float32)

@@ -1,0 +1,148 @@
+"""Networks computed by onnxruntime: no torch, a tenth of its start-up, and small models in half its time.
+
+A session is made of a graph without weights (`graph_folder`) and of the weights, which come from model.safetensors.
+Large layers may be in 8-bit integers, which one stream of a large model takes a quarter of the time for: a layer costs
+what it takes to read its weights. Those are rounded per output row as they are loaded; the input by its own range.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.errors import MissingExtra, ModelError
+from sfms_robot.frames import Floats
+from sfms_robot.listeners.engine import Array, one_of
+from sfms_robot.listeners.graph_folder import Graph, GraphFolder
+
+KEPT: Final = 4096  # numbers of a tensor that streams may ask for: scales, not weights
+FULL, HALF = 127, 64  # older x86 processors add pairs of products in 16 bits, where whole integers do not fit
+
+
+class OnnxEngine:
+    """`engine.Engine`.
+
+    Args:
+        folder: of the listener, for messages.
+        graphs: of its networks.
+        weights: by their name in model.safetensors; asked for again whenever the number of threads changes.
+        threads: that each network may use.
+    """
+
+    def __init__(
+        self, folder: Path, graphs: GraphFolder, weights: Callable[[], Mapping[str, Array]], threads: int = 1
+    ) -> None:
+        self._folder, self._graphs, self._weights = folder, graphs, weights
+        self.tensors: Mapping[str, Array] = {}
+        self._threads = 0
+        self._sessions: dict[str, Any] = {}
+        self._inputs: dict[str, list[str]] = {}
+        self.set_threads(threads)
+
+    @property
+    def name(self) -> str:
+        precision = " int8" if any(graph.integers for graph in self._graphs.graphs.values()) else ""
+        return f"onnx{precision}, {self._threads} thread{'s' * (self._threads > 1)}"
+
+    def build_graphs(self) -> None:
+        """They are graphs already."""
+
+    def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
+        """See `engine.Engine`."""
+        streams = max(map(len, inputs))
+        names = self._inputs[network]
+        told = {name: one_of(each, streams) for name, each in zip(names, inputs, strict=True) if name in names}
+        return tuple(self._sessions[network].run(None, told))
+
+    def set_threads(self, threads: int) -> None:
+        """Use so many from now on; takes as long as loading."""
+        if threads == self._threads:
+            return
+        weights = dict(self._weights())
+        self.tensors = {name: value for name, value in weights.items() if value.size <= KEPT}
+        values = _Values(weights, self._graphs.graphs.values())
+        for name, graph in self._graphs.graphs.items():
+            self._sessions[name] = _session(self._folder, name, graph, values, threads)
+            self._inputs[name] = [each.name for each in self._sessions[name].get_inputs()]
+        self._threads = threads
+
+
+class _Values:
+    """Weights as onnxruntime takes them, each made once; one in integers leaves nothing of itself behind."""
+
+    def __init__(self, weights: dict[str, Array], graphs: Any) -> None:
+        self._weights = weights
+        self._made: dict[str, Any] = {}
+        self._integers = {name for graph in graphs for name in graph.integers}
+
+    def of(self, graph: Graph) -> tuple[list[str], list[Any]]:
+        """Names of the initialisers of a graph, and their values."""
+        names = [name for name in graph.weights if name not in graph.integers]
+        for name in graph.integers:
+            names += [f"{name}.int8", f"{name}.scale"]
+            if f"{name}.int8" not in self._made:
+                self._made[f"{name}.int8"], self._made[f"{name}.scale"] = map(_value, integers(self._weights[name]))
+        for name in names:
+            if name not in self._made:
+                self._made[name] = _value(self._weights[name])
+        return names, [self._made[name] for name in names]
+
+
+def _value(array: Array) -> Any:
+    import onnxruntime
+
+    return onnxruntime.OrtValue.ortvalue_from_numpy(np.asarray(array, order="C"))
+
+
+def _session(folder: Path, name: str, graph: Graph, values: _Values, threads: int) -> Any:
+    onnxruntime = _onnxruntime()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the servo loop has the other core
+    options.log_severity_level = 3
+    options.add_external_initializers(*values.of(graph))
+    try:
+        return onnxruntime.InferenceSession(graph.data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has no class of its own for what is wrong with a file
+        why = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise ModelError(f"{folder}: onnxruntime cannot use graph {name}: {why}") from error
+
+
+def _onnxruntime() -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it looks up its maker's host
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise MissingExtra("engine onnx needs onnxruntime: pip install onnxruntime") from error
+    return onnxruntime
+
+
+def available() -> bool:
+    """Whether onnxruntime is installed. Does not import it."""
+    from importlib.util import find_spec
+
+    return find_spec("onnxruntime") is not None
+
+
+def integers(weight: Floats) -> tuple[Array, Floats]:
+    """A layer's weight (out, in) -> (in, out) int8, and (out,) scale of each output."""
+    most = FULL if whole_integers() else HALF
+    scale = np.maximum(np.abs(weight).max(1), 1e-12) / most
+    return np.ascontiguousarray(np.rint(weight / scale[:, None]).astype(np.int8).T), scale.astype(np.float32)
+
+
+def whole_integers() -> bool:
+    """Whether this processor adds products of 8-bit integers in 32 bits (VNNI, or ARM's dot products)."""
+    import platform
+
+    if platform.machine().lower() in ("aarch64", "arm64"):
+        return True
+    try:
+        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return False
+    return "avx512_vnni" in flags or "avx_vnni" in flags

@@ -1,0 +1,28 @@
+"""A listener by name, as the loop sees it: in a process of its own, or on another machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sfms_robot.config.calmness import Calmness
+from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.plugins import REMOTE
+from sfms_robot.listeners.process import ListenerProcess
+from sfms_robot.listeners.remote import RemoteListener
+
+NamedFeed = ListenerProcess | RemoteListener
+
+
+def open_feed(
+    name: str, seed: int, calmness: Calmness | None = None, zenoh: Path | None = None, engine: EngineName = "auto"
+) -> NamedFeed:
+    """Loads or connects from now on; `wait_loaded` waits. `zenoh`: its configuration, for one on another machine,
+    which chooses its engine itself.
+
+    Raises ConfigError, MissingExtra.
+    """
+    if not name.startswith(REMOTE):
+        return ListenerProcess(name, seed, calmness, engine)
+    from sfms_robot.listeners.zenoh_link import connect_listener  # zenoh: only for who has its extra
+
+    return connect_listener(name, seed, calmness, zenoh)

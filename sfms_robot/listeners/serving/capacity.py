@@ -1,0 +1,124 @@
+"""How many heads one server can answer in time, from what steps cost on this machine.
+
+While a batch is made frames wait, and are the next batch. n heads send n / T frames a second, of which every `hop`-th
+asks for a plan, so batches settle at a duration B in which just as many frames come as a batch of that duration takes:
+
+    cost(n B / T) = B,   cost(m) = plan(m / hop) + other(m - m / hop)
+
+Who comes just too late for one batch waits for it and for the next: 2 B, a little more where the machine is uneven.
+That is held against the deadline. Costs are measured at the start for some sizes of batches, lines are drawn between
+them, and while serving they are scaled by how long batches really take.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
+from sfms_robot.listeners.serving.batches import step_each
+from sfms_robot.ports import Listener
+
+SIZES: Final = (1, 2, 4, 8, 16, 32)
+ROUNDS: Final = 3  # plans that are measured at each size, after one that is not
+UNEVEN: Final = 1.2  # of 2 B: what the slowest of a hundred takes, measured
+_BISECTIONS: Final = 20
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """What batches cost here.
+
+    Attributes:
+        hop: frames from one plan to the next.
+        sizes: heads in a batch, rising.
+        plan_s, other_s: of a batch in which all plan, or none.
+        scale: how much longer batches take in service.
+    """
+
+    hop: int
+    sizes: tuple[int, ...]
+    plan_s: tuple[float, ...]
+    other_s: tuple[float, ...]
+    scale: float = 1.0
+
+    def batch_s(self, plans: float, others: float) -> float:
+        """A batch of so many steps with and without a plan."""
+        return self.scale * (_between(self.sizes, self.plan_s, plans) + _between(self.sizes, self.other_s, others))
+
+    def delay_s(self, heads: int, deadline_s: float) -> float:
+        """From a frame to its plan, at most; inf where `heads` are more than can be kept up with at all."""
+        if not heads:
+            return 0.0
+        longest_s = 2 * deadline_s
+
+        def kept_up(b_s: float) -> bool:
+            frames = max(1.0, heads * b_s / FRAME_S)
+            return self.batch_s(frames / self.hop, frames - frames / self.hop) <= b_s
+
+        if not kept_up(longest_s):
+            return float("inf")
+        low_s, high_s = 0.0, longest_s
+        for _ in range(_BISECTIONS):
+            middle_s = (low_s + high_s) / 2
+            low_s, high_s = (low_s, middle_s) if kept_up(middle_s) else (middle_s, high_s)
+        return 2 * high_s * UNEVEN
+
+    def most(self, deadline_s: float) -> int:
+        """Heads that are answered within the deadline."""
+        heads = 0
+        while self.delay_s(heads + 1, deadline_s) <= deadline_s and heads < 10_000:
+            heads += 1
+        return heads
+
+    def scaled(self, scale: float) -> Capacity:
+        """As measured in service."""
+        return replace(self, scale=scale)
+
+
+def measure_capacity(
+    listener: Listener,
+    sizes: Sequence[int] = SIZES,
+    rounds: int = ROUNDS,
+    now_s: Callable[[], float] = time.perf_counter,
+) -> Capacity:
+    """Step batches of silence and time them. Blocks for a second or two.
+
+    Medians: what a machine does besides is the scale's to tell.
+    """
+    plan_s, other_s = [], []
+    for size in sizes:
+        planned, others = _timed(listener, size, rounds, now_s)
+        plan_s.append(float(np.median(planned)))
+        other_s.append(float(np.median(others)) if others else 0.0)
+    return Capacity(listener.hop, tuple(sizes), tuple(plan_s), tuple(other_s))
+
+
+def _timed(listener: Listener, size: int, rounds: int, now_s: Callable[[], float]) -> tuple[list[float], list[float]]:
+    """What steps of `size` streams took, with a plan and without."""
+    memories = [listener.start(seed) for seed in range(size)]
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    planned: list[float] = []
+    others: list[float] = []
+    for index in range((rounds + 1) * listener.hop):
+        began_s = now_s()
+        answers = step_each(listener, [SpeakerFrame((index + 1) * FRAME_S, silence)] * size, memories)
+        taken_s = now_s() - began_s
+        memories = [memory for _, memory in answers]
+        plan: Plan | None = answers[0][0]
+        (others if plan is None else planned).append(taken_s)
+    return planned[1:] or planned or others, others[listener.hop - 1 :]
+
+
+def _between(sizes: Sequence[int], costs_s: Sequence[float], count: float) -> float:
+    """The cost of `count`: 0 for none, a line between two sizes, and the last line beyond."""
+    if count <= sizes[0]:
+        return costs_s[0] * max(count, 0.0) / sizes[0]  # some batches have one, most have none
+    if count <= sizes[-1]:
+        return float(np.interp(count, sizes, costs_s))
+    slope = (costs_s[-1] - costs_s[-2]) / (sizes[-1] - sizes[-2]) if len(sizes) > 1 else costs_s[0] / sizes[0]
+    return costs_s[-1] + max(0.0, slope) * (count - sizes[-1])

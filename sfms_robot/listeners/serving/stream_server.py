@@ -1,0 +1,345 @@
+"""Many heads, one model: streams join, send frames, and are stepped in batches. Opens nothing, waits for nothing.
+
+Whoever owns it (`app.serve`) brings messages and the time, and does three things in turn, the middle one without its
+lock, by as many threads as there are cores:
+
+    batch    the frames that are due, earliest deadline first, one of each stream, as many as can be made in time
+    step     the listener steps them together
+    finish   memories are kept, plans become messages
+
+A frame's deadline is `DEADLINE_S` after it was whole at its robot (as far as the clocks are known, else after it came);
+one that asks for no plan may wait until the one that does. So a stream that is slow, or sends nothing, or sends what it
+missed in one burst, costs the others nothing: it has one place in a batch, like all of them. What a stream remembers is
+the listener's memory, and at most `MOST_WAITING` frames; where more are waiting it goes on at the newest.
+
+A frame that was lost on the way becomes an empty one (nothing heard, nobody seen), so that memories count time.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import secrets
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.config.base import parse
+from sfms_robot.config.calmness import Calmness
+from sfms_robot.errors import PacketError, RobotError
+from sfms_robot.frames import FRAME_S, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.listeners.process import MOST_WAITING
+from sfms_robot.listeners.remote_messages import (
+    Interface,
+    Join,
+    Notice,
+    Refusal,
+    SentFrame,
+    SentPlan,
+    Welcome,
+    parse_frame,
+    parse_words,
+    plan_message,
+    words_message,
+)
+from sfms_robot.listeners.serving.batches import step_each
+from sfms_robot.listeners.serving.capacity import Capacity
+from sfms_robot.ports import Listener
+from sfms_robot.signals.quantiles import Quantiles
+
+DEADLINE_S: Final = 0.080
+SILENT_S: Final = 10.0  # a stream that sends nothing for so long is given up
+RECENT: Final = 2048  # delays that p50 and p99 are of
+MOST_FILLED: Final = MOST_WAITING  # lost frames in a row that become empty ones; more is an outage
+TOLD_AGAIN: Final = 2  # plans that tell an event once more
+_STALE_S: Final = 2.0  # a frame that claims to be older has a clock of its own
+_SCALE_STEP: Final = 0.05  # of a batch's weight in the scale of costs
+_EMPTY: Final = np.zeros(0, np.float32)
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Due:
+    """A frame that waits to be stepped; times by the server's clock."""
+
+    sent: SentFrame
+    came_s: float
+    deadline_s: float
+
+
+@dataclass
+class _Stream:
+    """One head's."""
+
+    name: str
+    client: str
+    memory: Any
+    heard_s: float
+    waiting: deque[_Due] = field(default_factory=deque)
+    expected: int | None = None  # number of the next frame
+    to_plan: int = 0  # steps until the next one that plans
+    stepping: bool = False
+    events: deque[tuple[ListenerEvent, ...]] = field(default_factory=lambda: deque(maxlen=TOLD_AGAIN))
+    calmness: Calmness | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Frames to be stepped together, and the streams that they are of."""
+
+    streams: Sequence[_Stream]
+    dues: Sequence[_Due]
+
+    @property
+    def speakers(self) -> list[SpeakerFrame]:
+        return [due.sent.frame for due in self.dues]
+
+    @property
+    def memories(self) -> list[Any]:
+        return [stream.memory for stream in self.streams]
+
+
+class StreamServer:
+    """Not thread-safe, but for `step`. All times are seconds of one clock.
+
+    Args:
+        listener: that is served, under `name`.
+        capacity: what its batches cost; None admits everybody.
+        server: what this server is called; a fresh number is put behind it.
+        deadline_s: what is promised to each head.
+
+    Attributes:
+        plans, batches, misses, skipped, lost, refused: counts; `misses` are plans later than the deadline.
+    """
+
+    def __init__(
+        self,
+        listener: Listener,
+        name: str,
+        capacity: Capacity | None = None,
+        server: str = "server",
+        deadline_s: float = DEADLINE_S,
+    ) -> None:
+        self._listener, self._name, self._capacity = listener, name, capacity
+        self._server = f"{server}-{secrets.token_hex(3)}"
+        self._deadline_s = deadline_s
+        self._streams: dict[str, _Stream] = {}
+        self._recent_s: deque[float] = deque(maxlen=RECENT)
+        self._most = self._batch_limit()
+        self._batch_sizes = Quantiles()
+        self.plans = self.batches = self.misses = self.skipped = self.lost = self.refused = self.stepped = 0
+
+    @property
+    def heads(self) -> int:
+        """Streams at this moment."""
+        return len(self._streams)
+
+    @property
+    def waits(self) -> bool:
+        """Whether `batch` has something to give."""
+        return any(each.waiting and not each.stepping for each in self._streams.values())
+
+    # --- coming and going --------------------------------------------------------------------------------------------
+
+    def join(self, message: bytes, now_s: float) -> bytes:
+        """The answer to somebody who asks to be listened for: Welcome or Refusal, as bytes. Never raises."""
+        try:
+            said = parse_words(message)
+            if not isinstance(said, Join):
+                raise PacketError("something else than Join")
+            answer = self._admit(said, now_s)
+        except RobotError as error:
+            answer = Refusal(f"server {self._server} cannot take that: {error}", final=True)
+        if isinstance(answer, Refusal):
+            self.refused += 1
+            log.info("refused: %s", answer.reason)
+        return words_message(answer)
+
+    def _admit(self, join: Join, now_s: float) -> Welcome | Refusal:
+        ours = Interface()
+        if not ours.fits(join.interface):
+            return Refusal(f"this robot is {join.interface}; server {self._server} is {ours}", final=True)
+        calmness = None if join.calmness is None else parse(Calmness, dict(join.calmness), "calmness")
+        known = next((each for each in self._streams.values() if each.client == join.client), None)
+        if known is None:
+            if (reason := self._full()) is not None:
+                return Refusal(reason, final=False)
+            known = _Stream(secrets.token_hex(6), join.client, self._listener.start(join.seed), now_s)
+            known.calmness = calmness
+            self._streams[known.name] = known
+        known.heard_s = now_s
+        return Welcome(known.name, self._server, self._name, self._listener.horizon, self._listener.hop)
+
+    def _full(self) -> str | None:
+        """Why nobody more is taken; None: one more is."""
+        if self._capacity is None:
+            return None
+        delay_s = self._capacity.delay_s(self.heads + 1, self._deadline_s)
+        if delay_s <= self._deadline_s:
+            return None
+        after = "not be kept up with" if math.isinf(delay_s) else f"be answered after {delay_s * 1e3:.0f} ms"
+        return (
+            f"server {self._server} is full: with {self.heads} heads one more would {after}, "
+            f"{self._deadline_s * 1e3:.0f} ms are promised"
+        )
+
+    def expire(self, now_s: float) -> None:
+        """Give up streams that send nothing."""
+        for name, stream in list(self._streams.items()):
+            if now_s - stream.heard_s > SILENT_S and not stream.stepping:
+                log.info("stream %s has sent nothing for %.0f s: given up", name, SILENT_S)
+                del self._streams[name]
+
+    # --- frames ------------------------------------------------------------------------------------------------------
+
+    def receive(self, name: str, message: bytes, now_s: float) -> Sequence[bytes]:
+        """A message to the stream `name`; what is to be answered at once. Never raises."""
+        stream = self._streams.get(name)
+        if stream is None:
+            return [words_message(Notice("unknown"))]
+        stream.heard_s = now_s
+        try:
+            if message[:1] == b"{":
+                self._heed(stream, message)
+                return []
+            return self._enqueue(stream, parse_frame(message), now_s)
+        except RobotError as error:
+            log.warning("stream %s: %s", name, error)
+            return []
+
+    def _heed(self, stream: _Stream, message: bytes) -> None:
+        said = parse_words(message)
+        if not isinstance(said, Notice):
+            raise PacketError("words that a server is not sent to a stream (leave, calm)")
+        if said.kind == "leave":
+            self._streams.pop(stream.name, None)
+        elif said.kind == "calm" and said.calmness is not None:
+            stream.calmness = parse(Calmness, dict(said.calmness), "calmness")
+
+    def _enqueue(self, stream: _Stream, sent: SentFrame, now_s: float) -> Sequence[bytes]:
+        if stream.expected is not None:
+            gap = sent.number - stream.expected
+            if gap < 0:
+                return []  # it came late, and an empty one has taken its place; or twice
+            self.lost += gap
+            for back in range(min(gap, MOST_FILLED), 0, -1):
+                empty = SpeakerFrame(sent.frame.time_s - back * FRAME_S, _EMPTY)
+                filled = SentFrame(sent.number - back, empty, sent.sent_s - back * FRAME_S, sent.server_sent_s)
+                stream.waiting.append(self._due(filled, now_s))
+        stream.expected = sent.number + 1
+        stream.waiting.append(self._due(sent, now_s))
+        if len(stream.waiting) <= MOST_WAITING:
+            return []
+        left_out = len(stream.waiting) - 1
+        stream.waiting = deque([stream.waiting[-1]])
+        self.skipped += left_out
+        return [words_message(Notice("skipped", frames=left_out))]
+
+    def _due(self, sent: SentFrame, now_s: float) -> _Due:
+        age_s = now_s - sent.server_sent_s
+        made_s = sent.server_sent_s if 0.0 <= age_s <= _STALE_S else now_s
+        return _Due(sent, now_s, made_s + self._deadline_s)
+
+    # --- batches -----------------------------------------------------------------------------------------------------
+
+    def batch(self) -> Batch | None:
+        """What is to be stepped next; None while nothing waits. Its streams are not in another batch until `finish`."""
+        ready = [each for each in self._streams.values() if each.waiting and not each.stepping]
+        if not ready:
+            return None
+        ready.sort(key=_urgency)
+        chosen = ready[: self._most]
+        for stream in chosen:
+            stream.stepping = True
+            if stream.calmness is not None and (change := getattr(self._listener, "calmed", None)) is not None:
+                stream.memory = change(stream.memory, stream.calmness)
+            stream.calmness = None
+        return Batch(chosen, [stream.waiting.popleft() for stream in chosen])
+
+    def step(self, batch: Batch) -> list[tuple[Plan | None, Any]]:
+        """From any thread, also several at a time."""
+        return step_each(self._listener, batch.speakers, batch.memories)
+
+    def finish(
+        self, batch: Batch, answers: Sequence[tuple[Plan | None, Any]], began_s: float, now_s: float
+    ) -> list[tuple[str, bytes]]:
+        """Keep the memories; the messages to be sent, each with its stream. `began_s`: when the step did."""
+        step_s = now_s - began_s
+        messages = []
+        for stream, due, (plan, memory) in zip(batch.streams, batch.dues, answers, strict=True):
+            stream.memory, stream.stepping = memory, False
+            stream.to_plan = self._listener.hop - 1 if plan is not None else max(0, stream.to_plan - 1)
+            if plan is not None and stream.name in self._streams:
+                earlier = tuple(event for each in stream.events for event in each)
+                sent = SentPlan(due.sent.number, plan, due.sent.sent_s, due.came_s, now_s, step_s * 1e3)
+                messages.append((stream.name, plan_message(sent, earlier)))
+                stream.events.append(plan.events)
+                self._planned(now_s - due.came_s)
+        self.batches += 1
+        self.stepped += len(batch.streams)
+        self._batch_sizes.add(len(batch.streams))
+        self._weigh(sum(plan is not None for plan, _ in answers), len(answers), step_s)
+        return messages
+
+    def failed(self, batch: Batch) -> None:
+        """Its step raised: these streams are given up, and join anew."""
+        for stream in batch.streams:
+            self._streams.pop(stream.name, None)
+
+    def _planned(self, delay_s: float) -> None:
+        self.plans += 1
+        self.misses += delay_s > self._deadline_s
+        self._recent_s.append(delay_s)
+
+    def _weigh(self, plans: int, steps: int, step_s: float) -> None:
+        """Batches take as long as they take, whatever was measured at the start."""
+        if self._capacity is None:
+            return
+        expected_s = self._capacity.scaled(1.0).batch_s(plans, steps - plans)
+        if expected_s > 0:
+            ratio = min(max(step_s / expected_s, 0.25), 4.0)
+            self._capacity = self._capacity.scaled(self._capacity.scale + _SCALE_STEP * (ratio - self._capacity.scale))
+
+    def _batch_limit(self) -> int:
+        """Streams of a batch that takes half of the deadline, all planning."""
+        if self._capacity is None:
+            return 1 << 16
+        size = 1
+        while self._capacity.batch_s(size + 1, 0) <= self._deadline_s / 2 and size < 4096:
+            size += 1
+        return size
+
+    # --- figures -----------------------------------------------------------------------------------------------------
+
+    def statistics(self) -> Mapping[str, Any]:
+        """`heads`, `room` for more, `plans`, `deadline_misses`, `delay_ms` of the last plans, `batch_size`, ..."""
+        recent = list(self._recent_s)
+        p50, p99 = (np.percentile(recent, [50, 99]) * 1e3).round(3).tolist() if recent else (None, None)
+        most = None if self._capacity is None else self._capacity.most(self._deadline_s)
+        return {
+            "server": self._server,
+            "listener": self._name,
+            "hop": self._listener.hop,
+            "heads": self.heads,
+            "most_heads": most,
+            "plans": self.plans,
+            "deadline_ms": self._deadline_s * 1e3,
+            "deadline_misses": self.misses,
+            "delay_ms": {"p50": p50, "p99": p99},
+            "batches": self.batches,
+            "batch_size": self._batch_sizes.report(p50=50, p99=99),
+            "steps": self.stepped,
+            "skipped_frames": self.skipped,
+            "lost_frames": self.lost,
+            "refused": self.refused,
+            "cost_scale": None if self._capacity is None else round(self._capacity.scale, 3),
+        }
+
+
+def _urgency(stream: _Stream) -> float:
+    """When its next frame must be stepped: one that asks for no plan may wait for the one that does."""
+    return stream.waiting[0].deadline_s + stream.to_plan * FRAME_S

@@ -1,0 +1,17 @@
+"""Which channels of a motion space move the head."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sfms_robot.frames import POSE_CHANNELS
+
+# Channels of any motion space that turn or move the head.
+HEAD = frozenset(
+    {*POSE_CHANNELS, *(f"{part}_{axis}" for part in ("rotation", "translation", "head") for axis in "xyz")}
+)
+
+
+def head_channels(channels: Sequence[str]) -> list[int]:
+    """Which of the channels move the head."""
+    return [index for index, name in enumerate(channels) if name in HEAD]

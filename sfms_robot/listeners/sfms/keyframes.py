@@ -1,0 +1,88 @@
+"""Tokens of a stream, as numbers: the last keyframes before every frame, and a window that moves on.
+
+A token is 0 at a transition, 1 + i at a keyframe of code i, UNDECIDED where nobody has drawn it yet. B streams, P past
+and H future frames, G groups.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.frames import Floats
+
+Tokens = NDArray[np.int64]
+UNDECIDED: Final = -1
+KEPT_FRAMES: Final = 1  # of the future, whatever is told
+SAME: Final = 1e-5  # what is told of a frame differs by more, or does not
+NEUTRAL_STRIDE: Final = 8  # frames between the keyframes of the neutral face a stream begins with
+
+
+class LastKeyframes(NamedTuple):
+    """The last two keyframes of every group, the newer first: tokens (..., G, 2), 0 for none yet, and their frames."""
+
+    tokens: Tokens
+    at: Tokens
+
+    def then(self, drawn: Tokens, frame: int) -> LastKeyframes:
+        """After the tokens (..., G) `drawn` for `frame`."""
+        key = (drawn > 0)[..., None]
+        newer = np.stack([drawn, self.tokens[..., 0]], axis=-1)
+        newer_at = np.stack([np.full_like(drawn, frame), self.at[..., 0]], axis=-1)
+        return LastKeyframes(np.where(key, newer, self.tokens), np.where(key, newer_at, self.at))
+
+
+def last_keyframes(tokens: Tokens) -> LastKeyframes:
+    """Tokens (B, T, G) -> the last keyframes at every frame, that frame included; -1 is before the first frame."""
+    frame = np.arange(tokens.shape[1])[:, None]
+    last = np.maximum.accumulate(np.where(tokens > 0, frame, -1), axis=1)
+    earlier = np.concatenate([np.full_like(last[:, :1], -1), last[:, :-1]], axis=1)  # of the frame before
+    before = np.where(last < 0, -1, np.take_along_axis(earlier, np.maximum(last, 0), 1))
+    at = np.stack([last, before], axis=-1)
+    found = [np.take_along_axis(tokens, np.maximum(each, 0), 1) for each in (last, before)]
+    return LastKeyframes(np.where(at < 0, 0, np.stack(found, axis=-1)), at)
+
+
+def neutral_mask(frames: int, groups: int) -> Floats:
+    """(frames, groups): where the keyframes of a still, neutral face are, the last of them at the newest frame."""
+    mask = np.zeros((frames, groups), np.float32)
+    mask[(frames - 1) % NEUTRAL_STRIDE :: NEUTRAL_STRIDE] = 1.0
+    return mask
+
+
+def passed(tokens: Tokens, path: Floats, frames: int = 1, holds: bool = False) -> tuple[Tokens, Floats]:
+    """Tokens (B, P + H, G) and path (B, 2 + H, C) of `frames` later.
+
+    What has passed without having been planned, before the first plan, was the neutral face: no keyframe. `holds`: the
+    last keyframe that has left the window stands at its first frame.
+    """
+    horizon = path.shape[1] - 2
+    moved = np.concatenate([tokens[:, frames:], np.full_like(tokens[:, :frames], UNDECIDED)], axis=1)
+    np.maximum(moved[:, :-horizon], 0, out=moved[:, :-horizon])
+    if holds:
+        moved[:, 0] = _newest(tokens[:, : frames + 1])
+    return moved, np.concatenate([path[:, frames:], np.repeat(path[:, -1:], frames, axis=1)], axis=1)
+
+
+def _newest(tokens: Tokens) -> Tokens:
+    """(B, T, G) -> the last keyframe of each group (B, G), 0 where there is none."""
+    out: Tokens = np.maximum(tokens[:, 0], 0)
+    for frame in range(1, tokens.shape[1]):
+        out = np.where(tokens[:, frame] > 0, tokens[:, frame], out)
+    return out
+
+
+def later(control: Floats, frames: int = 1) -> Floats:
+    """Control (B, P + H, K) of `frames` later; of frames that nothing was told of yet it is 0."""
+    return np.concatenate([control[:, frames:], np.zeros_like(control[:, :frames])], axis=1)
+
+
+def revoked(tokens: Tokens, drawn_under: Floats, told: Floats, horizon: int) -> Tokens:
+    """Tokens (B, P + H, G) without those of the future that what is told now, (B, P + H, K), has overtaken."""
+    changed = (np.abs(told - drawn_under)[:, -horizon:] > SAME).any(-1)
+    stale: NDArray[Any] = np.logical_or.accumulate(changed, axis=1)
+    stale[:, :KEPT_FRAMES] = False
+    future = np.where(stale[..., None], UNDECIDED, tokens[:, -horizon:])
+    return np.concatenate([tokens[:, :-horizon], future], axis=1)

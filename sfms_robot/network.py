@@ -1,0 +1,154 @@
+"""Sessions of zenoh (zenoh.io), which carries what robots and servers say to one another.
+
+Without a configuration everything stays on this machine: who serves listens on 127.0.0.1:7447, who calls connects
+there, and nobody looks for others by multicast. A file of zenoh's own form (JSON5: endpoints, TLS, access control)
+replaces all that; docs/remote.md has one for TLS with certificates of both sides.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from sfms_robot.errors import ConfigError, MissingExtra, PortError
+
+if TYPE_CHECKING:
+    import zenoh
+
+PORT: Final = 7447  # zenoh's own
+LOOPBACK: Final = f"tcp/127.0.0.1:{PORT}"
+LEASE_MS: Final = 2000  # a link that says nothing for so long is dead, and is made anew
+QUEUE: Final = 16  # messages that wait for a busy machine, the most that zenoh takes; with its own 2 frames are lost
+RETRY: Final = {"period_init_ms": 250, "period_max_ms": 250, "period_increase_factor": 1.0}
+AWAY_S: Final = 5.0  # after which somebody who waits for a router is told
+NAME_CHARACTERS: Final = "letters, digits, '-', '_' and '.'"
+
+Role = Literal["serve", "call"]
+
+
+def check_zenoh() -> None:
+    """Raises MissingExtra where zenoh is not installed."""
+    try:
+        import zenoh  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra.of("listening from another machine, and fleets,", "remote") from error
+
+
+def check_name(name: str, what: str) -> str:
+    """`name`, which becomes a part of keys. Raises ConfigError for one that cannot."""
+    if not name or not all(each.isascii() and (each.isalnum() or each in "-_.") for each in name):
+        raise ConfigError(f"{what} {name!r} is no name ({NAME_CHARACTERS})")
+    return name
+
+
+def session_config(role: Role, file: Path | None = None, endpoint: str | None = None) -> zenoh.Config:
+    """How a session connects: as `file` says, else on loopback, else at `endpoint`.
+
+    Raises ConfigError for a file or an endpoint that zenoh does not take, MissingExtra without zenoh.
+    """
+    check_zenoh()
+    import zenoh
+
+    if file is not None:
+        if not file.is_file():
+            raise ConfigError(f"{file}: no such file (a configuration of zenoh, JSON5)")
+        try:
+            return zenoh.Config.from_file(str(file))
+        except Exception as error:  # zenoh raises its own and plain exceptions alike
+            raise ConfigError(f"{file}: zenoh cannot use it: {_first_line(error)}") from error
+    where = [endpoint or LOOPBACK]
+    settings: dict[str, Any] = {
+        "mode": "router" if role == "serve" else "client",
+        "scouting/multicast/enabled": False,
+        "transport/link/tx/lease": LEASE_MS,
+        "connect/retry": RETRY,
+        "transport/link/tx/queue/size/real_time": QUEUE,
+        "listen/endpoints": where if role == "serve" else [],
+        "connect/endpoints": [] if role == "serve" else where,
+    }
+    if role == "call":
+        settings["connect/timeout_ms"] = -1  # for ever; `Connection` waits in a thread
+    config = zenoh.Config()
+    for key, value in settings.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except Exception as error:
+            raise ConfigError(f"zenoh endpoint {endpoint!r}: {_first_line(error)}") from error
+    return config
+
+
+def serve_session(config: zenoh.Config) -> zenoh.Session:
+    """A session that others connect to. Raises PortError where it cannot listen."""
+    import zenoh
+
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise PortError(f"zenoh cannot listen: {_first_line(error)}") from error
+
+
+def close_session(session: Any) -> None:
+    """Idempotent. (`Any`: zenoh says nothing of the types of its own.)"""
+    session.close()
+
+
+class Connection:
+    """A session that is being opened in a thread of its own, for as long as its router is away.
+
+    Attributes:
+        problem: why it never will be there; None as long as it may.
+    """
+
+    def __init__(self, config: zenoh.Config) -> None:
+        self._config = config
+        self._session: zenoh.Session | None = None
+        self._changed = threading.Condition()
+        self._closed = False
+        self.problem: str | None = None
+        threading.Thread(target=self._open, name="zenoh", daemon=True).start()
+
+    @property
+    def session(self) -> zenoh.Session | None:
+        """None while nobody answers."""
+        return self._session
+
+    def wait(self, limit_s: float) -> zenoh.Session | None:
+        """The session, waited for; None when it is not there by then. Raises PortError when it never will be."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._session is not None or self.problem is not None, limit_s)
+        if self.problem is not None:
+            raise PortError(self.problem)
+        return self._session
+
+    def close(self) -> None:
+        """Idempotent; one that is still being opened is closed as soon as it is open."""
+        with self._changed:
+            self._closed = True
+            session, self._session = self._session, None
+        if session is not None:
+            close_session(session)
+
+    def _open(self) -> None:
+        import zenoh
+
+        try:
+            session = zenoh.open(self._config)
+        except zenoh.ZError as error:
+            with self._changed:
+                self.problem = f"zenoh cannot connect: {_first_line(error)}"
+                self._changed.notify_all()
+            return
+        with self._changed:
+            if not self._closed:
+                self._session = session
+            self._changed.notify_all()
+        if self._closed:
+            close_session(session)
+
+
+def _first_line(error: BaseException) -> str:
+    """What zenoh says, without the places in its source."""
+    text = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return text.partition(" at /")[0].rstrip(".")

@@ -1,0 +1,60 @@
+"""How large and how long a listener's events are: what composed dyads, the event model and its teacher share.
+
+Sizes of nods, shakes and tilts are degrees from peak to peak, those of a face shares of full closure or pull. Nobody
+measured the sizes of annotated nods: these are of the recorded heads that composed dyads are made of. Looks aside are
+those of 14 people who listened to somebody with no table between them (Dembinsky et al., ETRA 2024, github
+psyberlab/eye-gaze-during-conversation-dataset e156145, Apache-2.0): beyond 5 degrees of the other's face for 0.86 s in
+the mean.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+NOD_DEG: Final = (2.2, 5.0, 12.0)  # least, habit, most
+NOD_SPREAD: Final = 0.35  # of the logarithm, from nod to nod
+HABIT_SPREAD: Final = 0.2  # from person to person
+SWINGS_HZ: Final = (1.8, 3.0)  # pace of a person's nods: there and back
+MOST_SWINGS: Final = 4
+SWING_S: Final = (0.3, 0.66)
+SHAKE: Final = 0.8  # of a nod's size
+TILT_DEG: Final = (2.0, 6.0)
+LAUGH: Final = (0.5, 0.9)
+LAUGH_LONGER_S: Final = (0.8, 1.8)  # than its sound is the smile of a laugh
+SMILE: Final = (0.3, 0.6)
+SMILE_S: Final = (2.0, 0.4, 1.0, 6.0)  # how long one is seen: median, deviation of its logarithm, least, most
+MM_HM: Final = (0.25, 0.45)
+BROW_RAISE: Final = (0.2, 0.5)
+BROW_STRETCH: Final = (0.7, 1.3)  # of the recorded length
+SLIGHT_BLINKS: Final = 0.15  # share of blinks that do not close the eye
+BLINK: Final = ((0.55, 0.8), (0.85, 1.0))  # slight ones, others
+ASIDE_MEAN_S, ASIDE_LEAST_S = 0.86, 0.16
+ASIDE_DEG: Final = ((0.0, 0.25, 0.5, 0.75, 0.9, 1.0), (5.5, 6.9, 10.3, 13.9, 17.9, 20.0))  # quantiles
+SIDEWAYS, UP = 0.75, 0.75  # shares of looks away: rather sideways than not, rather up than down
+
+
+def swings(length_s: float, pace_hz: float) -> tuple[int, float]:
+    """How often a head goes there and back in about that time, and how long that takes it."""
+    count = int(min(max(round(length_s * pace_hz), 1), MOST_SWINGS))
+    return count, count * min(max(length_s / count, SWING_S[0]), SWING_S[1])
+
+
+def aside(angle_rad: float, side: float, up: float) -> tuple[float, float]:
+    """(yaw, pitch) that far away, to either side alike; `side` and `up` by lot in 0..1."""
+    share = 2 * side % 1.0
+    steep = 45.0 * (share / SIDEWAYS if share < SIDEWAYS else 1 + (share - SIDEWAYS) / (1 - SIDEWAYS))
+    yaw = math.copysign(math.cos(math.radians(steep)), 0.5 - side)
+    return angle_rad * yaw, angle_rad * math.copysign(math.sin(math.radians(steep)), up - UP)  # pitch + is down
+
+
+def aside_rad(share: float) -> float:
+    """How far aside a look goes; `share` by lot in 0..1."""
+    return math.radians(float(np.interp(share, *ASIDE_DEG)))
+
+
+def aside_s(share: float) -> float:
+    """How long one lasts, likewise; `share` below 1."""
+    return ASIDE_LEAST_S - (ASIDE_MEAN_S - ASIDE_LEAST_S) * math.log1p(-share)

@@ -1,0 +1,209 @@
+"""The page's process: a server, and the two pipes to the run that it shows."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import secrets
+import socket
+import ssl
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, Final
+
+import orjson
+import uvicorn
+
+from sfms_robot.child_process import take_pipes
+from sfms_robot.errors import ConfigError, PortError, RobotError
+from sfms_robot.face.robot_scene import RobotScene
+from sfms_robot.origin import is_loopback
+from sfms_robot.viewer.page_process import DOCUMENT, HEADER, PERSON, PICTURE, Address
+from sfms_robot.viewer.page_server import PageServer
+from sfms_robot.viewer.visitor_commands import LONGEST_PERSON, Command
+
+SceneOf = Callable[[str], RobotScene | None]
+NICE: Final = 5  # the servo loop goes first
+TRIED: Final = 20  # ports
+MOST_UNSENT: Final = 2_000_000  # bytes for a run that does not read: a visitor's voice is left out then
+SEND_BUFFER: Final = 65_536  # bytes on their way to a visitor: pictures that are a second old are of no use
+
+
+class RunPipe:
+    """`page_server.Run` at the other end of a pipe."""
+
+    def __init__(self) -> None:
+        self._transport: asyncio.WriteTransport | None = None
+
+    async def open(self, pipe: IO[bytes]) -> None:
+        loop = asyncio.get_running_loop()
+        self._transport, _ = await loop.connect_write_pipe(asyncio.BaseProtocol, pipe)
+
+    def command(self, visitor: int, command: Command) -> None:
+        self.send(visitor, command=command.name, values=command.values)
+
+    def person(self, visitor: int, message: bytes) -> None:
+        if self._transport is not None and self._transport.get_write_buffer_size() < MOST_UNSENT:
+            self._transport.write(HEADER.pack(len(message), PERSON, visitor) + message)
+
+    def left(self, visitor: int) -> None:
+        self.send(visitor, left=True)
+
+    def watched(self, visitors: int) -> None:
+        self.send(0, watched=visitors)
+
+    def send(self, visitor: int, **told: Any) -> None:
+        """A document to the run."""
+        if self._transport is not None:
+            message = orjson.dumps(told)
+            self._transport.write(HEADER.pack(len(message), DOCUMENT, visitor) + message)
+
+
+class FromRun(asyncio.Protocol):
+    """What the run sends, done as it comes; of pictures that come at once the newest is shown. Ends with the pipe."""
+
+    def __init__(self, page: PageServer, over: asyncio.Event, scene_of: SceneOf | None) -> None:
+        self._page, self._over, self._scene_of = page, over, scene_of
+        self._unread = bytearray()
+
+    def data_received(self, data: bytes) -> None:
+        self._unread += data
+        picture: bytes | None = None
+        while len(self._unread) >= HEADER.size:
+            length, kind, visitor = HEADER.unpack_from(self._unread)
+            end = HEADER.size + length
+            if len(self._unread) < end:
+                break
+            message = bytes(self._unread[HEADER.size : end])
+            del self._unread[:end]
+            if kind == PICTURE:
+                if picture is not None:
+                    self._page.keep(picture)
+                picture = message
+            else:
+                if picture is not None:
+                    self._page.show(picture)
+                    picture = None
+                self._document(visitor, orjson.loads(message))
+        if picture is not None:
+            self._page.show(picture)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._over.set()
+
+    def _scene(self, head: str) -> RobotScene | None:
+        return None if self._scene_of is None else self._scene_of(head)
+
+    def _document(self, visitor: int, told: dict[str, Any]) -> None:
+        do = told.pop("do")
+        if do == "begin":
+            self._page.begin(told, partial(self._scene, told.pop("scene", "")))
+        elif do == "end":
+            self._page.end(told["report"])
+        elif do == "error":
+            self._page.answer(visitor, orjson.dumps({"type": "error", "error": told["error"]}))
+        elif do == "recorded":
+            file = told["file"]
+            self._page.recorded(None if file is None else Path(file), told["record"])
+        else:
+            self._page.tell(orjson.dumps({"type": do, **told}), keep=do != "status")
+
+
+def main(scene_of: SceneOf | None = None) -> None:
+    """Serve until the pipe ends. The first message says where. `scene_of`: gives the picture of a head by its name."""
+    incoming, outgoing = take_pipes()
+    first = _first_document(incoming.fileno())
+    if first is None:
+        return
+    if hasattr(os, "nice"):
+        os.nice(NICE)
+    address, run = Address(**first), RunPipe()
+    asyncio.run(_serve(address, run, incoming, outgoing, scene_of))
+
+
+def _first_document(pipe: int) -> dict[str, Any] | None:
+    """Byte for byte: what follows it is read by others. None at the end of the pipe."""
+
+    def exactly(length: int) -> bytes:
+        data = b""
+        while len(data) < length and (more := os.read(pipe, length - len(data))):
+            data += more
+        return data
+
+    header = exactly(HEADER.size)
+    if len(header) < HEADER.size:
+        return None
+    first: dict[str, Any] = orjson.loads(exactly(HEADER.unpack(header)[0]))
+    return first
+
+
+async def _serve(
+    address: Address, run: RunPipe, incoming: IO[bytes], outgoing: IO[bytes], scene_of: SceneOf | None
+) -> None:
+    await run.open(outgoing)
+    try:
+        listening = bound(address)
+        _check_certificate(address)
+    except RobotError as error:
+        run.send(0, problem=str(error), of=type(error).__name__)
+        return
+    host, port = listening.getsockname()[:2]
+    token = None if is_loopback(host) else secrets.token_urlsafe(12)
+    over = asyncio.Event()
+    page = PageServer(run, token)
+    loop = asyncio.get_running_loop()
+    await loop.connect_read_pipe(lambda: FromRun(page, over, scene_of), incoming)
+    config = uvicorn.Config(
+        page.app, ws="websockets-sansio", http="h11", lifespan="off", loop="none", log_config=None, log_level="error",
+        access_log=False, ws_max_size=LONGEST_PERSON, ws_per_message_deflate=False, ssl_certfile=address.certificate,
+        ssl_keyfile=address.key, timeout_graceful_shutdown=1, server_header=False,
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    serving = asyncio.create_task(server.serve(sockets=[listening]))
+    page.prepare()
+    run.send(0, bound=url(address, host, port, token), token=token, taken=_taken(address, port))
+    await over.wait()
+    server.should_exit = True
+    await serving
+
+
+def bound(address: Address) -> socket.socket:
+    """A socket that listens there, or on the next port that is free. Raises PortError where there is none."""
+    ports = [0] if address.port == 0 else [*range(address.port, min(address.port + TRIED, 65536)), 0]
+    for port in ports:
+        try:
+            family, _, _, _, where = socket.getaddrinfo(address.host, port, type=socket.SOCK_STREAM)[0]
+            listening = socket.create_server(where[:2], family=family)
+        except (OSError, UnicodeError) as error:
+            if getattr(error, "errno", None) not in (errno.EADDRINUSE, errno.EACCES):
+                problem = getattr(error, "strerror", None) or error
+                raise PortError(f"--view {address.host}:{port}: {problem}") from error
+        else:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            return listening
+    raise PortError(f"--view {address.host}:{address.port}: no port is free")
+
+
+def url(address: Address, host: str, port: int, token: str | None) -> str:
+    """What to open in a browser; with its token, where there is one. Of every address: this machine's local name."""
+    scheme = "http" if address.certificate is None else "https"
+    if host in ("0.0.0.0", "::"):
+        host = f"{socket.gethostname().partition('.')[0]}.local"
+    name = f"[{host}]" if ":" in host else host
+    return f"{scheme}://{name}:{port}/" + ("" if token is None else f"?token={token}")
+
+
+def _taken(address: Address, port: int) -> int | None:
+    return address.port if address.port not in (0, port) else None
+
+
+def _check_certificate(address: Address) -> None:
+    if address.certificate is not None:
+        try:
+            ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(address.certificate, address.key)
+        except (ssl.SSLError, OSError) as error:
+            problem = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
+            pair = f"--view-cert {address.certificate}, --view-key {address.key}"
+            raise ConfigError(f"{pair}: not a certificate with its key: {problem}") from error

@@ -1,0 +1,233 @@
+"""The page's server in a process of its own: whatever visitors do, it costs the servo loop no tick.
+
+Both directions are messages behind a header, over the child's stdin and stdout:
+
+    uint32    length of what follows the header
+    uint8     kind: P packed picture, J JSON, V a visitor's voice or face (from the child)
+    uint32    number of a visitor, 0 for none
+
+The run's side hands over numbers and small documents; a thread writes them, of pictures the newest. The child makes
+JSON of pictures, talks to visitors, and sends back what they ask for. It ends with its pipe.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, Final, Protocol
+
+import orjson
+
+from sfms_robot.child_process import end_child, start_child
+from sfms_robot.errors import ConfigError, PortError, RobotError
+from sfms_robot.viewer.visitor_commands import Command
+
+HEADER: Final = struct.Struct("<IBI")
+PICTURE, DOCUMENT, PERSON = b"PJV"
+START_LIMIT_S: Final = 30.0  # importing on a small board with a cold disk
+CLOSE_LIMIT_S: Final = 1.0
+CHILD: Final = "sfms_robot.viewer.page_child:main"
+LOOPBACK: Final = "127.0.0.1"
+PORT: Final = 8780
+_HIGHEST_PORT: Final = 65535
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the page is to be: `--view [HOST:]PORT`, and the files of `--view-cert` and `--view-key` for https.
+
+    Attributes:
+        port: 0 for any that is free; one that is taken makes room for the next that is free.
+    """
+
+    host: str = LOOPBACK
+    port: int = PORT
+    certificate: str | None = None
+    key: str | None = None
+
+    @classmethod
+    def parsed(cls, wanted: str, certificate: Path | None = None, key: Path | None = None) -> Address:
+        """`wanted`: "auto", PORT or HOST:PORT. Raises ConfigError for another form, or missing files."""
+        if (certificate is None) != (key is None):
+            raise ConfigError("--view-cert and --view-key: https needs both (docs/page.md says how to make them)")
+        for flag, file in (("--view-cert", certificate), ("--view-key", key)):
+            if file is not None and not file.is_file():
+                raise ConfigError(f"{flag} {file}: no such file")
+        files = (None if certificate is None else str(certificate), None if key is None else str(key))
+        if wanted == "auto":
+            return cls(LOOPBACK, PORT, *files)
+        host, colon, number = wanted.rpartition(":")
+        if not (number.isascii() and number.isdigit() and int(number) <= _HIGHEST_PORT) or (colon and not host):
+            raise ConfigError(f"--view {wanted}: is no TCP port (PORT, HOST:PORT; 0 for a free one, or none)")
+        return cls(host.strip("[]") if colon else LOOPBACK, int(number), *files)
+
+
+class Asked(Protocol):
+    """Who does what visitors ask for. Called in a thread of the page's; may raise RobotError, told to the visitor."""
+
+    def command(self, visitor: int, command: Command) -> None: ...
+
+    def person(self, visitor: int, message: bytes) -> None: ...
+
+    def left(self, visitor: int) -> None:
+        """Who had the controls has them no more."""
+
+
+class PageProcess:
+    """The run's side. All methods from any thread; only the constructor's `wait` and `close` block.
+
+    Attributes:
+        url: where the page is, with its token where it needs one.
+        visitors: how many look at it now.
+        token: None on loopback.
+    """
+
+    def __init__(self, address: Address, child: str = CHILD) -> None:
+        """Starts at once; `wait` says what came of it. `child`: what runs there, a "module:function"."""
+        self.url = ""
+        self.taken: int | None = None
+        self.token: str | None = None
+        self.visitors = 0
+        self.visited = threading.Event()
+        self._asked: Asked | None = None
+        self._problem: RobotError | None = None
+        self._bound = threading.Event()
+        self._process = start_child(child)
+        self._waiting: deque[tuple[int, int, bytes]] = deque([(DOCUMENT, 0, orjson.dumps(asdict(address)))])
+        self._picture: Callable[[], bytes] | None = None
+        self._changed = threading.Condition()
+        self._closing = False
+        self._reading = threading.Thread(target=self._read, name="page", daemon=True)
+        self._reading.start()
+        threading.Thread(target=self._write, name="page", daemon=True).start()
+
+    @property
+    def process_id(self) -> int:
+        """Of the server."""
+        return self._process.pid
+
+    def __str__(self) -> str:
+        """Where it is, for people."""
+        return self.url + ("" if self.taken is None else f" ({self.taken} is taken)")
+
+    def wait(self) -> None:
+        """Block until it answers there. Raises PortError, ConfigError where it cannot."""
+        if not self._bound.wait(START_LIMIT_S):
+            self.close()
+            raise PortError(f"--view: the page's process did not start within {START_LIMIT_S:g} s")
+        if self._problem is not None:
+            self.close()
+            raise self._problem
+
+    def answered_by(self, asked: Asked | None) -> None:
+        """Who does from now on what visitors ask for; None: nobody, they are told so."""
+        self._asked = asked
+
+    def show(self, pack: Callable[[], bytes]) -> None:
+        """A packed picture, made by the thread that sends it; an older one that has not left yet is left out."""
+        with self._changed:
+            self._picture = pack
+            self._changed.notify()
+
+    def keep(self, record: bytes) -> None:
+        """A packed picture of a run that is over: all of them arrive, in order."""
+        with self._changed:
+            self._waiting.append((PICTURE, 0, record))
+            self._changed.notify()
+
+    def say(self, do: str, visitor: int = 0, **values: Any) -> None:
+        """One of `page_child`'s documents, in order."""
+        message = orjson.dumps({"do": do, **values}, default=str)
+        with self._changed:
+            self._waiting.append((DOCUMENT, visitor, message))
+            self._changed.notify()
+
+    def close(self) -> None:
+        """End the server; blocks for twice `CLOSE_LIMIT_S` at most. Idempotent."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        end_child(self._process, CLOSE_LIMIT_S)
+
+    def _write(self) -> None:
+        pipe = self._process.stdin
+        assert pipe is not None
+        try:
+            with pipe:
+                while True:
+                    with self._changed:
+                        self._changed.wait_for(lambda: self._closing or self._waiting or self._picture is not None)
+                        if self._closing and not self._waiting:
+                            return
+                        pack, self._picture = self._picture, None
+                    packed = [] if pack is None else [(PICTURE, 0, pack())]
+                    with self._changed:
+                        messages = [*self._waiting, *packed]
+                        self._waiting.clear()
+                    pipe.write(b"".join(HEADER.pack(len(data), kind, of) + data for kind, of, data in messages))
+                    pipe.flush()
+        except (BrokenPipeError, OSError, ValueError):
+            return  # it died: the reader sees that too, and says so
+
+    def _read(self) -> None:
+        pipe = self._process.stdout
+        assert pipe is not None
+        with pipe:
+            while (message := read_message(pipe)) is not None:
+                kind, visitor, data = message
+                if kind == PERSON:
+                    self._heed(visitor, partial(_person, visitor, data))
+                else:
+                    self._told(visitor, orjson.loads(data))
+        self.visitors = 0
+        if not self._closing:
+            self._problem = self._problem or PortError("--view: the page's process died")
+            if self._bound.is_set():
+                log.warning("the page is away: its process died (exit code %s); the run goes on", self._process.wait())
+        self._bound.set()
+
+    def _told(self, visitor: int, told: Mapping[str, Any]) -> None:
+        if "bound" in told:
+            self.url, self.token, self.taken = told["bound"], told["token"], told["taken"]
+            self._bound.set()
+        elif "problem" in told:
+            self._problem = (ConfigError if told["of"] == "ConfigError" else PortError)(told["problem"])
+        elif "watched" in told:
+            self.visitors = told["watched"]
+            self.visited.set()
+        elif "left" in told:
+            self._heed(visitor, lambda asked: asked.left(visitor))
+        else:
+            command = Command(told["command"], told["values"])
+            self._heed(visitor, lambda asked: asked.command(visitor, command))
+
+    def _heed(self, visitor: int, do: Callable[[Asked], None]) -> None:
+        asked = self._asked
+        try:
+            if asked is None:
+                raise RobotError("no run is on")
+            do(asked)
+        except RobotError as error:
+            self.say("error", visitor, error=str(error))
+
+
+def _person(visitor: int, message: bytes, asked: Asked) -> None:
+    asked.person(visitor, message)
+
+
+def read_message(pipe: IO[bytes]) -> tuple[int, int, bytes] | None:
+    """(kind, visitor, data); None at the end of the pipe. Blocks until it is whole."""
+    header = pipe.read(HEADER.size)
+    if len(header) < HEADER.size:
+        return None
+    length, kind, visitor = HEADER.unpack(header)
+    data = pipe.read(length)
+    return None if len(data) < length else (kind, visitor, data)

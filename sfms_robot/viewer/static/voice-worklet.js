@@ -1,0 +1,1 @@
+var e=class extends AudioWorkletProcessor{#e=new Int16Array(Math.round(sampleRate/50));#s=0;process([[s]]){for(let t of s??[])this.#e[this.#s++]=Math.max(-32768,Math.min(32767,Math.round(t*32767))),this.#s===this.#e.length&&(this.port.postMessage({piece:this.#e.slice(),at:currentTime}),this.#s=0);return!0}};registerProcessor("voice-pieces",e);

@@ -1,0 +1,103 @@
+"""A page and the runs behind it, in real time on emulated servos; and flags that cannot be, refused at once."""
+
+import json
+import threading
+from contextlib import closing
+from types import SimpleNamespace
+
+import pytest
+from websockets.sync.client import connect
+
+from sfms_robot.app.listen.page_session import LEFT_S, EndsAlone, page_session
+from sfms_robot.app.listen.preflight import begin_page
+from sfms_robot.app.session import RunOptions
+from sfms_robot.errors import ConfigError
+from sfms_robot.runtime.safety import Interrupt
+
+WAIT_S = 60.0
+
+
+class Visit(threading.Thread):
+    """Somebody who looks at a page, and does something at a kind of message: `plan` is (what is seen, what is said)."""
+
+    def __init__(self, url, plan):
+        super().__init__(daemon=True)
+        self.url, self.plan = url, list(plan)
+        self.seen = []
+
+    def run(self):
+        with connect(self.url.replace("http", "ws", 1) + "ws") as page:
+            while self.plan:
+                told = json.loads(page.recv(timeout=WAIT_S))
+                self.seen.append(told)
+                if self.plan[0][0](told):
+                    says = self.plan.pop(0)[1]
+                    if says is not None:
+                        page.send(json.dumps(says))
+
+
+def at(time_s, state=None):
+    return lambda told: told["type"] == "frame" and told["t"] >= time_s and told["s"] == (state or told["s"])
+
+
+def kind(name):
+    return lambda told: told["type"] == name
+
+
+def test_a_run_that_a_visitor_has_left_is_asked_to_end():
+    page, interrupt = SimpleNamespace(visitors=1), Interrupt()
+    alone = EndsAlone(page, interrupt)
+    alone.tick(SimpleNamespace(time_s=40.0))
+    page.visitors = 0
+    alone.tick(SimpleNamespace(time_s=40.0 + LEFT_S))
+    assert not interrupt() and not alone.ended
+    alone.tick(SimpleNamespace(time_s=40.1 + LEFT_S))
+    assert interrupt() and alone.ended
+
+
+@pytest.mark.slow
+def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
+    options = RunOptions(head="op3_head", duration_s=8.0, seed=1)
+    plan = [
+        (at(1.5), {"type": "record", "on": True}),
+        (at(1.6), {"type": "show", "channels": {"yaw": 0.4}, "seconds": 1.0}),
+        (lambda told: told["type"] == "frame" and told["j"][0] > 0.2, {"type": "halt"}),
+        (at(0.0, "halted"), {"type": "resume"}),
+        (at(0.0, "starting"), {"type": "record", "on": False}),
+        (lambda told: told["type"] == "record" and told["seconds"], {"type": "seed", "seed": 7}),
+        (lambda told: told["type"] == "hello" and told["seed"] == 7, {"type": "listener", "name": "nobody"}),
+        (kind("error"), None),
+        (at(1.0), {"type": "release"}),
+        (kind("over"), None),
+    ]
+    page = begin_page("0")
+    with closing(page), page_session(page, options, choices=True) as pages:
+        visit = Visit(page.url, plan)
+        visit.start()
+        first = pages.run()
+        assert first["exit"] == "interrupted" and pages.next(stay=True)
+        second = pages.run()
+        visit.join(WAIT_S)
+        assert not visit.plan, f"waits for {visit.plan[0]}"
+        assert second["seed"] == 7 and pages.released and not pages.next(stay=True)  # nobody looks any more
+        assert "halted" in [change["state"] for change in first["states"]["changes"]]
+        assert first["observers_detached"] == second["observers_detached"] == {}
+        assert (pages._folder / "recording-1" / "run.mcap").stat().st_size > 1000
+    errors = [told["error"] for told in visit.seen if told["type"] == "error"]
+    assert len(errors) == 1 and "nobody" in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--fast", "--view"], "--view auto: a page shows what takes real time"),
+        (["--dry-run", "--view", "9000"], "--view 9000: nothing moves in a --dry-run"),
+        (["--view", "nowhere"], "--view nowhere: is no TCP port"),
+        (["--view-cert", "a.pem"], "no page is served"),
+        (["--view", "--view-cert", "a.pem"], "https needs both"),
+        (["--fast", "--audio", "browser"], "a page shows what takes real time"),
+    ],
+)
+def test_a_page_that_cannot_be_is_refused_in_one_line(command_line, words, problem):
+    ended = command_line("run", "--duration", 1, *words)
+    assert ended.code == ConfigError.exit_code and problem in ended.err

@@ -1,0 +1,190 @@
+"""What each paper says, and that the configuration of its name does it; and that cards name every departure from it."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from sfms_robot import config
+from sfms_robot.config import load_training
+from sfms_robot.data import data_dir
+from sfms_robot.learning.training_loop import optimizer, schedule
+from sfms_robot.listeners import checkpoint
+
+TRAINING = data_dir("configs") / "training"
+# Of a listener or its training, what is its size, not its method: the same in both files.
+SIZES = {
+    "description",
+    "batch",
+    "evaluate_every",
+    "heads",
+    "learning_rate",
+    "precision",
+    "seed",
+    "steps",
+    "window_frames",
+}
+
+
+def trained(name: str) -> Any:
+    return load_training(TRAINING / f"{name}.yaml")
+
+
+# --- SFMS -----------------------------------------------------------------------------------------------------------
+
+SFMS = {
+    "III-B: 52 expressions and 6 of pose": lambda one: one.listener.motion_space == "faceverse58",
+    "IV-B2, Algorithm 1, (4) to (7): keyframes by Gumbel top-k scores": lambda one: (
+        one.listener.placement == "learned_paper"
+    ),
+    "IV-B2: the temperature is annealed": lambda one: one.tokenizer.temperature[0] > one.tokenizer.temperature[1],
+    "IV-B3: k is fixed": lambda one: all(
+        group.keyframes and group.keyframe_cost is None for group in one.listener.groups.values()
+    ),
+    "IV-B2: one mask C(t) of the whole face": lambda one: len(one.listener.groups) == 1,
+    "IV-B4: finite scalar quantization of 256 codes": lambda one: (
+        one.listener.quantizer == "fsq" and [group.codes for group in one.listener.groups.values()] == [256]
+    ),
+    "(9), (10): the inpainter alone, no straight lines": lambda one: (
+        one.listener.inpainter == "paper" and one.listener.ramp_frames is None
+    ),
+    "(11): told of the speaker's face and voice and the own past": lambda one: (
+        not (one.listener.events or one.listener.sway or one.listener.phase)
+    ),
+    "(13): motion, codes, masks": lambda one: one.tokenizer.mask_loss > 0 and one.tokenizer.velocity_loss == 0,
+    "(14): classes weigh differently, and that is all": lambda one: (
+        one.predictor.transition_weight != 1 and not one.predictor.undo_weight and not one.predictor.calibration_rounds
+    ),
+    "IV-C: sequences that begin neutral": lambda one: one.predictor.neutral_prefix > 0,
+    "IV-D3: soft-DTW beside the cross-entropy": lambda one: one.predictor.dtw_weight > 0,
+    "IV-D3: the encoded ground truth, as it is": lambda one: (
+        not (one.predictor.history_noise or one.predictor.missed_keyframes or one.predictor.event_windows)
+        and not (one.predictor.drop_audio or one.predictor.drop_face or one.predictor.gain_db)
+        and not one.predictor.group_weights
+    ),
+    "V-C: 40 past frames, 8 future ones": lambda one: (one.listener.past_frames, one.listener.future_frames) == (40, 8),
+    "V-C: 8 frames in parallel": lambda one: not one.listener.sequential,
+    "V-C: the window rolls on by what was predicted": lambda one: one.listener.hop_frames == 8,
+    "V-B: windows of 48 frames": lambda one: one.listener.window_frames == 48,
+    "nothing is done to the motion afterwards": lambda one: (
+        one.listener.sampling.smoothing == 0 and one.listener.sampling.seam_frames == 1
+        and not one.listener.sampling.reach
+    ),
+    "no guidance": lambda one: all(group.guidance == 1 for group in one.listener.groups.values()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("said", SFMS)
+def test_the_configuration_does_what_the_sfms_paper_says(said):
+    assert SFMS[said](trained("sfms-as-written"))
+
+
+# --- ARIG -----------------------------------------------------------------------------------------------------------
+
+ARIG = {
+    "(1): told of sounds and motions": lambda one: not one.listener.events and not one.listener.phase,
+    "3.2: both modalities": lambda one: one.listener.visual,
+    "3.2: bidirectional, then integrated learning": lambda one: (
+        one.listener.interaction == "bidirectional" and one.listener.bidirectional_layers == 2
+    ),
+    "3.3: states guide, the cross-entropy weighs as much as (3)": lambda one: (
+        one.listener.state_guidance and one.training.state_weight == 1
+    ),
+    "3.3: s_(T-1) as it is": lambda one: one.training.state_noise == 0,
+    "3.4: M_T ~ p(M_T | z), in a continuous space": lambda one: (
+        one.listener.draws == "motion" and not one.listener.discrete
+    ),
+    "(3) alone teaches motion": lambda one: one.training.coarse_weight == 0 and one.training.group_weights is None,
+    "(1): the past as it was": lambda one: not (one.training.history_noise or one.training.speaking_noise),
+    "4.1: sounds and faces as they were": lambda one: (
+        not (one.training.drop_audio or one.training.drop_face or one.training.drop_agent)
+        and not (one.training.gain_db or one.training.colour_db or one.training.grain_db)
+    ),
+    "(4): ancestral sampling, nothing scaled or clamped": lambda one: (
+        one.listener.diffusion.sampler == "ddpm"
+        and one.listener.diffusion.temperature == (1.0, 1.0)
+        and not one.listener.diffusion.temperatures
+        and not one.listener.diffusion.clamp
+    ),
+    "4.1: c = 6, h = 6, 15 steps": lambda one: (
+        (one.listener.chunk_frames, one.listener.context_layers, one.listener.diffusion.steps) == (6, 6, 15)
+    ),
+    "A.1: 3 frames of sound, 5 of motion, 3 blocks": lambda one: (
+        (one.listener.sound_frames, one.listener.motion_frames, one.listener.diffusion.blocks) == (3, 5, 3)
+    ),
+    "4.1: talking, listening, interaction, in this order": lambda one: (
+        [stage.interaction > 0 for stage in one.training.stages] == [False, False, True]
+        and one.training.stages[0].listening == 0 < one.training.stages[1].listening
+    ),
+}
+
+
+@pytest.mark.parametrize("said", ARIG)
+def test_the_configuration_does_what_the_arig_paper_says(said):
+    assert ARIG[said](trained("arig-as-written"))
+
+
+def test_both_papers_optimizer_is_theirs():
+    """V-A: AdamW, betas 0.9 and 0.98, cosine annealing."""
+    found = optimizer([torch.nn.Parameter(torch.zeros(1))], 1e-3, 0.01)
+    assert isinstance(found, torch.optim.AdamW) and found.defaults["betas"] == (0.9, 0.98)
+    phase = trained("sfms-as-written").predictor
+    assert schedule(phase.steps, phase) == pytest.approx(0, abs=1e-6)
+    assert schedule(phase.steps // 2, phase) == pytest.approx(0.5, abs=0.03)
+
+
+# --- what the shipped listeners do besides --------------------------------------------------------------------------
+
+PAIRS = {"sfms-small": ("sfms-small", "sfms-as-written"), "arig-small": ("arig", "arig-as-written")}
+
+
+def leaves(tree: dict[str, Any]) -> dict[str, Any]:
+    """By name, without the sections that they are in: no two of those compared share one."""
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict) and key not in ("groups", "temperatures", "group_weights"):
+            found |= leaves(value)
+        else:
+            found[key] = value
+    return found
+
+
+def settings_of(name: str) -> dict[str, Any]:
+    """The listener and its training; groups by how many they are, since what they cost is said of `placement`."""
+    raw = trained(name).model_dump(mode="json")
+    return {f"{part}.{key}": value for part, section in raw.items() if isinstance(section, dict)
+            for key, value in leaves(section).items()}  # fmt: skip
+
+
+def departures(listener: str) -> set[str]:
+    """Keys that the shipped listener, or how it is trained, has otherwise than its paper."""
+    ours, paper = (settings_of(name) for name in PAIRS[listener])
+    differing = {key.split(".", 1)[1] for key in ours.keys() | paper.keys() if ours.get(key) != paper.get(key)}
+    shipped = leaves(checkpoint.load_config(data_dir("configs") / "listeners" / listener).model_dump(mode="json"))
+    written = leaves(trained(PAIRS[listener][1]).listener.model_dump(mode="json"))
+    return (differing | {key for key in written if shipped.get(key) != written[key]}) - SIZES
+
+
+def named(card: Path) -> set[str]:
+    """Keys that a card names where it says how the listener leaves its paper."""
+    said = card.read_text().split("Where it leaves the paper", 1)[1].split("\n## ", 1)[0]
+    return set(re.findall(r"`(?:[a-z]+\.)?([a-z_]+)(?::[^`]*)?`", said))
+
+
+@pytest.mark.parametrize("listener", ["sfms-small"])
+def test_a_card_names_every_departure_from_its_paper(listener):
+    card = data_dir("configs") / "listeners" / listener / "CARD.md"
+    assert departures(listener) - named(card) == set(), f"{card.parent.name}: not named in its card"
+
+
+@pytest.mark.parametrize("listener", PAIRS)
+def test_the_paper_has_the_same_size_steps_and_budget(listener):
+    ours, paper = (trained(name) for name in PAIRS[listener])
+    for part in ("training",) if listener == "arig-small" else ("tokenizer", "predictor"):
+        for key in ("steps", "batch", "learning_rate", "precision", "evaluate_every"):
+            assert getattr(getattr(ours, part), key) == getattr(getattr(paper, part), key), key
+    for key in ("width", "feedforward", "tokenizer_width", "predictor_width", "heads"):
+        assert getattr(ours.listener, key, None) == getattr(paper.listener, key, None), key
+    assert isinstance(paper, config.ArigTraining) == (listener == "arig-small")

@@ -1,0 +1,164 @@
+"""A head's URDF follows the angles that its servos read."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.head.head_scene import scene_of
+from sfms_robot.app.session import shipped_heads
+from sfms_robot.config import load_head
+from sfms_robot.config.check import check_head
+from sfms_robot.errors import ConfigError
+from sfms_robot.face.robot_drawing import render_robot
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+
+HEADS = [head["name"] for head in shipped_heads()]
+
+OWL = """
+name: owl
+description: a jaw and a neck
+urdf: {urdf}
+buses: {{main: {{family: dynamixel2, baud: 1000000}}}}
+limits: {{any: {{speed_deg_s: 100, acceleration_deg_s2: 1000, jerk_deg_s3: 10000}}}}
+joint_defaults: {{bus: main, model: xl330-m288, zero_ticks: 2048, min_deg: -20, max_deg: 20, limits: any}}
+joints: {{jaw: {{id: 1, drive: jawOpen}}, neck: {{id: 2, drive: yaw}}}}
+"""
+URDF = """<robot name="owl"><link name="base"/><link name="beak"/><link name="head">
+  <visual><geometry><mesh filename="package://owl/head.stl"/></geometry></visual></link>
+  <joint name="BeakJoint" type="prismatic"><parent link="head"/><child link="beak"/><axis xyz="0 0 1"/></joint>
+  <joint name="neck" type="revolute"><parent link="base"/><child link="head"/><axis xyz="0 0 1"/></joint>
+  <joint name="stiff" type="fixed"><parent link="base"/><child link="foot"/></joint><link name="foot"/></robot>"""
+TRIANGLE = (
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid"
+)
+
+
+def owl(tmp_path, urdf="{file: owl.urdf, packages: {owl: parts}, joints: {jaw: {joint: BeakJoint, scale: -0.1}}}"):
+    (tmp_path / "head.yaml").write_text(OWL.format(urdf=urdf))
+    (tmp_path / "owl.urdf").write_text(URDF)
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "head.stl").write_text(TRIANGLE)
+    return load_head(str(tmp_path))
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_every_joint_of_a_shipped_head_moves_something_that_is_drawn(name):
+    head = load_head(name)
+    scene = scene_of(head)
+    assert scene is not None and scene.undriven == () and not scene.meshes
+    assert (scene.urdf.parent / "SOURCE.md").is_file()
+    before = pictures(scene, scene.rest())
+    for column, joint in enumerate(head.joints.values()):
+        angles = np.array([each.rest_rad for each in head.joints.values()])
+        angles[column] += 0.1 * (joint.max_rad - joint.rest_rad or joint.min_rad - joint.rest_rad)
+        after = pictures(scene, scene.values(angles))
+        scene.rest()
+        assert max(np.abs(a - b).max() for a, b in zip(after, before, strict=True)) > 1e-4, list(head.joints)[column]
+
+
+def pictures(scene, values):
+    places = scene.robot.link_places(dict(zip(scene.joints, values, strict=True)))
+    return [places[visual.link] @ visual.place for visual in scene.robot.visuals]
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_the_drawn_head_turns_as_the_pose_says(name):
+    head = load_head(name)
+    retargeter, scene = HeadRetargeter(head), scene_of(head)
+    for channel, axis, sign in (("yaw", 1, 1), ("pitch", 2, -1)):
+        if channel in retargeter.blind_channels:
+            continue
+        motion = np.zeros(58, np.float32)
+        motion[("roll", "pitch", "yaw").index(channel)] = 0.2
+        places = [
+            scene.robot.link_places(dict(zip(scene.joints, scene.values(angles), strict=True)))["head"]
+            for angles in (retargeter.angles(np.zeros(58, np.float32)), retargeter.angles(motion))
+        ]
+        nose = places[0][:3, :3].T @ [1.0, 0.0, 0.0]  # what points ahead at home, in the head's own axes
+        assert sign * (places[1][:3, :3] @ nose)[axis] == pytest.approx(np.sin(0.2), abs=1e-6)
+
+
+def test_the_rods_of_the_platform_end_on_the_head():
+    head = load_head("reachy_mini")
+    scene, retargeter = scene_of(head), HeadRetargeter(head)
+    motion = np.zeros(58, np.float32)
+    motion[:6] = [0.1, -0.15, 0.8, 0.01, -0.005, 0.008]
+    values = scene.values(retargeter.angles(motion))
+    places = scene.robot.link_places(dict(zip(scene.joints, values, strict=True)))
+    for number, leg in enumerate(head.kinematics.legs, start=1):
+        tip = places[f"rod_{number}"] @ [head.kinematics.rod_m, 0, 0, 1]
+        np.testing.assert_allclose(tip, places["head"] @ [*leg.rod_end_m, 1], atol=2e-5)
+
+
+def test_an_angle_that_was_never_read_stays_at_rest():
+    scene = scene_of(load_head("op3_head"))
+    assert scene.values(np.array([np.nan, 0.2])).tolist() == [0.0, 0.2]
+    assert scene.values(np.array([0.1, np.nan])).tolist() == [0.1, 0.2]
+    with pytest.raises(ValueError, match=r"angles are \(2,\), not \(3,\)"):
+        scene.values(np.zeros(3))
+
+
+def test_a_urdf_of_ones_own_follows_by_name_and_by_table(tmp_path):
+    scene = scene_of(owl(tmp_path))
+    values = dict(zip(scene.joints, scene.values(np.array([0.2, 0.3])), strict=True))
+    assert values == {"BeakJoint": pytest.approx(-0.02), "neck": 0.3}
+    assert scene.meshes == {"package://owl/head.stl": tmp_path / "parts" / "head.stl"}
+
+
+def test_a_head_may_look_like_a_shipped_one_and_needs_no_picture(tmp_path):
+    assert scene_of(owl(tmp_path)) is not None
+    (tmp_path / "head.yaml").write_text(OWL.format(urdf="reachy_mini").replace("neck:", "body_rotation:"))
+    scene = scene_of(load_head(str(tmp_path)))
+    assert scene.joints == ("body_rotation",) and scene.undriven == ("jaw",)
+    (tmp_path / "head.yaml").write_text(OWL.format(urdf="null"))
+    assert scene_of(load_head(str(tmp_path))) is None
+
+
+@pytest.mark.parametrize(
+    "urdf, told",
+    [
+        ("owl2.urdf", "urdf.file = 'owl2.urdf' is neither a file nor a shipped head (face24_maestro, "),
+        ("{file: owl.urdf}", "no mesh 'package://owl/head.stl' at .*urdf.packages says where packages lie"),
+        (
+            "{file: owl.urdf, packages: {owl: parts}, joints: {jaw: Beak}}",
+            "urdf.joints.jaw.joint = 'Beak' is not a joint",
+        ),
+        ("{file: owl.urdf, packages: {owl: parts}, joints: {jaw: stiff}}", "'stiff' does not move by itself"),
+        ("{file: owl.urdf, joints: {tail: neck}}", "urdf.joints: 'tail' is not a joint of this head (jaw, neck)"),
+        ("{file: owl.urdf, joints: {jaw: neck, neck: neck}}", "'neck' already follows jaw"),
+        ("{file: owl.urdf, joints: {jaw: {joint: neck, scale: .nan}}}", "scale"),
+    ],
+)
+def test_what_is_wrong_with_it_is_one_line(tmp_path, urdf, told):
+    with pytest.raises(ConfigError) as caught:
+        scene_of(owl(tmp_path, urdf))
+    assert all(part in str(caught.value) for part in told.split(".*")) and "\n" not in str(caught.value)
+
+
+def test_head_check_tells_joints_that_the_head_has_not(tmp_path):
+    owl(tmp_path)
+    (tmp_path / "head.yaml").write_text(OWL.format(urdf="{file: a.urdf, joints: {tail: neck}}"))
+    assert check_head(str(tmp_path)) == [
+        f"{tmp_path}/head.yaml: urdf.joints: 'tail' is not a joint of this head (jaw, neck)"
+    ]
+
+
+def test_a_robot_is_drawn_without_a_display(tmp_path):
+    pytest.importorskip("vtkmodules")
+    scene = scene_of(owl(tmp_path))
+    render_robot(tmp_path / "a.png", scene, scene.rest(), (64, 48))
+    data = (tmp_path / "a.png").read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n" and int.from_bytes(data[16:20], "big") == 64
+
+
+def test_a_mesh_that_cannot_be_read_is_told(tmp_path):
+    pytest.importorskip("vtkmodules")
+    scene = scene_of(owl(tmp_path))
+    scene.meshes["package://owl/head.stl"].rename(tmp_path / "parts" / "head.step")
+    scene.meshes["package://owl/head.stl"] = tmp_path / "parts" / "head.step"
+    with pytest.raises(ConfigError, match="a picture needs one of .stl"):
+        render_robot(tmp_path / "a.png", scene, scene.rest(), (64, 48))
+
+
+def test_the_two_inmoov_heads_are_one_robot():
+    texts = [scene_of(load_head(name)).urdf.read_text() for name in ("inmoov2_maestro", "inmoov2_ssc32")]
+    assert texts[0].replace("inmoov2_maestro", "") == texts[1].replace("inmoov2_ssc32", "")

@@ -1,0 +1,116 @@
+"""Idle motion: a function of seed and time alone, of the sizes asked for, from rest, and a file that is checked."""
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+from tiny_sfms import speech, told_listener
+
+from sfms_robot.config import Calmness
+from sfms_robot.errors import ModelError
+from sfms_robot.frames import BLENDSHAPES, EVENT_KINDS, MOTION_DIM, SHAPES
+from sfms_robot.listeners.eventful import EventfulListener
+from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, EASE_S, IdleMotion
+
+BROW = BLENDSHAPES.index("browInnerUp")
+
+
+def made(size=0.02, spread=0.0):
+    loadings = np.zeros((2, len(BLENDSHAPES)), np.float32)
+    loadings[0, BROW], loadings[1, BROW + 1] = size, size
+    return IdleMotion(loadings, np.full((BANDS, 2), BANDS**-0.5, np.float32), spread)
+
+
+def faces(frames, level=0.5):
+    return np.full((frames, MOTION_DIM), level, np.float32)
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 100])
+def test_piece_by_piece_it_is_the_whole(chunk):
+    stream, times_s = made().start(3), (np.arange(400) + 1) * 0.04
+    whole = stream.added(faces(400), times_s)
+    parts = [stream.added(faces(len(some)), some) for some in np.split(times_s, range(chunk, 400, chunk))]
+    np.testing.assert_allclose(np.concatenate(parts), whole, atol=1e-6)
+
+
+def test_it_sets_in_from_rest_and_leaves_the_head_alone():
+    out = made().start(1).added(faces(3), np.array([0.0, EASE_S / 100, 60.0])) - 0.5
+    assert not out[0].any() and np.abs(out[1]).max() < 1e-4 < np.abs(out[2]).max()
+    assert not out[:, : SHAPES.start].any()
+
+
+def test_its_size_is_what_was_asked_also_after_an_hour():
+    for since_s in (10.0, 3600.0):
+        moved = [made().start(seed).added(faces(40), since_s + np.arange(40) * 2.3) - 0.5 for seed in range(150)]
+        assert float(np.std([one[:, SHAPES][:, BROW] for one in moved])) == pytest.approx(0.02, rel=0.05)
+
+
+def test_faces_stay_faces():
+    for level in (0.0, 1.0):
+        out = made(0.4).start(0).added(faces(500, level), np.arange(500) * 0.04)
+        assert out[:, SHAPES].min() >= 0 and out[:, SHAPES].max() <= 1 and out[:, SHAPES].std() > 0.01
+
+
+def test_it_is_no_faster_than_its_bands():
+    moved = made().start(2).added(faces(5000), 10 + np.arange(5000) * 0.04)[:, SHAPES][:, BROW].astype(np.float64)
+    power, hz = np.abs(np.fft.rfft(moved - moved.mean())) ** 2, np.fft.rfftfreq(5000, 0.04)
+    assert power[hz > BANDS_HZ[-1] + 0.05].sum() < 0.01 * power.sum()
+
+
+def test_streams_go_their_own_ways_and_people_differ_by_the_spread():
+    times_s = 10 + np.arange(2000) * 0.2
+    one, other = (made().start(seed).added(faces(2000), times_s)[:, SHAPES][:, BROW] for seed in (1, 2))
+    assert abs(np.corrcoef(one, other)[0, 1]) < 0.3
+    stds = [made(spread=0.4).start(s).added(faces(300), 10 + np.arange(300) * 1.3)[:, SHAPES].std() for s in range(60)]
+    assert 0.25 < np.std(np.log(stds)) < 0.55
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    made(spread=0.2).save(tmp_path / "a.safetensors")
+    found = IdleMotion.load(tmp_path / "a.safetensors")
+    np.testing.assert_array_equal(found.loadings, made().loadings)
+    assert found.spread == pytest.approx(0.2)
+
+
+BROKEN = {
+    "holds": {"spread": None},
+    "not finite": {"loadings": np.full((2, 52), np.nan, np.float32)},
+    "has \\(K, 52\\)": {"loadings": np.zeros((2, 51), np.float32)},
+    "amplitude": {"amplitude": np.zeros((BANDS, 3), np.float32)},
+    "moves a face by": {"loadings": np.ones((2, 52), np.float32)},
+    "a spread of": {"spread": np.float32([7.0])},
+}
+
+
+@pytest.mark.parametrize("problem", BROKEN)
+def test_a_broken_file_is_one_line(tmp_path, problem):
+    file, good = tmp_path / "a.safetensors", made()
+    tensors = {"loadings": good.loadings, "amplitude": good.amplitude, "spread": np.float32([0.0])} | BROKEN[problem]
+    save_file({name: np.ascontiguousarray(value) for name, value in tensors.items() if value is not None}, file)
+    with pytest.raises(ModelError, match=problem) as raised:
+        IdleMotion.load(file)
+    assert str(file) in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no weights"])
+def test_a_file_that_is_none_is_one_line(tmp_path, content):
+    (tmp_path / "a.safetensors").write_bytes(content)
+    with pytest.raises(ModelError, match="not a readable safetensors file"):
+        IdleMotion.load(tmp_path / "a.safetensors")
+
+
+def test_a_listener_adds_it_to_every_plan_whatever_the_hop_and_nothing_else_changes():
+    when, nothing = EventModel.load(), Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))
+
+    def shown(hop, idle):
+        listener = EventfulListener(told_listener(hop=hop), when, nothing, idle)
+        memory, plans = listener.start(5), []
+        for frame in speech(120):
+            plan, memory = listener.step(frame, memory)
+            plans += [] if plan is None else [plan]
+        return plans
+
+    for hop in (2, 4):
+        for still, moving in zip(shown(hop, None), shown(hop, made(0.01)), strict=True):
+            expected = made(0.01).start(5).added(still.frames, still.times_s)
+            np.testing.assert_allclose(moving.frames, expected, atol=1e-6)

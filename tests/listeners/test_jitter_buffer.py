@@ -1,0 +1,129 @@
+"""Plans that come unevenly are played evenly, in order, each once."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.frames import FRAME_S, ListenerEvent, Plan
+from sfms_robot.listeners.jitter_buffer import LONGEST_S, SHRINKS, JitterBuffer
+
+
+def plan(number, horizon, events=()):
+    made_s = (number + 1) * FRAME_S
+    times_s = made_s + FRAME_S * (1 + np.arange(horizon))
+    return Plan(made_s, times_s, np.zeros((horizon, 58), np.float32), None, events)
+
+
+def played(buffer, arrivals, until_s, tick_s=0.01):
+    """(now, plan) of all that is given; `arrivals` are (time, number, plan)."""
+    arrivals, given = sorted(arrivals, key=lambda each: each[0]), []
+    for now_s in np.arange(0, until_s, tick_s):
+        while arrivals and arrivals[0][0] <= now_s:
+            came_s, number, one = arrivals.pop(0)
+            buffer.put(number, one, came_s)
+        given += [(now_s, each) for each in buffer.take(now_s)]
+    return given
+
+
+def jittered(horizon, hop, delay_s, jitter_s, frames=500, loss=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    return [
+        ((number + 1) * FRAME_S + delay_s + rng.uniform(-jitter_s, jitter_s), number, plan(number, horizon))
+        for number in range(0, frames, hop)
+        if rng.random() >= loss
+    ]
+
+
+def longest_gap_s(given):
+    """Longest time in which all that was planned has run out."""
+    gap_s, known_s = 0.0, None
+    for now_s, one in given:
+        if known_s is not None:
+            gap_s = max(gap_s, now_s - known_s)
+        known_s = max(known_s or 0.0, one.times_s[-1])
+    return gap_s
+
+
+def test_a_long_plan_that_comes_in_time_is_left_as_it_is():
+    buffer = JitterBuffer(8, 3)
+    one = plan(0, 8)
+    buffer.put(0, one, one.made_at_s + 0.05)
+    assert buffer.take(0.1) == [one]
+    assert buffer.shift_s == 0.0
+
+
+@pytest.mark.parametrize(("horizon", "hop"), [(8, 2), (8, 3), (8, 4), (1, 1)])
+def test_no_gap_for_a_network_that_is_late_and_uneven_once_it_is_measured(horizon, hop):
+    arrivals = jittered(horizon, hop, 0.10, 0.04)
+    given = played(JitterBuffer(horizon, hop), arrivals, 21.0)
+    settled = [each for each in given if each[0] > 6.0]
+    assert len(given) == len(arrivals)
+    # a single frame is played one frame late by the timeline
+    assert longest_gap_s(settled) <= (FRAME_S if horizon == 1 else 0.0) + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_plan_that_is_lost_leaves_a_gap_of_120_ms_at_most(seed):
+    arrivals = jittered(8, 3, 0.10, 0.04, loss=0.04, seed=seed)
+    assert longest_gap_s(played(JitterBuffer(8, 3), arrivals, 20.0)) <= 0.120
+
+
+def test_plans_that_overtook_one_another_are_given_in_order():
+    buffer = JitterBuffer(8, 1)
+    for number, came_s in [(0, 0.1), (2, 0.14), (1, 0.15), (3, 0.2)]:
+        buffer.put(number, plan(number, 8), came_s)
+    given = [each.made_at_s for _, each in played(buffer, [], 0.5)]
+    assert given == sorted(given) and len(given) == 4
+
+
+def test_a_missing_plan_is_waited_for_until_the_next_one_is_due():
+    buffer = JitterBuffer(8, 3)
+    buffer.put(0, plan(0, 8), 0.05)
+    assert len(buffer.take(0.05)) == 1
+    buffer.put(6, plan(6, 8), 0.29)  # made at 0.28 s, its first frame is of 0.32 s
+    assert buffer.take(0.30) == []
+    assert len(buffer.take(0.31)) == 1
+    assert buffer.lost == 1
+    buffer.put(3, plan(3, 8), 0.33)
+    assert buffer.take(0.34) == [] and buffer.late == 1
+
+
+def test_doubles_are_given_once():
+    buffer = JitterBuffer(8, 3)
+    for _ in range(3):
+        buffer.put(0, plan(0, 8), 0.1)
+    assert len(buffer.take(0.1)) == 1
+    buffer.put(0, plan(0, 8), 0.12)
+    assert buffer.take(0.12) == [] and buffer.doubled == 3
+
+
+def test_the_shift_shrinks_slowly_when_the_way_gets_better():
+    buffer = JitterBuffer(1, 1)
+    played(buffer, jittered(1, 1, 0.3, 0.0, frames=100), 5.0)
+    before_s = buffer.shift_s
+    better = [(5.0 + came_s, 125 + number, plan(125 + number, 1)) for came_s, number, _ in jittered(1, 1, 0.05, 0.0)]
+    for came_s, number, one in better[:200]:
+        buffer.put(number, one, came_s)
+        buffer.take(came_s)
+    assert before_s > 0.3 and before_s - 8.0 * SHRINKS - 0.01 <= buffer.shift_s < before_s
+
+
+def test_an_outage_does_not_make_all_plans_late():
+    buffer = JitterBuffer(1, 1)
+    played(buffer, jittered(1, 1, 0.05, 0.0, frames=100), 5.0)
+    before_s = buffer.shift_s
+    buffer.restart(10.0)
+    for number in range(100, 240):  # all at once
+        buffer.put(number, plan(number, 1), 10.0)
+    buffer.take(10.0)
+    assert buffer.shift_s <= before_s < LONGEST_S
+
+
+def test_events_are_shifted_with_the_motion_that_shows_them():
+    buffer = JitterBuffer(1, 1)
+    played(buffer, jittered(1, 1, 0.3, 0.0, frames=100), 5.0)
+    nod = ListenerEvent("nod", 5.2, 0.5, 0.1)
+    one = plan(124, 1, (nod,))
+    buffer.put(124, one, 5.3)
+    (given,) = buffer.take(6.0)
+    assert given.events[0].start_s - nod.start_s == pytest.approx(given.times_s[0] - one.times_s[0])
+    assert given.times_s[0] > one.times_s[0]

@@ -1,0 +1,166 @@
+"""The wire between a robot and a server: what is said comes back, and nothing else is taken for a message."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.errors import PacketError
+from sfms_robot.frames import EVENT_KINDS, FaceFrame, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.listeners.remote_messages import (
+    Interface,
+    Join,
+    Notice,
+    Refusal,
+    SentFrame,
+    SentPlan,
+    Welcome,
+    frame_message,
+    parse_frame,
+    parse_plan,
+    parse_words,
+    plan_message,
+    words_message,
+)
+
+TIMES = st.floats(0, 1e6, width=64)
+
+
+SEEDS = st.integers(0, 2**32 - 1).map(np.random.default_rng)  # arrays of this size take hypothesis long to draw
+
+
+def floats(*shape):
+    return SEEDS.map(lambda rng: rng.normal(0, 3, shape).astype(np.float32))
+
+
+SOUND = SEEDS.map(lambda rng: (rng.integers(-32768, 32768, 640) / 32768).astype(np.float32))
+FACES = st.builds(FaceFrame, TIMES, floats(6), floats(52), st.none() | floats(3))
+FRAMES = st.builds(
+    SpeakerFrame, TIMES, SOUND | st.just(np.zeros(0, np.float32)), st.none() | FACES, st.none() | SOUND,
+    st.none() | st.floats(0, 1), st.none() | floats(3),
+)  # fmt: skip
+EVENTS = st.builds(
+    ListenerEvent, st.sampled_from(EVENT_KINDS), TIMES, st.floats(0, 5), st.floats(0, 1), st.integers(1, 5),
+    st.none() | st.tuples(st.floats(-1, 1), st.floats(-1, 1)), st.none() | st.floats(0, 1), st.none() | st.floats(0, 1),
+    st.dictionaries(st.text(max_size=8), st.floats(-5, 5), max_size=3),
+)  # fmt: skip
+
+
+@st.composite
+def plans(draw):
+    length = draw(st.integers(1, 9))
+    return Plan(
+        draw(TIMES), np.array(draw(st.lists(TIMES, min_size=length, max_size=length))), draw(floats(length, 58)),
+        draw(st.none() | floats(length, 3)), tuple(draw(st.lists(EVENTS, max_size=3))),
+        draw(st.dictionaries(st.sampled_from(EVENT_KINDS), st.floats(0, 9))),
+    )  # fmt: skip
+
+
+def same(a, b):
+    """Whether two values are the same, arrays included, NaN equal to itself."""
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and np.array_equal(a, b)
+    if hasattr(a, "__dataclass_fields__"):
+        return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__)
+    return a == b or (a != a and b != b)
+
+
+@given(st.integers(0, 2**31 - 1), FRAMES, TIMES, TIMES | st.just(math.nan))
+def test_a_frame_comes_as_it_was_sent(number, frame, sent_s, server_s):
+    sent = SentFrame(number, frame, sent_s, server_s)
+    assert same(parse_frame(frame_message(sent)), sent)
+
+
+@given(SEEDS.map(lambda rng: rng.uniform(-1, 1, 640).astype(np.float32)))
+def test_sound_loses_half_a_step_of_a_sound_card_at_most(audio):
+    heard = parse_frame(frame_message(SentFrame(0, SpeakerFrame(0.04, audio), 0.0))).frame.audio
+    assert np.abs(heard - audio).max() <= 1 / 32768
+
+
+@given(st.integers(0, 2**31 - 1), plans(), TIMES, TIMES, TIMES, st.floats(0, 1e4, width=32))
+def test_a_plan_comes_as_it_was_made(number, plan, echo_s, came_s, sent_s, step_ms):
+    sent = SentPlan(number, plan, echo_s, came_s, sent_s, step_ms)
+    assert same(parse_plan(plan_message(sent)), sent)
+
+
+@given(plans(), st.tuples(EVENTS, EVENTS))
+def test_a_plan_tells_the_events_of_plans_before_it_first(plan, earlier):
+    told = parse_plan(plan_message(SentPlan(0, plan, 0.0, 0.0, 0.0, 1.0), earlier)).plan
+    assert told.events == (*earlier, *plan.events)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        Join("a", 3), Join("a", 3, {"nod": 2.0}), Welcome("s", "big-1", "sfms-small", 8, 3), Refusal("full", False),
+        Notice("skipped", 3), Notice("calm", calmness={"nod": 1.0}),
+    ],
+)  # fmt: skip
+def test_words_come_as_they_were_said(said):
+    assert parse_words(words_message(said)) == said
+
+
+def whole_messages():
+    frame = SpeakerFrame(0.04, np.zeros(640, np.float32), FaceFrame.of(0.0, np.zeros(58)))
+    plan = Plan(0.04, np.array([0.08]), np.zeros((1, 58), np.float32))
+    return [
+        (parse_frame, frame_message(SentFrame(0, frame, 1.0))),
+        (parse_plan, plan_message(SentPlan(0, plan, 1.0, 1.0, 1.0, 1.0))),
+    ]
+
+
+@pytest.mark.parametrize(("parse", "message"), whole_messages(), ids=["frame", "plan"])
+def test_a_message_that_is_cut_short_or_too_long_is_none(parse, message):
+    for end in range(len(message)):
+        with pytest.raises(PacketError):
+            parse(message[:end])
+    with pytest.raises(PacketError, match="1 bytes too many"):
+        parse(message + b"x")
+
+
+@given(st.binary(max_size=300))
+def test_random_bytes_are_refused_in_one_line(data):
+    for parse in (parse_frame, parse_plan, parse_words):
+        with pytest.raises(PacketError):
+            parse(data)
+    for parse, message in whole_messages():
+        at = len(message) - len(data)
+        try:
+            parse(message[:at] + data)
+        except PacketError as error:
+            assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(("parse", "message"), whole_messages(), ids=["frame", "plan"])
+def test_a_message_of_another_protocol_is_named(parse, message):
+    with pytest.raises(PacketError, match="protocol 2, not 1"):
+        parse(message[:1] + b"\x02" + message[2:])
+
+
+def test_interfaces_fit_whatever_the_version_of_the_program_and_nothing_else():
+    ours = Interface()
+    assert ours.fits(replace(ours, version="9.9"))
+    assert not ours.fits(replace(ours, motion="deca56"))
+    assert not ours.fits(replace(ours, protocol=2))
+    assert not ours.fits(replace(ours, frame_hz=30))
+
+
+def test_words_of_a_later_protocol_are_still_read_as_far_as_they_are_named():
+    told = json.loads(words_message(Join("a", 0)))
+    told["interface"] |= {"protocol": 7, "colour": "red"}
+    said = parse_words(json.dumps(told).encode())
+    assert said.interface.protocol == 7
+
+
+@pytest.mark.parametrize(
+    "told",
+    ["{", "{}", '{"type": "join"}', '{"type": "join", "client": 3, "seed": 0}', '{"type": "robot"}',
+     '{"type": "notice", "kind": "calm", "calmness": 3}', "{" + " " * 20_000 + "}"],
+)  # fmt: skip
+def test_words_that_are_none_are_refused(told):
+    with pytest.raises(PacketError):
+        parse_words(told.encode())

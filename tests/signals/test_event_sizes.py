@@ -1,0 +1,26 @@
+"""Looks aside last and go as far as those of people who listened, and either way alike."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.signals.event_sizes import ASIDE_DEG, ASIDE_MEAN_S, SWING_S, aside, aside_rad, aside_s, swings
+
+
+def test_looks_aside_are_peoples():
+    shares = np.random.default_rng(0).random(4000)
+    assert np.mean([aside_s(share) for share in shares]) == pytest.approx(ASIDE_MEAN_S, rel=0.05)
+    assert np.degrees(np.median([aside_rad(share) for share in shares])) == pytest.approx(ASIDE_DEG[1][2], rel=0.05)
+
+
+def test_as_often_to_the_left_as_to_the_right_and_as_far_as_asked():
+    rng = np.random.default_rng(1)
+    found = np.array([aside(0.2, *rng.random(2)) for _ in range(4000)])
+    np.testing.assert_allclose(np.hypot(*found.T), 0.2)
+    assert abs((found[:, 0] > 0).mean() - 0.5) < 0.03
+    assert 0.7 < (found[:, 1] < 0).mean() < 0.8  # up
+
+
+@pytest.mark.parametrize("length_s", [0.0, 0.3, 1.0, 5.0])
+def test_a_swing_is_never_faster_nor_slower_than_a_neck_goes(length_s):
+    count, lasts_s = swings(length_s, 2.4)
+    assert 1 <= count <= 4 and SWING_S[0] <= lasts_s / count <= SWING_S[1]

@@ -1,0 +1,226 @@
+"""The page in a real browser, on a run of the emulated head."""
+
+import numpy as np
+import pytest
+from chromium import Page, ServedRun, missing
+
+from sfms_robot.face.human import load_human
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}")]
+
+HUMAN = "human-cell"
+WINDOW, PHONE = (1000, 700), (390, 844)
+JOINTS = "page.hello.joints.map(({name}) => name)"
+
+
+@pytest.fixture(scope="module")
+def run():
+    with ServedRun("run", "--port", "sim", "--head", "op3_head", "--duration", "3000", "--seed", "1") as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def browser(run, tmp_path_factory):
+    with Page(tmp_path_factory.mktemp("chromium"), size=WINDOW) as page:
+        yield page
+
+
+@pytest.fixture
+def page(browser, run):
+    """The run's page; the same for all who leave it as it was."""
+    if not browser.driver.current_url.startswith(run.url):
+        browser.open(run.url)
+    return browser
+
+
+@pytest.fixture
+def own_page(browser, run):
+    """A page that is left when the test ends."""
+    browser.leave()
+    yield browser
+    browser.look(WINDOW)
+    browser.leave()
+
+
+def shows(**channels):
+    """In JavaScript: that the newest picture shows about this."""
+    each = [
+        f"Math.abs(page.stage.seen[page.hello.channels.indexOf('{name}')] - {value}) < {0.15 * (abs(value) or 1)}"
+        for name, value in channels.items()
+    ]
+    return " && ".join(["page.stage.seen", *each])
+
+
+def hold(page, **channels):
+    """Show this, and go on showing it until it is drawn; the picture then."""
+    page.driver.execute_script(
+        "const channels = arguments[0];"
+        "globalThis.holding = setInterval(() => page.connection.send('show', {channels, seconds: 5}), 300)",
+        channels,
+    )
+    page.until(shows(**channels))
+    shown = page.picture(HUMAN)
+    page.ask("clearInterval(globalThis.holding) || 1")
+    return shown
+
+
+def slide(page, channel, value):
+    """As a hand does."""
+    page.driver.execute_script(
+        "const input = document.querySelector(`[data-channel=${arguments[0]}] input`);"
+        "input.value = arguments[1]; input.dispatchEvent(new Event('input'))",
+        channel,
+        value,
+    )
+
+
+def press(page, words):
+    page.driver.execute_script(
+        "[...document.querySelectorAll('#controls button')]"
+        ".find((each) => each.textContent.startsWith(arguments[0])).click()",
+        words,
+    )
+
+
+def test_loads_without_a_complaint_and_asks_nobody_but_this_machine(page):
+    page.until(
+        "page.timeline.frames.length > 30 && page.stage.robot"
+        " && document.querySelectorAll('#controls > details').length > 4"
+    )
+    assert page.complaints() == []
+    assert page.addresses() <= {"127.0.0.1", "data", "blob", "about"}
+    assert page.ask("document.getElementById('notice').hidden")
+
+
+def test_vertices_are_those_that_python_computes(page):
+    motion = np.random.default_rng(0).uniform(0, 0.8, 58).astype(np.float32)
+    motion[:6] *= 0.4
+    flat = page.ask(
+        "(() => { const posed = page.stage.human.posed; posed.pose(arguments[0]);"
+        " return [...posed.positions.subarray(0, 3 * posed.head.facts.skinned)]; })()".replace(
+            "arguments[0]", str(motion.tolist())
+        )
+    )
+    shown = np.array(flat).reshape(-1, 3)
+    np.testing.assert_allclose(
+        shown, load_human().vertices(motion)[: len(shown)], atol=1e-3
+    )  # shares of the turn come in 256 steps
+
+
+def test_a_blink_is_seen_where_the_eyes_are(page):
+    still = hold(page, eyeBlinkLeft=0.0, eyeBlinkRight=0.0, pitch=0.0, yaw=0.0, roll=0.0)
+    closed = hold(page, eyeBlinkLeft=1.0, eyeBlinkRight=1.0, pitch=0.0, yaw=0.0, roll=0.0)
+    change = np.abs(closed - still).mean(axis=2)
+    high, wide = change.shape
+    eyes = change[int(0.36 * high) : int(0.50 * high), int(0.30 * wide) : int(0.70 * wide)].mean()
+    collar = change[int(0.86 * high) : int(0.92 * high), int(0.30 * wide) : int(0.70 * wide)].mean()
+    assert eyes > 3 and eyes > 8 * collar
+
+
+def test_a_nod_moves_head_and_hair_and_not_the_shoulders(page):
+    still = hold(page, pitch=0.0, yaw=0.0, roll=0.0)
+    down = hold(page, pitch=0.25, yaw=0.0, roll=0.0)
+    change = np.abs(down - still).mean(axis=2)
+    high = len(change)
+    assert change[: high // 2].mean() > 4
+    assert change[: high // 2].mean() > 5 * change[int(0.86 * high) :].mean()
+
+
+@pytest.mark.parametrize("way", ["click", "Escape", "space"])
+def test_halt(page, way):
+    from selenium.webdriver.common.keys import Keys
+
+    body = page.driver.find_element("tag name", "body")
+    if way == "click":
+        page.driver.find_element("id", "halt").click()
+    else:
+        body.send_keys(Keys.ESCAPE if way == "Escape" else " ")
+    page.until("page.newest.s === 'halted' && document.getElementById('state').dataset.state === 'halted'")
+    page.driver.find_element("id", "resume").click()
+    page.until("page.newest.s !== 'halted'")
+
+
+def test_a_slider_moves_its_joint_and_the_other_stays(page):
+    pan, tilt = (page.ask(JOINTS).index(name) for name in ("head_pan", "head_tilt"))
+    for channel, value in (("roll", 0.0), ("pitch", 0.0), ("yaw", -0.3)):
+        slide(page, channel, value)
+    asked = "page.newest.j"
+    page.until(f"Math.abs({asked}[{pan}]) > 0.2 && " + shows(yaw=-0.3, pitch=0.0))
+    before = page.ask(asked)
+    slide(page, "yaw", 0.3)
+    page.until(f"Math.abs({asked}[{pan}] - {before[pan]}) > 0.45")
+    after = page.ask(asked)
+    assert abs(after[tilt] - before[tilt]) < 0.2 * abs(after[pan] - before[pan])
+    press(page, "Let go of the sliders")
+
+
+def test_it_comes_back_by_itself_and_after_a_reload(own_page, run):
+    page = own_page.open(run.url)
+    page.driver.execute_script(
+        "page.connection.addEventListener('closed', () => {"
+        "  page.newest = null;"
+        "  page.connection.addEventListener('frame', () => { globalThis.again = true; }); });"
+        "page.connection.close()"
+    )
+    page.until("globalThis.again && page.newest && document.getElementById('state').dataset.state === page.newest.s")
+    page.open(run.url)
+    assert page.ask("globalThis.again === undefined")
+
+
+def test_replay_goes_where_the_scrubber_is_put(page):
+    page.until("page.timeline.frames.length > 60")
+    press(page, "Replay")
+    page.until("page.replay && !document.getElementById('replay').hidden")
+    at_s = page.ask(
+        "(() => { const s = document.getElementById('scrub'); s.value = (+s.min + +s.max) / 2;"
+        " s.dispatchEvent(new Event('input')); return +s.value; })()"
+    )
+    shown = page.ask("page.timeline.frames.at(-1).t")
+    assert shown <= at_s + 1e-6
+    assert page.ask("page.replay.frames.find(({t}) => t > arguments[0])?.t ?? Infinity", shown) > at_s
+    page.driver.find_element("id", "live").click()
+    page.until(f"page.replay === null && page.timeline.frames.at(-1)?.t > {at_s}")
+
+
+def test_every_control_has_a_name_that_can_be_read_out(page):
+    page.until("document.querySelectorAll('#controls > details').length > 4")
+    nameless = page.ask(
+        "[...document.querySelectorAll('button, input, select, canvas, video')].filter((e) =>"
+        " !(e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label')?.textContent.trim()))"
+        ".map((e) => e.outerHTML)"
+    )
+    assert nameless == []
+
+
+def test_what_is_wrong_with_the_run_is_said(own_page, run):
+    page = own_page.open(run.url)
+    page.driver.execute_script("globalThis.whole = page.hello; sessionStorage.setItem('reloaded for 2', '1')")
+    for change, notice in (
+        ("version: 2", "version 2: reload"),
+        ("urdf: 'static/app.css'", "static/app.css: not XML"),
+        ("urdf: 'robot/none.urdf'", "robot/none.urdf: 404"),
+        ("urdf_joints: ['chin'], head: 'other'", 'no joint "chin"'),
+    ):
+        page.driver.execute_script(
+            f"page.connection.dispatchEvent(new CustomEvent('hello', {{detail: {{...whole, {change}}}}}))"
+        )
+        page.until("document.getElementById('notice').textContent.includes(arguments[0])", notice)
+
+
+def test_phone(own_page, run):
+    own_page.look(PHONE, dark=True)
+    phone = own_page.open(run.url)
+    assert phone.ask("document.documentElement.scrollWidth") <= PHONE[0]
+    top, bottom, width = phone.ask(
+        "(({top, bottom, width}) => [top, bottom, width])(document.getElementById('halt').getBoundingClientRect())"
+    )
+    assert 0 < top < bottom <= PHONE[1] and bottom - top >= 48 and width > 300
+    assert phone.picture(HUMAN).std() > 20
+
+
+def test_without_webgl_it_says_so_and_the_curves_go_on(own_page, run):
+    with own_page.without_webgl():
+        own_page.driver.get(run.url)
+        own_page.until("page.newest && page.timeline.frames.length > 10")
+    assert own_page.ask("document.getElementById('no-webgl').checkVisibility()")
+    assert own_page.picture("timeline").std() > 5

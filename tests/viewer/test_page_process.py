@@ -1,0 +1,325 @@
+"""The page on real sockets of this machine, in its process: told, worked, refused, and holding nothing up."""
+
+import json
+import queue
+import socket
+import struct
+import subprocess
+import sys
+from contextlib import ExitStack, closing, contextmanager
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from sfms_robot.errors import ConfigError, InputError, PortError
+from sfms_robot.viewer.frame_record import Picture, pack_picture, rare_json
+from sfms_robot.viewer.page_process import Address, PageProcess
+
+WAIT_S = 30.0  # for what is bound to come
+RARE = rare_json("listening", (), {}, None)
+HELLO = {"version": 1, "head": "face28", "joints": [], "channels": []}
+
+
+class Asked:
+    """What visitors asked for, as it comes; "speaker" is refused."""
+
+    def __init__(self):
+        self.came = queue.Queue()
+
+    def command(self, visitor, command):
+        if command.name == "speaker":
+            raise InputError("speaker 'x' is not there")
+        self.came.put((command.name, command.values))
+
+    def person(self, visitor, message):
+        self.came.put(("person", message))
+
+    def left(self, visitor):
+        self.came.put(("left", visitor))
+
+    def next(self):
+        """What comes next; that somebody of an earlier test has gone may come at any time."""
+        while (came := self.came.get(timeout=WAIT_S))[0] == "left":
+            pass
+        return came
+
+
+@pytest.fixture(scope="module")
+def process():
+    with closing(PageProcess(Address(port=0))) as page:
+        page.wait()
+        yield page
+
+
+@pytest.fixture
+def page(process):
+    """Behind which a run has begun."""
+    asked = process.asked = Asked()
+    process.answered_by(asked)
+    process.say("begin", **HELLO)
+    return process
+
+
+@contextmanager
+def visit(page, **more):
+    with connect(page.url.split("?")[0].replace("http", "ws", 1) + "ws", open_timeout=WAIT_S, **more) as visitor:
+        yield visitor
+
+
+def heard(visitor, kind=None):
+    """The next message, or the next of a kind."""
+    while True:
+        told = json.loads(visitor.recv(timeout=WAIT_S))
+        if kind is None or told["type"] == kind:
+            return told
+
+
+def says(visitor, command, **values):
+    visitor.send(json.dumps({"type": command, **values}))
+
+
+def picture(time_s):
+    motion = np.zeros(58, np.float32)
+    return pack_picture(Picture(time_s, motion, np.zeros(2), np.full(2, np.nan, np.float32), RARE))
+
+
+def got(url, **headers):
+    with urlopen(Request(url, headers=headers), timeout=WAIT_S) as answer:
+        return answer.read(), answer.headers
+
+
+def test_the_page_and_its_protocol_are_there(page):
+    body, headers = got(page.url)
+    assert b"<!doctype html>" in body and headers["X-Content-Type-Options"] == "nosniff"
+    assert "default-src 'self'" in headers["Content-Security-Policy"]
+    with visit(page) as visitor:
+        hello = heard(visitor)
+        assert hello["type"] == "hello" and hello["head"] == "face28" and hello["controls"] == "nobody"
+        assert (hello["over"], hello["needs_token"], hello["record"]) == (False, False, None)
+        says(visitor, "ping", id=[1, "x"])
+        assert heard(visitor) == {"type": "pong", "id": [1, "x"]}
+
+
+def test_pictures_go_to_all_and_come_back_in_the_last_run(page):
+    with ExitStack() as stack:
+        visitors = [stack.enter_context(visit(page)) for _ in range(10)]
+        assert all(heard(visitor)["type"] == "hello" for visitor in visitors)
+        page.show(lambda: picture(1.0))
+        assert all(heard(visitor, "frame")["t"] == 1.0 for visitor in visitors)
+        page.say("event", event="nod", at_s=1.2)
+        page.say("status", status={"state": "listening"})
+        page.say("end", report={"exit": "done"})
+        for visitor in visitors:
+            assert heard(visitor) == {"type": "event", "event": "nod", "at_s": 1.2}
+            assert heard(visitor) == {"type": "status", "status": {"state": "listening"}}
+            assert heard(visitor) == {"type": "over", "report": {"exit": "done"}}
+    with visit(page) as late:
+        assert heard(late)["over"] is True
+    lines = [json.loads(line) for line in got(page.url + "runs/last")[0].splitlines()]
+    assert [line["type"] for line in lines] == ["hello", "frame", "event", "over"] and lines[0]["replay"] is True
+
+
+def test_another_run_begins_behind_the_same_page(page):
+    with visit(page) as visitor:
+        assert heard(visitor)["type"] == "hello"
+        page.show(lambda: picture(5.0))
+        assert heard(visitor)["t"] == 5.0
+        page.say("begin", **{**HELLO, "head": "op3_head"})
+        assert heard(visitor, "hello")["head"] == "op3_head"
+    assert len(got(page.url + "runs/last")[0].splitlines()) == 1
+
+
+def test_commands_reach_the_run_and_what_it_refuses_is_told_to_who_asked(page):
+    with visit(page) as visitor, visit(page) as other:
+        says(visitor, "show", channels={"jawOpen": 0.5})
+        assert page.asked.next() == ("show", {"channels": {"jawOpen": 0.5}, "seconds": 0.5})
+        assert heard(visitor, "controls")["held"] == "you" and heard(other, "controls")["held"] == "other"
+        says(visitor, "speaker", name="x")
+        assert heard(visitor, "error")["error"] == "speaker 'x' is not there"
+        says(other, "neutral")
+        assert heard(other, "error")["error"] == "somebody else holds the controls"
+        says(other, "halt")
+        assert page.asked.next() == ("halt", {})
+
+
+def test_of_nobody_but_the_holder_voice_and_face_are_taken(page):
+    message = struct.pack("<BBHIdd", 1, 1, 0, 16000, 1.0, 1.0) + bytes(640)
+    with visit(page) as visitor, visit(page) as other:
+        says(visitor, "source", feeds=["voice"])
+        assert page.asked.next() == ("source", {"feeds": ["voice"]})
+        visitor.send(message)
+        assert page.asked.next() == ("person", message)
+        other.send(message)
+        assert "who holds the controls" in heard(other, "error")["error"]
+        holder = page.asked.came
+    assert holder.get(timeout=WAIT_S)[0] == "left"
+
+
+def test_when_no_run_is_on_that_is_said(page):
+    page.answered_by(None)
+    with visit(page) as visitor:
+        says(visitor, "halt")
+        assert heard(visitor, "error")["error"] == "no run is on"
+
+
+@pytest.mark.parametrize("told", ["", "{", "[]", '{"type":"dance"}', '{"type":"show"}', "\x00", "9" * 9000])
+def test_nonsense_is_refused_in_a_line_and_the_visitor_stays(page, told):
+    with visit(page) as visitor:
+        visitor.send(told)
+        assert "\n" not in heard(visitor, "error")["error"]
+        says(visitor, "ping", id=1)
+        assert heard(visitor) == {"type": "pong", "id": 1}
+
+
+def test_who_talks_nothing_but_nonsense_is_sent_away(page):
+    with visit(page) as visitor, pytest.raises(ConnectionClosed):
+        for _ in range(300):
+            visitor.send("nonsense")
+        while True:
+            visitor.recv(timeout=WAIT_S)
+    with visit(page) as another:
+        assert heard(another)["type"] == "hello"
+
+
+def test_a_message_that_is_too_long_ends_the_connection(page):
+    with visit(page) as visitor, pytest.raises(ConnectionClosed):
+        visitor.send(bytes(300_000))
+        while True:
+            visitor.recv(timeout=WAIT_S)
+
+
+def test_while_one_floods_the_others_are_served(page):
+    with visit(page) as flooder, visit(page) as other:
+        assert heard(other)["type"] == "hello"
+        for number in range(400):
+            says(flooder, "ping", id=number)
+        says(other, "ping", id="here")
+        assert heard(other) == {"type": "pong", "id": "here"}
+
+
+def test_a_page_of_an_older_version_is_told_so(page):
+    with visit(page) as visitor:
+        says(visitor, "hello", version=0)
+        assert "load it anew" in heard(visitor, "error")["error"]
+        says(visitor, "hello", version=1)
+        assert heard(visitor)["type"] == "controls"
+
+
+@pytest.mark.parametrize("origin", ["http://robots.example", "http://192.0.2.7", "null", "file://"])
+def test_pages_of_others_may_not_connect(page, origin):
+    with pytest.raises(InvalidStatus, match="403"), visit(page, origin=origin):
+        pass
+
+
+@pytest.mark.parametrize("host", ["robots.example", "robots.example:8780", ""])
+def test_who_calls_this_machine_by_a_strangers_name_is_not_answered(page, host):
+    with pytest.raises(HTTPError, match="403"):
+        got(page.url, Host=host)
+
+
+def test_what_is_not_there_is_not_found(page):
+    for path in ("recording", "robot/robot.urdf", "etc/passwd", "static/../page_server.py"):
+        with pytest.raises(HTTPError, match="404"):
+            got(page.url + path)
+
+
+def test_a_recording_is_downloaded(page, tmp_path):
+    (tmp_path / "run.mcap").write_bytes(b"recorded")
+    with visit(page) as visitor:
+        page.say("recorded", file=str(tmp_path / "run.mcap"), record={"on": False, "seconds": 2})
+        assert heard(visitor, "record") == {"type": "record", "on": False, "seconds": 2}
+    body, headers = got(page.url + "recording")
+    assert body == b"recorded" and 'filename="run.mcap"' in headers["Content-Disposition"]
+    page.say("recorded", file=None, record=None)
+
+
+def test_the_virtual_human_comes_compressed_to_who_takes_that(page):
+    plain, packed = got(page.url + "human/head.bin"), got(page.url + "human/head.bin", **{"Accept-Encoding": "gzip"})
+    assert packed[1]["Content-Encoding"] == "gzip" and len(packed[0]) < 0.7 * len(plain[0])
+    assert json.loads(plain[0][4 : 4 + struct.unpack_from("<I", plain[0])[0]])["version"] == 1
+
+
+def test_a_port_that_is_taken_makes_room_for_the_next(page):
+    taken = int(page.url.rstrip("/").rpartition(":")[2])
+    with closing(PageProcess(Address(port=taken))) as second:
+        second.wait()
+        assert second.taken == taken and f"({taken} is taken)" in str(second) and second.url != page.url
+
+
+def test_beyond_loopback_a_token_is_made_and_asked_for(tmp_path):
+    with closing(PageProcess(Address("0.0.0.0", 0))) as page:
+        page.wait()
+        asked = Asked()
+        page.answered_by(asked)
+        page.say("begin", **HELLO)
+        (tmp_path / "run.mcap").write_bytes(b"recorded")
+        page.say("recorded", file=str(tmp_path / "run.mcap"), record=None)
+        assert page.token and page.url.endswith(f"/?token={page.token}")
+        port = int(page.url.split(":")[2].partition("/")[0])
+        with connect(f"ws://127.0.0.1:{port}/ws") as visitor:
+            assert heard(visitor)["needs_token"] is True
+            says(visitor, "halt")
+            assert "the token is needed" in heard(visitor, "error")["error"]
+            says(visitor, "hello", version=1, token="guess")
+            assert "is not the one" in heard(visitor, "error")["error"]
+            says(visitor, "hello", version=1, token=page.token)
+            assert heard(visitor)["type"] == "controls"
+            says(visitor, "halt")
+            assert asked.next() == ("halt", {})
+        with pytest.raises(HTTPError, match="403"):
+            got(f"http://127.0.0.1:{port}/recording")
+        assert got(f"http://127.0.0.1:{port}/recording?token={page.token}")[0] == b"recorded"
+
+
+@pytest.mark.parametrize("wanted", ["-1", "65536", "http", "", ":80", "host:", "١"])
+def test_what_is_no_port_is_refused_in_one_line(wanted):
+    with pytest.raises(ConfigError, match=r"^--view .*is no TCP port"):
+        Address.parsed(wanted)
+
+
+def test_an_address_that_is_not_this_machines_is_refused_in_one_line():
+    with (
+        closing(PageProcess(Address("192.0.2.1", 8780))) as page,
+        pytest.raises(PortError, match="^--view 192.0.2.1:8780: "),
+    ):
+        page.wait()
+
+
+def test_https_needs_a_certificate_and_its_key(tmp_path):
+    (tmp_path / "a.pem").write_text("nothing")
+    with pytest.raises(ConfigError, match="https needs both"):
+        Address.parsed("auto", tmp_path / "a.pem", None)
+    with pytest.raises(ConfigError, match="^--view-key .*: no such file"):
+        Address.parsed("auto", tmp_path / "a.pem", tmp_path / "b.pem")
+    address = Address.parsed("0", tmp_path / "a.pem", tmp_path / "a.pem")
+    with closing(PageProcess(address)) as page, pytest.raises(ConfigError, match="not a certificate with its key"):
+        page.wait()
+
+
+def test_a_page_whose_process_dies_takes_no_run_with_it(caplog):
+    with closing(PageProcess(Address(port=0))) as page:
+        page.wait()
+        page._process.kill()
+        page._process.wait()
+        for _ in range(100):
+            page.show(lambda: picture(1.0))
+            page.say("status", status={})
+        page._reading.join(WAIT_S)
+        assert page.visitors == 0 and "the page is away" in caplog.text
+
+
+def test_it_ends_with_who_began_it():
+    code = (
+        "import os; from sfms_robot.viewer.page_process import Address, PageProcess\n"
+        "page = PageProcess(Address(port=0)); page.wait(); print(page.url, flush=True); os._exit(0)"
+    )
+    began = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=WAIT_S * 2)
+    port = int(began.stdout.rstrip("/\n").rpartition(":")[2])
+    answers = True
+    while answers:  # its pipe is at an end: the port is given back
+        with socket.socket() as asking:
+            answers = asking.connect_ex(("127.0.0.1", port)) == 0

@@ -1,0 +1,129 @@
+"""One visitor holds the controls; who needs a token only looks until it is shown."""
+
+import asyncio
+import json
+
+import pytest
+
+from sfms_robot.errors import PacketError
+from sfms_robot.viewer.visitor_commands import Command
+from sfms_robot.viewer.visitors import IDLE_S, MOST_VISITORS, OUTBOX, Visitors
+
+HALT, SHOW = Command("halt", {}), Command("show", {})
+
+
+class Here:
+    """Visitors, and a clock that is set."""
+
+    def __init__(self, token=None):
+        self.now_s = 100.0
+        self.left = []
+        self.visitors = Visitors(token, self.left.append, lambda: self.now_s)
+
+
+def told(visitor):
+    """What waits for a visitor."""
+
+    async def all_of_it():
+        found = []
+        while visitor._something.is_set():
+            found.append(await visitor.next())
+        return found
+
+    return [json.loads(each) if each.startswith("{") else each for each in asyncio.run(all_of_it())]
+
+
+def test_who_does_something_first_has_the_controls_until_they_are_given_back() -> None:
+    here = Here()
+    a, b = here.visitors.enter(), here.visitors.enter()
+    here.visitors.admit(a, SHOW)
+    assert here.visitors.controls(a) == "you" and here.visitors.controls(b) == "other"
+    assert told(b) == [{"type": "controls", "held": "other"}]
+    with pytest.raises(PacketError, match="somebody else holds the controls"):
+        here.visitors.admit(b, SHOW)
+    here.visitors.give(a)
+    assert here.left == [a.number] and here.visitors.controls(b) == "nobody"
+    here.visitors.admit(b, SHOW)
+    assert here.visitors.controls(b) == "you"
+
+
+def test_anybody_may_halt() -> None:
+    here = Here()
+    a, b = here.visitors.enter(), here.visitors.enter()
+    here.visitors.take(a)
+    here.visitors.admit(b, HALT)
+    assert here.visitors.controls(a) == "you"
+
+
+def test_controls_that_are_not_used_go_to_who_asks() -> None:
+    here = Here()
+    a, b = here.visitors.enter(), here.visitors.enter()
+    here.visitors.take(a)
+    here.now_s += IDLE_S - 1
+    assert here.visitors.holds(a) and not here.visitors.holds(b)  # a piece of voice counts as use
+    here.now_s += IDLE_S - 1
+    with pytest.raises(PacketError):
+        here.visitors.take(b)
+    here.now_s += 2
+    here.visitors.take(b)
+    assert here.visitors.controls(b) == "you" and here.left == [a.number]
+
+
+def test_who_goes_leaves_the_controls() -> None:
+    here = Here()
+    a, b = here.visitors.enter(), here.visitors.enter()
+    here.visitors.take(a)
+    here.visitors.leave(a)
+    assert here.left == [a.number] and here.visitors.controls(b) == "nobody" and len(here.visitors) == 1
+
+
+@pytest.mark.parametrize("command", [HALT, SHOW])
+def test_with_a_token_who_has_not_shown_it_only_looks(command) -> None:
+    here = Here("secret")
+    visitor = here.visitors.enter()
+    with pytest.raises(PacketError, match="the token is needed"):
+        here.visitors.admit(visitor, command)
+    with pytest.raises(PacketError, match="the token is not the one"):
+        here.visitors.greeted(visitor, Command("hello", {"version": 1, "token": "guess"}))
+    assert not visitor.allowed
+    here.visitors.greeted(visitor, Command("hello", {"version": 1, "token": "secret"}))
+    here.visitors.admit(visitor, command)
+
+
+def test_a_page_of_another_version_is_told_to_be_loaded_anew() -> None:
+    here = Here()
+    with pytest.raises(PacketError, match="this page is of version 0, not 1: load it anew"):
+        here.visitors.greeted(here.visitors.enter(), Command("hello", {"version": 0, "token": ""}))
+
+
+def test_there_is_room_for_some_and_not_for_all() -> None:
+    here = Here()
+    first = [here.visitors.enter() for _ in range(MOST_VISITORS)][0]
+    with pytest.raises(PacketError, match="look at this head already"):
+        here.visitors.enter()
+    here.visitors.leave(first)
+    assert here.visitors.enter().number == MOST_VISITORS + 1
+
+
+def test_of_pictures_the_newest_is_sent_and_of_messages_all() -> None:
+    visitor = Here().visitors.enter()
+    for picture in ("old", "new"):
+        visitor.show(picture)
+    visitor.tell(b'{"n":1}')
+    visitor.tell(b'{"n":2}')
+    assert told(visitor) == [{"n": 1}, {"n": 2}, "new"]
+
+
+def test_who_reads_nothing_is_found_out() -> None:
+    visitor = Here().visitors.enter()
+    for _ in range(OUTBOX):
+        visitor.tell(b"{}")
+    assert not visitor.behind
+    visitor.tell(b"{}")
+    assert visitor.behind
+
+
+def test_a_flood_is_read_slowly_and_a_burst_at_once() -> None:
+    visitor = Here().visitors.enter()
+    pauses = [visitor.pause_s(0.01, 100.0) for _ in range(100)]
+    assert pauses[:24] == [0.0] * 24 and pauses[-1] == pytest.approx(0.75)
