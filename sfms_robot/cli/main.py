@@ -93,12 +93,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     verbose = [word for word in words if word in ("-v", "--verbose")]
     with _endings_as_interrupts():
         code, problem = _outcome(verbose + _completed([word for word in words if word not in verbose]))
+        if arguments is None:
+            _ignore_interrupts()
     if problem is not None and "--json" in words:
         ended = "interrupted" if code == INTERRUPTED else "failed"
         told = {"version": 1, "exit": ended, "error": problem, "exit_code": code}
         with suppress(OSError):
             print(json_module.dumps(told), flush=True)
     sys.exit(code)
+
+
+def _ignore_interrupts() -> None:
+    """The command is over and its exit code stands: who presses Ctrl-C once more would only make it that of a signal."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager

@@ -1,7 +1,17 @@
+import signal
+
 import pytest
 from drill_rig import HEAD, servos
 
 from sfms_robot.data import data_dir
+
+
+@pytest.fixture(scope="session", autouse=True)
+def hangups_are_heeded():
+    """Also where these tests run under nohup, which what they start would inherit."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture
