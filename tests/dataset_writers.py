@@ -1,6 +1,7 @@
 """Tiny data sets in the formats that other projects write, with motion that has their statistics."""
 
 import csv
+import json
 import pickle
 from pathlib import Path
 
@@ -143,3 +144,95 @@ def vico(root: Path, lengths: tuple[int, ...] = (60, 70)) -> Path:
             torch.save({"id.gamma.tex": np.zeros((frames, 187), np.float32), "angle.exp.trans": motion}, file)
     (root / "metadata" / "data.csv").write_text("\n".join(lines) + "\n")
     return root
+
+
+def dualtalk_demo(root: Path, frames: int = 100) -> Path:
+    """Two voices in samples of 32-bit floats, one face, of whom the model is to answer, as in the published demo."""
+    for number, faced in enumerate((2, 1)):
+        for person in (1, 2):
+            stem = root / "demo" / f"abc_sub_video_{number}_000_speaker{person}"
+            stem.parent.mkdir(parents=True, exist_ok=True)
+            voice = RNG.normal(0, 0.1, frames * 640 - 768)  # they end a little before the face
+            soundfile.write(stem.with_suffix(".wav"), voice, 16_000, subtype="FLOAT")
+            if person == faced:
+                motion = deca(frames)
+                more = {"shape": (100,), "tex": (50,), "cam": (3,), "light": (9, 3)}
+                zeros = {key: np.zeros((frames, *shape), np.float32) for key, shape in more.items()}
+                np.savez(stem.with_suffix(".npz"), exp=motion[:, :50], pose=motion[:, 50:], **zeros)
+    return root
+
+
+def dualtalk_arkit(root: Path, chats: int = 2, frames: int = 100, split: str = "train") -> Path:
+    """The edition in ARKit's shapes beside the one in FLAME's."""
+    dualtalk(root, chats, frames, split)
+    for number in range(chats):
+        for person in (1, 2):
+            weights = RNG.uniform(0, 0.6, (frames, 51))
+            head = RNG.normal(0, 0.2, (frames, 3)).clip(-1, 1)  # yaw, pitch, roll
+            rows = np.concatenate([weights, np.zeros((frames, 1)), head, np.zeros((frames, 6))], axis=1)
+            npy(root / "ARKit_npy" / split / f"{number:04d}_speaker{person}.npy", rows.astype(np.float32))
+    return root
+
+
+SEAMLESS_ID = "V00_S0809_I00000582"
+
+
+def seamless_speech(seconds: float, first: bool) -> list[tuple[float, float]]:
+    """Turns of 1.5 s with pauses of 0.5 s, the two people by turns."""
+    starts = np.arange(0.3 if first else 2.3, seconds - 1.6, 4.0)
+    return [(round(float(start), 3), round(float(start) + 1.5, 3)) for start in starts]
+
+
+def seamless_person(
+    folder: Path, name: str, frames: int = 240, first: bool = True, invalid=(), late_s: float = 0.0, **arrays
+) -> None:
+    """One person's three files, his voice `late_s` behind its annotation; `arrays` replace those of the .npz."""
+    folder.mkdir(parents=True, exist_ok=True)
+    seconds = frames / 30
+    spans = seamless_speech(seconds, first)
+    voice = RNG.normal(0, 1e-4, round(seconds * 48_000))
+    for start, end in spans:
+        at, to = (max(0, round((edge + late_s) * 48_000)) for edge in (start, end))
+        voice[at:to] += 0.1 * np.sin(2 * np.pi * 150 * np.arange(len(voice[at:to])) / 48_000)
+    soundfile.write(folder / f"{name}.wav", voice, 48_000, subtype="PCM_16")
+    words = [{"words": [], "start": start, "end": end, "transcript": "Yeah."} for start, end in spans]
+    vad = [{"start": start, "end": end} for start, end in spans]
+    told = {"id": name, "metadata:transcript": words, "metadata:vad": vad}
+    (folder / f"{name}.json").write_text(json.dumps(told))
+    times_s = np.arange(frames) / 30
+    valid = np.ones((frames, 1), np.float32)
+    for start, end in invalid:
+        valid[start:end] = 0
+    rotation = 0.15 * np.sin(times_s[:, None] * (3.0, 1.1, 0.7) + float(first))
+    units = 1.0 + 0.9 * np.sin(times_s[:, None] * np.linspace(0.5, 4, 24) + float(first))
+    rows = {
+        "movement:alignment_head_rotation": (rotation * valid).astype(np.float32),
+        "movement:FAUValue": (units * valid).astype(np.float32),
+        "movement:is_valid": valid,
+        "movement:expression": np.zeros((frames, 128), np.float32),
+        "smplh:body_pose": np.zeros((frames, 21, 3), np.float32),
+    } | arrays
+    np.savez_compressed(folder / f"{name}.npz", **{key: value for key, value in rows.items() if value is not None})
+
+
+def seamless(root: Path, interactions: int = 2, frames: int = 240, split: str = "train", **more) -> Path:
+    """Two people an interaction, in different archives of a batch, as the data set keeps partners."""
+    for number in range(interactions):
+        for first, archive in ((True, "0005"), (False, "0011")):
+            name = f"V00_S{809 + number:04d}_I00000582_P{947 + (not first):04d}{'A' * (not first)}"
+            seamless_person(root / "improvised" / split / "0000" / archive, name, frames, first, **more)
+    return root
+
+
+def seen(rotation: np.ndarray, jaw: np.ndarray, eyes: np.ndarray, mirrored: bool = False) -> np.ndarray:
+    """(T, 133, 3) key points of a face in a picture (x right, y down) that turns, talks and blinks in FLAME's terms."""
+    pitch, yaw, roll = (rotation * ((1, -1, -1) if mirrored else (1, 1, 1))).T
+    points = np.zeros((len(rotation), 133, 3), np.float32)
+    points[..., 2] = 0.9
+    points[:, 1, 0], points[:, 2, 0] = 530, 470  # the left eye at the picture's right
+    points[:, 2, 1], points[:, 1, 1] = 400 + 60 * roll, 400
+    points[:, 0, 0], points[:, 0, 1] = 500 + 40 * yaw, 430 + 40 * pitch + 30 * roll
+    points[:, 23 + 66, 1] = 10 * jaw
+    for above, below in ((37, 41), (38, 40), (43, 47), (44, 46)):
+        points[:, 23 + above, 1], points[:, 23 + below, 1] = 398, 406 - 3 * eyes
+    return points

@@ -1,4 +1,4 @@
-"""`sfms-robot data`: make training data, and look at what somebody else made."""
+"""`sfms-robot data`: make training data, look at what somebody else made, and take it into our space."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from pathlib import Path
 
 import typer
 
-app = typer.Typer(help="Training data: compose dyads, check data sets.", no_args_is_help=True)
+app = typer.Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
+
+
+_LAYOUTS = (
+    "composed, l2l, lm_listener, react, react2025, dualtalk, dualtalk_arkit, dim, vico, seamless; "
+    "found by itself if not said."
+)
 
 
 class Order(StrEnum):
@@ -36,9 +42,7 @@ def compose(
 @app.command()
 def check(
     folder: Path = typer.Argument(..., metavar="DIR", help="A data set, as its authors lay it out."),
-    layout: str = typer.Option(
-        "auto", help="composed, l2l, lm_listener, react, react2025, dualtalk, dim, vico; found by itself if not said."
-    ),
+    layout: str = typer.Option("auto", help=_LAYOUTS),
     order: Order | None = typer.Option(None, help="Order of the channels in the files, if not the layout's own."),
     window: int = typer.Option(0, min=0, help="Frames that a clip must have."),
     channels: bool = typer.Option(False, "--channels", help="Show the range of every channel."),
@@ -52,3 +56,23 @@ def check(
     show(report, json, partial(print_check, channels=channels))
     if not report["usable"]:
         raise typer.Exit(2)
+
+
+@app.command()
+def convert(
+    folder: Path = typer.Argument(..., metavar="IN", help="A data set, as its authors lay it out."),
+    out: Path = typer.Argument(..., metavar="OUT", help="Folder to write dyads into; must be empty or not there."),
+    layout: str = typer.Option("auto", help=_LAYOUTS),
+    order: Order | None = typer.Option(None, help="Order of the channels in the files, if not the layout's own."),
+    flame_matrix: Path | None = typer.Option(
+        None, help="FLAME coefficients of every ARKit blendshape (.npy, .csv): shows the expression of deca56 data."
+    ),
+    flame_order: str = typer.Option("alphabetical", help="Order of the matrix's rows: alphabetical, apple, ..."),
+    json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object."),
+) -> None:
+    """Convert a data set into dyads at 25 fps in our own space, and tell what is lost."""
+    from sfms_robot.app.train.data_conversion import convert_data
+    from sfms_robot.cli.show_learning import print_conversion, show
+
+    show(convert_data(folder, out, layout, order.value if order else None, flame_matrix, flame_order), json,
+         print_conversion)  # fmt: skip

@@ -214,6 +214,8 @@ def print_check(report: Mapping[str, Any], channels: bool) -> None:
             _counts(split["sound"]), _counts(split["features"]),
         )  # fmt: skip
     console.print(report["folder"], soft_wrap=True)
+    if report["licence"]:
+        console.print(f"licence: {report['licence']}", soft_wrap=True)
     console.print(table)
     if channels:
         for split in report["splits"]:
@@ -238,7 +240,7 @@ def _print_problems(console: Console, report: Mapping[str, Any]) -> None:
     if table.row_count:
         console.print(table)
     for note in dict.fromkeys(note for split in report["splits"] for note in split["notes"]):
-        console.print(note, style="dim")
+        console.print(escape(note), style="dim", soft_wrap=True)
     for split in report["splits"]:
         if split["speaker_unknown_frames"]:
             console.print(
@@ -256,6 +258,24 @@ def _span(frames: Mapping[str, float] | None) -> str:
 
 def _counts(counts: Mapping[str, int]) -> str:
     return "\n".join(f"{name} {count}" for name, count in counts.items()) or "-"
+
+
+def print_conversion(report: Mapping[str, Any]) -> None:
+    """Splits that were written, what was left out of them, and what the conversion lost."""
+    console = screen()
+    console.print(f"{report['layout']}: {report['folder']} -> {report['out']}", soft_wrap=True)
+    if report["licence"]:
+        console.print(f"licence: {report['licence']}", soft_wrap=True)
+    print_rows([{key: split[key] for key in ("split", "clips", "minutes")} for split in report["splits"]])
+    for split in report["splits"]:
+        for problem in split["left_out"]:
+            told = f"{split['split']}: {problem['count']} left out, {problem['kind']}: {problem['first']}"
+            console.print(escape(told), soft_wrap=True)
+    for key, meaning in report["residual_names"].items():
+        if report["residual"][key] is not None:
+            console.print(f"{meaning}: {cell(report['residual'][key])}", soft_wrap=True)
+    for note in dict.fromkeys([*report["notes"], *(note for split in report["splits"] for note in split["notes"])]):
+        console.print(escape(note), style="dim", soft_wrap=True)
 
 
 # --- evaluate people --------------------------------------------------------------------------------------------

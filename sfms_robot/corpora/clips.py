@@ -17,12 +17,16 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, SPACE_CHANNELS, Floats, ListenerEvent
 from sfms_robot.signals import mel as log_mel
+from sfms_robot.signals.action_units import FAU_VALUE
 
-# Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
+# Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
+SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))
+# Numbers per frame of every space data comes in: those a listener may work in, and three that it may not.
 WIDTHS: Final[Mapping[str, int]] = {
     **{name: len(channels) for name, channels in SPACE_CHANNELS.items()},
     "faceverse58-centred": 58,  # less a mean face: how far from it, not where
     "deep3d73": 73,  # Deep3DFaceRecon: angle 3 | expression 64 | translation 3 | crop 3
+    "seamless27": len(SEAMLESS_CHANNELS),
 }
 # What reading a broken file may raise; numpy parses the headers of its files as Python literals.
 UNREADABLE: Final = (

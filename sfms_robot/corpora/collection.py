@@ -21,7 +21,7 @@ _T = TypeVar("_T")
 Order = Literal["exp-first", "pose-first"]
 Kind = Literal[
     "missing half", "missing sound", "missing feature", "wrong dims", "lengths differ", "not finite", "too short",
-    "unreadable", "swapped order",
+    "unreadable", "swapped order", "time stamps",
 ]  # fmt: skip
 
 _NAMED: Final = 5  # problems a warning names
@@ -79,6 +79,7 @@ class Dataset(Sequence[Dyad]):
         features: names of the shipped features each dyad carries.
         problems: what was left out, and why.
         notes: what else a person should know.
+        licence: what may be done with the data, as far as they say; None: they do not.
     """
 
     layout: str
@@ -89,6 +90,7 @@ class Dataset(Sequence[Dyad]):
     problems: tuple[Problem, ...] = ()
     notes: tuple[str, ...] = ()
     features: tuple[str, ...] = ()
+    licence: str | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

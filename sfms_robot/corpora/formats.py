@@ -18,18 +18,18 @@ import numpy as np
 from sfms_robot.corpora import stored
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import ClipError, Dataset, Layout, Order
-from sfms_robot.corpora.external import dualtalk, l2l, lm_listener, react, react2025, vico
+from sfms_robot.corpora.conversion import CONVERTIBLE, in_ours
+from sfms_robot.corpora.external import dualtalk, l2l, lm_listener, react, react2025, seamless, vico
 from sfms_robot.corpora.reading import pose_last
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.signals.audio_features import Feature, cached
-from sfms_robot.signals.spaces import decode
 
 LAYOUTS: Final = {
     layout.name: layout
     for layout in (
-        l2l.LAYOUT, lm_listener.LAYOUT, react.LAYOUT, react2025.LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO,
-        stored.LAYOUT,
+        l2l.LAYOUT, lm_listener.LAYOUT, react.LAYOUT, react2025.LAYOUT, dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT,
+        vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
     )
 }  # fmt: skip
 _SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}
@@ -46,8 +46,9 @@ def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
         raise ConfigError(f"--layout {layout}: is not known (auto, {', '.join(LAYOUTS)})")
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder")
-    tried = LAYOUTS.values() if layout == "auto" else [LAYOUTS[layout]]
-    for candidate in tried:
+    tried = list(LAYOUTS.values()) if layout == "auto" else [LAYOUTS[layout]]
+    # Our own first: converted dyads keep the names of their files, and these may be another layout's.
+    for candidate in sorted(tried, key=lambda one: one is not stored.LAYOUT):
         place = candidate.root(folder)
         if place is not None:
             return candidate, place
@@ -94,6 +95,8 @@ def open_dataset(
     dataset = replace(dataset, features=_shipped(found, features))
     if dataset.problems:
         log.warning("%s", dataset.summary())
+    if dataset.licence is not None and dataset.split == "train":  # what weights come from
+        log.warning("%s: %s", place, dataset.licence)
     return _in_space(dataset, place, space or dataset.space)
 
 
@@ -107,7 +110,8 @@ def open_for(space: str, folder: Path, split: str, order: Order | None = None, f
     if dataset.space in (space, "arkit58"):
         return dataset
     if dataset.space != "faceverse58":
-        raise ConfigError(f"{folder}: {dataset.layout} is in {dataset.space}, which cannot become {space}")
+        way = "; `sfms-robot data convert` makes arkit58 of it" if dataset.space in CONVERTIBLE else ""
+        raise ConfigError(f"{folder}: {dataset.layout} is in {dataset.space}, which cannot become {space}{way}")
     return dataset.map(_as_arkit, "arkit58")
 
 
@@ -184,14 +188,8 @@ def _in_space(dataset: Dataset, place: Path, space: str) -> Dataset:
 
 def _as_arkit(clip: Dyad) -> Dyad:
     """faceverse58 in our units; a speaker's unknown frames stay unknown."""
-    return replace(clip, speaker=_decoded(clip.speaker), listener=_decoded(clip.listener), space="arkit58")
-
-
-def _decoded(motion: Floats) -> Floats:
-    known = np.isfinite(motion).all(axis=1)
-    out = np.full_like(motion, np.nan)
-    out[known] = decode(motion[known], "faceverse58").motion
-    return out
+    speaker, listener = (in_ours(motion, "faceverse58") for motion in (clip.speaker, clip.listener))
+    return replace(clip, speaker=speaker, listener=listener, space="arkit58")
 
 
 # --- order ------------------------------------------------------------------------------------------------------

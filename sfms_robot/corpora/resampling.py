@@ -10,6 +10,7 @@ import numpy as np
 from sfms_robot.corpora.clips import Dyad, at_rate, samples_of
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, Floats
+from sfms_robot.signals.mel import ROWS_PER_FRAME
 from sfms_robot.signals.tracks import Track, resample
 
 SPACE: Final = "arkit58"  # in other spaces a frame between two is not always what lies between their numbers
@@ -42,10 +43,15 @@ def at_frame_rate(dyad: Dyad) -> Dyad:
         listener=_motion(dyad.listener, dyad.fps, frames),
         listening=at_rate(dyad.listening, dyad.fps, frames, FRAME_HZ),
         states=None if dyad.states is None else at_rate(dyad.states, dyad.fps, frames, FRAME_HZ),
-        mel=None,  # ships with other spaces only
+        mel=None if dyad.mel is None else _mel(dyad.mel, dyad.fps, frames),
         features={name: newest(rows) for name, rows in dyad.features.items()},
         fps=float(FRAME_HZ),
     )
+
+
+def _mel(rows: Floats, fps: float, frames: int) -> Floats:
+    """(4N, 128) at four rows a frame -> (4 * frames, 128): of each time the newest row."""
+    return at_rate(rows, ROWS_PER_FRAME * fps, ROWS_PER_FRAME * frames, ROWS_PER_FRAME * FRAME_HZ)
 
 
 def _motion(motion: Floats, fps: float, frames: int) -> Floats:

@@ -1,4 +1,7 @@
-"""Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, among them all that `data compose` makes."""
+"""Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`: what `data compose` and `data convert` make.
+
+What was converted has a `source.yaml` beside its splits, which says whose data they are: their licence goes along.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,15 @@ from typing import Final
 
 import numpy as np
 
+from sfms_robot.config.yaml_file import read as read_yaml
 from sfms_robot.corpora.clips import read
 from sfms_robot.corpora.collection import Clip, ClipError, Dataset, Layout, Order
 from sfms_robot.corpora.reading import collect, npz_shapes
 from sfms_robot.corpora.splits import SPLITS
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
 
+SOURCE: Final = "source.yaml"
 _FEATURE: Final = "feature."
 
 
@@ -54,7 +60,18 @@ def scan(place: Path, split: str, order: Order | None) -> Dataset:
 
     clips, problems = collect([(row, file.stem) for row, file in enumerate(files)], clip)
     space, fps = first[0] if first else ("arkit58", float(FRAME_HZ))
-    return Dataset("composed", split, space, fps, clips, problems)
+    return Dataset("composed", split, space, fps, clips, problems, licence=_licence(place))
+
+
+def _licence(place: Path) -> str | None:
+    """Of what was converted; `place` may be one split of it. Raises ConfigError for a file that says something else."""
+    file = next((base / SOURCE for base in (place, place.parent) if (base / SOURCE).is_file()), None)
+    if file is None:
+        return None
+    told = read_yaml(file)
+    if not isinstance(told, dict) or not isinstance(told.get("licence"), str | None):
+        raise ConfigError.at(file, "licence", told.get("licence") if isinstance(told, dict) else told, "is no text")
+    return told.get("licence")
 
 
 def _kind(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> tuple[str, float]:

@@ -154,7 +154,9 @@ def test_computed_features_come_from_the_voice_and_the_cache(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("name", ["l2l", "lm_listener", "react", "react2025", "dualtalk", "dim", "vico"])
+@pytest.mark.parametrize(
+    "name", ["l2l", "lm_listener", "react", "react2025", "dualtalk", "dualtalk_arkit", "dim", "vico", "seamless"]
+)
 def test_no_broken_byte_is_more_than_a_problem(tmp_path, name, seed):
     """Files that are cut, emptied, scrambled or swapped with each other: a report or one clear line, never a trace."""
     rng = np.random.default_rng([seed, len(name)])

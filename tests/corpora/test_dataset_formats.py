@@ -9,6 +9,7 @@ import dataset_writers as write
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from sfms_robot.corpora import clips, formats
 from sfms_robot.corpora.clips import WIDTHS, Dyad
@@ -16,11 +17,13 @@ from sfms_robot.corpora.collection import ClipError
 from sfms_robot.corpora.external import l2l, react
 from sfms_robot.corpora.formats import LAYOUTS, detect, looks_like, open_dataset, open_for, split_names
 from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.learning.sfms.features import gather
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.learning2listen import l2l_bilateral
-from sfms_robot.signals.spaces import rest_of
+from sfms_robot.signals.spaces import decode, rest_of
 
 
 def composed(root: Path) -> Path:
@@ -41,8 +44,10 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "react": write.react,
     "react2025": write.react2025,
     "dualtalk": write.dualtalk,
+    "dualtalk_arkit": write.dualtalk_arkit,
     "dim": write.dim,
     "vico": write.vico,
+    "seamless": write.seamless,
     "composed": composed,
 }
 
@@ -229,6 +234,50 @@ def test_dualtalk_each_listens_to_the_other(tmp_path):
     one, two = dataset[0], dataset[1]
     np.testing.assert_array_equal(one.speaker, two.listener)
     assert one.audio.shape == (100 * 640,) and not np.array_equal(one.audio, two.audio)
+
+
+def test_dualtalk_demo_has_two_voices_and_one_face_and_whose_face_is_there_listens(tmp_path):
+    write.dualtalk_demo(tmp_path)
+    for folder in (tmp_path, tmp_path / "demo"):
+        dataset = open_dataset(folder, "demo")
+        assert dataset.names == ("abc_sub_video_0_000_speaker2", "abc_sub_video_1_000_speaker1")
+        dyad = dataset[0]
+        assert np.isnan(dyad.speaker).all() and dyad.fps == 25 and dyad.space == "deca56"
+        heard, said = (read_audio(tmp_path / "demo" / f"abc_sub_video_0_000_speaker{person}.wav") for person in (1, 2))
+        np.testing.assert_array_equal(dyad.audio[: len(heard)], heard)
+        np.testing.assert_array_equal(dyad.agent_audio[: len(said)], said)
+
+
+def test_dualtalk_each_has_the_other_s_voice_and_his_own(tmp_path):
+    one, two = open_dataset(write.dualtalk(tmp_path, chats=1, split="test"), "test")
+    np.testing.assert_array_equal(one.audio, two.agent_audio)
+    np.testing.assert_array_equal(one.agent_audio, two.audio)
+
+
+def test_dualtalk_in_arkit_s_shapes_is_found_before_the_one_in_flame_s_and_stands_in_our_order(tmp_path):
+    write.dualtalk_arkit(tmp_path, split="test")
+    dyad = open_dataset(tmp_path, "test")[0]
+    rows = np.load(tmp_path / "ARKit_npy" / "test" / "0000_speaker1.npy")
+    assert dyad.name == "0000_speaker1" and dyad.space == "arkit58" and dyad.agent_audio is not None
+    columns = [CHANNEL_INDEX[name] for name in ("yaw", "pitch", "roll")]
+    np.testing.assert_array_equal(dyad.listener[:, columns], rows[:, 52:55])
+    for name, column in (("eyeBlinkLeft", 0), ("jawLeft", 15), ("jawOpen", 17), ("noseSneerRight", 50)):
+        np.testing.assert_array_equal(dyad.listener[:, CHANNEL_INDEX[name]], rows[:, column])
+    assert open_dataset(tmp_path, "test", layout="dualtalk").space == "deca56"
+
+
+def test_dualtalk_angles_in_arkit_s_edition_are_the_turns_of_flame_s(tmp_path):
+    """What its authors computed from FLAME's rotation vector is what reading FLAME's own files gives."""
+    write.dualtalk_arkit(tmp_path, chats=1, split="test")
+    with np.load(tmp_path / "test" / "0000_speaker1.npz") as arrays:
+        vectors = arrays["pose"][:, :3].astype(float)
+    file = tmp_path / "ARKit_npy" / "test" / "0000_speaker1.npy"
+    rows = np.load(file)
+    rows[:, 52:55] = Rotation.from_rotvec(vectors).as_euler("YXZ")
+    np.save(file, rows)
+    arkit = open_dataset(tmp_path, "test")[0]
+    flame = decode(open_dataset(tmp_path, "test", layout="dualtalk")[0].listener, "deca56").motion
+    np.testing.assert_allclose(arkit.listener[:, :3], flame[:, :3], atol=1e-6)
 
 
 def test_dim_pickle_that_would_run_code_is_refused(tmp_path):

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 
 from sfms_robot.corpora import formats
-from sfms_robot.corpora.clips import Dyad
+from sfms_robot.corpora.clips import SEAMLESS_CHANNELS, Dyad
 from sfms_robot.corpora.collection import ClipError, Dataset, Layout, Order, Problem, guarded
 from sfms_robot.corpora.compose.composed import compose_folder
 from sfms_robot.errors import ConfigError
@@ -30,8 +30,8 @@ def check_data(folder: Path, layout: str = "auto", order: Order | None = None, w
         window: frames that a clip must have.
 
     Returns:
-        layout, order, and per split: clips, minutes, fps, space, frames, sound, features, channels, problems (kind,
-        count, names, first detail), notes. `usable` is False when no clip can be used, or the order is swapped.
+        layout, order, licence, and per split: clips, minutes, fps, space, frames, sound, features, channels, problems
+        (kind, count, names, first detail), notes. `usable` is False when no clip can be used, or the order is swapped.
 
     Raises ConfigError where there is no data set at all.
     """
@@ -46,6 +46,7 @@ def check_data(folder: Path, layout: str = "auto", order: Order | None = None, w
         "about": found.about,
         "order": order or found.order,
         "window": window,
+        "licence": next((split["licence"] for split in splits if split["licence"]), None),
         "usable": not swapped and any(split["clips"] for split in splits),
         "splits": splits,
     }
@@ -55,7 +56,7 @@ def _split(
     layout: Layout, place: Path, split: str, order: Order | None, window: int, progress: Progress
 ) -> dict[str, Any]:
     try:
-        dataset = formats.scan_split(layout, place, split, order)
+        dataset = scanned(layout, place, split, order, progress)
     except ConfigError as error:
         broken = Problem("unreadable", str(place), str(error))
         return _report(Dataset(layout.name, split, layout.space, layout.fps, (), (broken,)), _Tally(), {})
@@ -75,6 +76,15 @@ def _split(
             checked = replace(checked, notes=(*checked.notes, said))
     counts, missing = _features(checked, progress.add_task(f"{split}: features", total=len(checked)), progress.advance)
     return _report(replace(checked, problems=(*checked.problems, *missing)), tally, counts)
+
+
+def scanned(layout: Layout, place: Path, split: str, order: Order | None, progress: Progress) -> Dataset:
+    """Names and headers of a split, under a bar that says so: of many files even these take their time."""
+    task = progress.add_task(f"{split}: headers", total=None)
+    try:
+        return formats.scan_split(layout, place, split, order)
+    finally:
+        progress.remove_task(task)
 
 
 def _features(dataset: Dataset, task: Any, advance: Callable[[Any], None]) -> tuple[dict[str, int], Sequence[Problem]]:
@@ -144,7 +154,8 @@ class _Tally:
 
 def _report(dataset: Dataset, tally: _Tally, features: dict[str, int]) -> dict[str, Any]:
     width = len(tally.low) if tally.low is not None else 0
-    names = SPACE_CHANNELS.get(dataset.space) or [f"channel_{index}" for index in range(width)]
+    known = {**SPACE_CHANNELS, "seamless27": SEAMLESS_CHANNELS}
+    names = known.get(dataset.space) or [f"channel_{index}" for index in range(width)]
     kinds: dict[str, list[Problem]] = {}
     for problem in dataset.problems:
         kinds.setdefault(problem.kind, []).append(problem)
@@ -166,6 +177,7 @@ def _report(dataset: Dataset, tally: _Tally, features: dict[str, int]) -> dict[s
             for kind, found in kinds.items()
         ],
         "notes": list(dataset.notes),
+        "licence": dataset.licence,
     }
 
 
