@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _ignore_interrupts() -> None:
-    """The command is over and its exit code stands: who presses Ctrl-C once more would only make it that of a signal."""
+    """The command is over and its exit code stands: one more Ctrl-C would only make it that of a signal."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
