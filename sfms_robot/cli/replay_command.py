@@ -17,7 +17,7 @@ def replay(
     plot: Path | None = typer.Option(
         None, help="PNG: states and events, voice, head pose, six face channels, joint angles over time."
     ),
-    sheet: Path | None = typer.Option(None, help="PNG: the virtual head at twelve instants of the run."),
+    sheet: Path | None = typer.Option(None, help="PNG: the virtual head and the robot at twelve instants of the run."),
     port: str | None = typer.Option(
         None, help="Drive a head with the recorded face: 'sim', 'auto', a device, or NAME=DEVICE per bus."
     ),

@@ -1,4 +1,4 @@
-"""Pictures of the virtual head: a contact sheet of a run, and one face alone. Needs the extra `pictures`.
+"""A contact sheet of a run: the virtual head, and beside it the robot. Needs the extra `pictures`.
 
 A sheet is twelve instants, chosen to show what happened: the largest nod from its top over its lowest point to its end,
 the firmest blink, the broadest smile, the furthest look aside; the rest are spread where nothing is shown yet.
@@ -17,11 +17,14 @@ from scipy.ndimage import median_filter
 
 from sfms_robot.face.drawing import BACKGROUND, add_head, add_renderer, load_vtk, look, open_window, save
 from sfms_robot.face.human import HumanHead, load_human
+from sfms_robot.face.robot_drawing import add_robot
+from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
 
 _COLUMNS: Final = 4
 _INSTANTS: Final = 12
-_CELL_PX: Final = (392, 352)  # one picture
+_ALONE_PX: Final = ((392,), 352)  # widths of the pictures of an instant, and their height: the virtual head
+_BESIDE_PX: Final = ((258, 182), 316)  # the virtual head and the robot
 _CAPTION_PX: Final = 58
 _GAP_PX: Final = 8
 _TITLE_PX: Final = 62
@@ -147,23 +150,33 @@ def render_sheet(
     motion: Floats,
     talking: NDArray[np.bool_] | None = None,
     title: str = "",
+    robot: tuple[RobotScene, Doubles] | None = None,
 ) -> list[Instant]:
     """Draw twelve instants of a motion (N, 58) as one PNG, 4 x 3, and say which.
 
-    talking: (N,) whether the speaker talks, told under each picture. Raises MissingExtra without vtk.
+    talking: (N,) whether the speaker talks, told under each picture. robot: what it looks like, and the angles (N, J)
+    that it showed; None leaves it out. Raises ConfigError for a bad mesh, MissingExtra without vtk.
     """
     vtk = load_vtk()
     instants = pick_instants(times_s, motion)
-    wide, high = _CELL_PX[0] + _GAP_PX, _CELL_PX[1] + _CAPTION_PX
+    widths, cell_high = _ALONE_PX if robot is None else _BESIDE_PX
+    wide, high = sum(widths) + _GAP_PX, cell_high + _CAPTION_PX
     size = (_COLUMNS * wide + _GAP_PX, -(-len(instants) // _COLUMNS) * high + _TITLE_PX)
     window, head = open_window(vtk, size), load_human()
     paper = add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
     _text(vtk, paper, title, (_GAP_PX + 4, size[1] - 42), 24, _INK, bold=True)
     for index, instant in enumerate(instants):
         left = _GAP_PX + index % _COLUMNS * wide
-        low = size[1] - _TITLE_PX - index // _COLUMNS * high - _CELL_PX[1]
-        box = (left / size[0], low / size[1], (left + _CELL_PX[0]) / size[0], (low + _CELL_PX[1]) / size[1])
-        _add_portrait(vtk, add_renderer(vtk, window, box, BACKGROUND), head, motion[instant.row])
+        low = size[1] - _TITLE_PX - index // _COLUMNS * high - cell_high
+
+        def cell(begin: int, end: int, left: int = left, low: int = low) -> Any:
+            ends = ((left + begin) / size[0], low / size[1], (left + end) / size[0], (low + cell_high) / size[1])
+            return add_renderer(vtk, window, ends, BACKGROUND)
+
+        _add_portrait(vtk, cell(0, widths[0]), head, motion[instant.row])
+        if robot is not None:
+            scene, angles_rad = robot
+            add_robot(vtk, cell(widths[0], sum(widths)), scene, scene.values(angles_rad[instant.row]))
         _text(vtk, paper, f"{instant.time_s:.2f} s", (left + 4, low - 26), 19, _INK, bold=True)
         _text(vtk, paper, instant.label, (left + 96, low - 26), 19, _ACCENT, bold=instant.label != "-")
         if talking is not None:

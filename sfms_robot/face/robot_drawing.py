@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -15,9 +16,9 @@ from sfms_robot.face.urdf import Visual
 from sfms_robot.frames import Doubles
 
 _ROUND: Final = 48  # corners of a circle
-_FROM: Final = (1.0, 0.42, 0.22)  # where the camera stands, seen from the robot's middle
+_DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.22])  # of the camera, from the robot
 _ANGLE_DEG: Final = 24.0
-_ZOOM: Final = 1.12
+_ROOM: Final = 1.12  # of a picture, by what it shows
 _LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
 _INK: Final = (0.16, 0.17, 0.20)
 _READERS: Final = {".stl": "STLReader", ".obj": "OBJReader", ".ply": "PLYReader"}
@@ -49,19 +50,20 @@ def render_robots(
 
 
 def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
-    """Every visual in its place, three lights, and the camera before it. Raises ConfigError for a bad mesh."""
-    places = scene.robot.link_places(dict(zip(scene.joints, values.tolist(), strict=True)))
-    for visual in scene.robot.visuals:
-        renderer.AddActor(_actor(vtk, visual, places[visual.link] @ visual.place, scene.meshes))
-    bounds = np.array(renderer.ComputeVisiblePropBounds()).reshape(3, 2)
+    """Every visual in its place, three lights, and the camera before it. Raises ConfigError for a bad mesh.
+
+    The camera stands where it sees all of the robot at rest, so pictures of one robot show how it moves.
+    """
+    at_rest = vtk.Renderer()
+    _add_visuals(vtk, at_rest, scene, scene.rest())
+    bounds = np.array(at_rest.ComputeVisiblePropBounds()).reshape(3, 2)
+    _add_visuals(vtk, renderer, scene, values)
     middle, size = bounds.mean(axis=1), float(np.linalg.norm(np.ptp(bounds, axis=1)))
     camera = renderer.GetActiveCamera()
     camera.SetViewAngle(_ANGLE_DEG)
     camera.SetFocalPoint(*middle)
-    camera.SetPosition(*(middle + size * np.array(_FROM)))
+    camera.SetPosition(*(middle + _distance(bounds, renderer.GetTiledAspectRatio()) * _DIRECTION))
     camera.SetViewUp(0, 0, 1)
-    renderer.ResetCamera()
-    camera.Zoom(_ZOOM)
     renderer.ResetCameraClippingRange()
     renderer.AutomaticLightCreationOff()
     for place, strength in _LIGHTS:
@@ -71,6 +73,22 @@ def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> No
         light.SetFocalPoint(*middle)
         light.SetIntensity(strength)
         renderer.AddLight(light)
+
+
+def _distance(bounds: Doubles, aspect: float) -> float:
+    """From where a camera along `_DIRECTION` sees a box (3, 2) with room around it; aspect: width by height."""
+    corners = np.stack(np.meshgrid(*bounds), axis=-1).reshape(8, 3) - bounds.mean(axis=1)
+    aside = np.cross([0.0, 0.0, 1.0], _DIRECTION)
+    aside /= np.linalg.norm(aside)
+    slope = math.tan(math.radians(_ANGLE_DEG / 2)) / _ROOM
+    away = np.maximum(np.abs(corners @ aside) / aspect, np.abs(corners @ np.cross(_DIRECTION, aside))) / slope
+    return float((away + corners @ _DIRECTION).max())
+
+
+def _add_visuals(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
+    places = scene.robot.link_places(dict(zip(scene.joints, values.tolist(), strict=True)))
+    for visual in scene.robot.visuals:
+        renderer.AddActor(_actor(vtk, visual, places[visual.link] @ visual.place, scene.meshes))
 
 
 def _actor(vtk: Any, visual: Visual, place: Doubles, meshes: Mapping[str, Path]) -> Any:

@@ -3,7 +3,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from motion_rows import motion
+from PIL import Image
 
+from sfms_robot.app.head.head_scene import scene_of
+from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.contact_sheet import pick_instants, render_sheet
 from sfms_robot.face.human import load_human
@@ -122,6 +125,21 @@ def test_pictures_are_drawn_without_a_display(tmp_path):
     width, height = png_size(tmp_path / "sheet.png")
     assert width == pytest.approx(1600, abs=20) and 1000 < height < 1400
     assert instants == pick_instants(times_s, frames)
+
+
+def test_the_robot_is_drawn_beside_the_face_and_moves(tmp_path):
+    pytest.importorskip("vtkmodules")
+    scene = scene_of(load_head("op3_head"))
+    times_s, frames = run_with_events()
+    angles_rad = np.zeros((len(times_s), 2))
+    for name, tilt_rad in (("still", 0.0), ("down", 0.4)):
+        angles_rad[:, 1] = tilt_rad
+        render_sheet(tmp_path / f"{name}.png", times_s, frames, None, "a run", (scene, angles_rad))
+    still, down = (np.asarray(Image.open(tmp_path / f"{name}.png")).astype(float) for name in ("still", "down"))
+    change = np.abs(still - down).mean(axis=2)
+    first = slice(8, 260), slice(268, 440)  # the virtual head and the robot, of the first instant
+    face, robot = (change[80:360, columns] for columns in first)
+    assert robot.mean() > 2 and face.max() == 0
 
 
 def test_a_picture_needs_a_folder(tmp_path):

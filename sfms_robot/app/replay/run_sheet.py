@@ -1,14 +1,37 @@
-"""The virtual head at twelve instants of a recorded run."""
+"""The virtual head, and the robot beside it, at twelve instants of a recorded run."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
+from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.replay.run_file import RunRecording
+from sfms_robot.config import load_head
+from sfms_robot.errors import ConfigError
 from sfms_robot.face.contact_sheet import Instant, render_sheet
+from sfms_robot.face.robot_scene import RobotScene
+from sfms_robot.frames import Doubles
 
 
 def sheet(recording: RunRecording, png: Path | str) -> list[Instant]:
-    """Draw the face the listener asked for, and say at which instants. Raises MissingExtra without vtk."""
+    """Draw the face the listener asked for and what the servos did, and say at which instants.
+
+    A head that is not at hand, has other joints now or names no URDF is left out. Raises MissingExtra without vtk.
+    """
     talking = recording.talks_at(recording.times_s) if recording.has_voice else None
-    return render_sheet(png, recording.times_s, recording.motion, talking, recording.title)
+    return render_sheet(png, recording.times_s, recording.motion, talking, recording.title, _robot(recording))
+
+
+def _robot(recording: RunRecording) -> tuple[RobotScene, Doubles] | None:
+    """What it looks like, and the angles (N, J) that were read, or asked for where none was."""
+    try:
+        head = load_head(recording.about["head"])
+        scene = scene_of(head) if tuple(head.joints) == recording.joints else None
+    except ConfigError:
+        return None
+    if scene is None:
+        return None
+    read_rad = recording.present_rad.astype(np.float64)
+    return scene, np.where(np.isnan(read_rad), recording.goals_rad, read_rad)
