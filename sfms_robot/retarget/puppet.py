@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from threading import Lock
 from typing import Final
 
@@ -70,9 +71,10 @@ class Ramp:
         until = np.where(which, now_s + self.rise_s + seconds, self.until_s)
         return Ramp(start, began, until, self.rise_s, self.fall_s)
 
-    def over(self, time_s: float) -> bool:
-        """Whether all weights are 0 from `time_s` on."""
-        return bool((self.until_s + self.fall_s <= time_s).all())
+    @property
+    def over_s(self) -> float:
+        """From here on all weights are 0."""
+        return float(self.until_s.max()) + self.fall_s
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,11 @@ class _Piece:
     shown: Shown
     eyes: Turn
     head: Turn
+
+    @cached_property
+    def over_s(self) -> float:
+        """From here on the face is the listener's; asked at every tick."""
+        return max(part.ramp.over_s for part in (self.shown, self.eyes, self.head))
 
 
 @dataclass(frozen=True)
@@ -206,8 +213,9 @@ class Puppet:
 
     def overlay(self, motion: Floats, times_s: Doubles) -> Floats:
         """Motion (N, 58) at (N,) instants -> the same with what was asked for. Never changes its input."""
-        self._take(float(times_s.min()), float(times_s.max()))
-        if len(self._pieces) == 1 and self._idle(self._pieces[0], float(times_s.min())):
+        earliest_s = float(times_s.min())
+        self._take(earliest_s, float(times_s.max()))
+        if len(self._pieces) == 1 and self._pieces[0].over_s <= earliest_s:
             return motion
         out = motion.copy()
         starts = [piece.since_s for piece in self._pieces]
@@ -233,9 +241,6 @@ class Puppet:
             self._pieces.append(_Piece(since_s, shown, eyes, head))
         while len(self._pieces) > 1 and self._pieces[1].since_s <= earliest_s:
             self._pieces.pop(0)
-
-    def _idle(self, piece: _Piece, time_s: float) -> bool:
-        return all(part.ramp.over(time_s) for part in (piece.shown, piece.eyes, piece.head))
 
     def _laid_over(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
         shown = piece.shown
