@@ -17,6 +17,7 @@ export class Connection extends EventTarget {
     this.address = address;
     this.token = token;
     this.held = 'nobody';
+    this.allowed = false; // more than to look
     this.roundTripMs = null;
     this.#open();
     setInterval(() => this.#ping(), PING_MS);
@@ -50,6 +51,7 @@ export class Connection extends EventTarget {
     socket.onmessage = ({ data }) => this.#heard(JSON.parse(data));
     socket.onclose = () => {
       this.held = 'nobody';
+      this.allowed = false;
       this.dispatchEvent(new Event('closed'));
       setTimeout(() => this.#open(), this.#wait);
       this.#wait = Math.min(2 * this.#wait, LONGEST_WAIT_MS);
@@ -62,7 +64,7 @@ export class Connection extends EventTarget {
       this.#pinged.clear();
       if (sent !== undefined) this.roundTripMs = performance.now() - sent;
     } else if (message.type === 'hello') this.held = message.controls;
-    else if (message.type === 'controls') this.held = message.held;
+    else if (message.type === 'controls') [this.held, this.allowed] = [message.held, !message.needs_token];
     this.dispatchEvent(new CustomEvent(message.type, { detail: message }));
   }
 

@@ -87,7 +87,7 @@ class Page {
     on('frame', (frame) => { this.newest = frame; if (!this.replay && !this.still) this.#show(frame); });
     on('event', (event) => { this.timeline.event(event); if (!this.replay) this.shownEvent = event; });
     on('status', ({ status }) => this.#status(status));
-    on('controls', ({ held }) => { this.panels?.held(held); if (held === 'other') this.panels?.release(); });
+    on('controls', (controls) => { this.panels?.held(controls); if (controls.held === 'other') this.panels?.release(); });
     on('over', () => this.#over());
     on('error', ({ error }) => this.notice(error, 6000));
     connection.addEventListener('closed', () => this.#state('no connection', 'trying again'));

@@ -1,6 +1,7 @@
 // What a visitor can do. Every change is one command; what the program says against it comes back as an error.
 
 import { find, make, panel, slider, throttled } from './dom.js';
+import { lookPanel } from './look.js';
 import { ServoTable } from './servos.js';
 import { recordingPanel } from './recording.js';
 import { visitorPanel } from './visitor-panel.js';
@@ -11,18 +12,19 @@ const MOST_PER_MINUTE = { blink: 40, gaze_shift: 30 };
 const PEOPLE = { nod: 2.2, smile: 1, gaze_shift: 7, blink: 17, mm_hm: 2, laugh: 1, brow_raise: 1, shake: 0.3, tilt: 0.3 };
 const GROUPS = [['Head', 0, 6], ['Brows and cheeks', 6, 14], ['Eyes', 14, 28], ['Jaw', 28, 32], ['Mouth', 32, 55], ['Nose and tongue', 55, 58]];
 
-/** Fills #controls anew for the run that `hello` tells of. Returns {status(document), held(how), servos}. */
+/** Fills #controls anew for the run that `hello` tells of. Returns {held(controls), release(), servos}. */
 export function buildPanels(hello, connection, visitor, replays, chooseJoint) {
   const open = new Set([...document.querySelectorAll('#controls > details[open]')].map((each) => each.dataset.name));
   const first = !find('controls').children.length;
   const servos = new ServoTable(chooseJoint);
   servos.begin(hello.joints);
   const held = heldPanel(hello, connection);
-  const faces = facesPanel(hello, connection);
+  const faces = facesPanel(hello, connection), look = lookPanel(connection);
   const parts = {
     person: ['The person', visitorPanel(hello, connection, visitor), true],
     listener: ['The listener', listenerPanel(hello, connection), false],
     face: ['Show a face', [faces.expressions, faces.actions, ...faces.groups], true],
+    look: ['Where it looks', look.elements, false],
     knobs: ['How much it shows', knobsPanel(hello, connection), false],
     servos: ['Servos', [servos.element], false],
     recording: ['Record and replay', recordingPanel(hello, connection, replays), false],
@@ -33,7 +35,7 @@ export function buildPanels(hello, connection, visitor, replays, chooseJoint) {
     return element;
   });
   find('controls').replaceChildren(held.element, ...panels);
-  return { servos, held: held.show, release: faces.letGo };
+  return { servos, held: held.show, release: () => { faces.letGo(); look.letGo(); } };
 }
 
 function heldPanel(hello, connection) {
@@ -46,14 +48,14 @@ function heldPanel(hello, connection) {
     sessionStorage.setItem('token', connection.token);
     connection.send('hello', { version: hello.version, token: connection.token });
   } }, make('span', { className: 'quiet' }, 'To do more than look:'), token, make('button', {}, 'Enter'));
-  enter.hidden = !hello.needs_token;
   const element = make('div', { className: 'row' }, text, give, enter);
-  const show = (how) => {
-    give.hidden = how !== 'you';
-    text.textContent = { you: 'You have the controls.', other: 'Somebody else has the controls; anybody may halt.' }[how] ?? '';
+  const show = ({ held, needs_token: needsToken }) => {
+    give.hidden = held !== 'you';
+    enter.hidden = !needsToken;
+    text.textContent = { you: 'You have the controls.', other: 'Somebody else has the controls; anybody may halt.' }[held] ?? '';
     element.hidden = !text.textContent && enter.hidden;
   };
-  show(hello.controls);
+  show({ held: hello.controls, needs_token: hello.needs_token && !connection.allowed });
   return { element, show };
 }
 

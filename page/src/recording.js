@@ -6,8 +6,10 @@ export function recordingPanel(hello, connection, replays) {
   const state = hello.record;
   const on = state?.on ?? false;
   const record = make('button', { type: 'button', 'aria-pressed': String(on), onclick: () => connection.send('record', { on: record.getAttribute('aria-pressed') !== 'true' }) }, on ? 'Stop recording' : 'Record');
-  const token = connection.token ? `?token=${encodeURIComponent(connection.token)}` : '';
-  const download = make('a', { href: `recording${token}`, download: '' }, 'Download');
+  const download = make('a', { href: 'recording', download: '' }, 'Download');
+  download.addEventListener('click', () => { // with the token of that moment
+    download.href = connection.token ? `recording?token=${encodeURIComponent(connection.token)}` : 'recording';
+  });
   const said = make('p', { className: 'sent', role: 'status' });
   const replay = make('button', { type: 'button', onclick: async () => {
     try { await replays(); said.textContent = ''; } catch (error) { said.textContent = error.message; }

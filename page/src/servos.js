@@ -3,17 +3,18 @@
 import { make } from './dom.js';
 
 const HOT_C = 60;
-const COLUMNS = [
+const COLUMNS = [ // a column of which no servo of this head tells anything is left out
   ['asked °', (joint) => degrees(joint.goal_rad)],
   ['read °', (joint) => degrees(joint.present_rad)],
   ['age ms', (joint) => number(joint.age_s, 1000, 0)],
   ['°C', (joint) => number(joint.temperature_C, 1, 0)],
-  ['load', (joint) => number(joint.load ?? joint.load_fraction ?? joint.current_A, 1, 2)],
+  ['mA', (joint) => number(joint.current_mA, 1, 0)],
+  ['load %', (joint) => number(joint.load_percent, 1, 0)],
   ['V', (joint) => number(joint.voltage_V, 1, 1)],
-  ['errors', (joint) => number(joint.errors ?? joint.hardware_error, 1, 0)],
 ];
+const NOTHING = '–';
 
-const number = (value, by, digits) => (Number.isFinite(value) ? (value * by).toFixed(digits) : '–');
+const number = (value, by, digits) => (Number.isFinite(value) ? (value * by).toFixed(digits) : NOTHING);
 const degrees = (rad) => number(rad, 180 / Math.PI, 1);
 
 export class ServoTable {
@@ -21,10 +22,11 @@ export class ServoTable {
     this.body = make('tbody');
     this.summary = make('p', { className: 'quiet' });
     this.choose = choose;
-    const head = make('tr', {}, ...['joint', ...COLUMNS.map(([name]) => name), 'fault'].map((name) => make('th', { scope: 'col' }, name)));
-    this.table = make('table', {}, make('thead', {}, head), this.body);
+    this.head = make('tr');
+    this.table = make('table', {}, make('thead', {}, this.head), this.body);
     this.element = make('div', {}, this.summary, make('div', { className: 'scroll', tabIndex: 0, role: 'region', 'aria-label': 'Servos' }, this.table));
     this.facts = {};
+    this.titles = '';
   }
 
   begin(joints) {
@@ -34,11 +36,15 @@ export class ServoTable {
 
   /** The status document's `joints` and `faults`, once a second. */
   show(status) {
-    const faults = status.faults ?? {};
-    const rows = Object.entries(status.joints ?? {}).map(([name, joint]) => {
+    const faults = status.faults ?? {}, joints = Object.entries(status.joints ?? {});
+    const columns = COLUMNS.filter(([, of]) => joints.some(([, joint]) => of(joint) !== NOTHING));
+    const titles = ['joint', ...columns.map(([title]) => title), 'fault'];
+    if (titles.join() !== this.titles) this.head.replaceChildren(...titles.map((title) => make('th', { scope: 'col' }, title)));
+    this.titles = titles.join();
+    const rows = joints.map(([name, joint]) => {
       const { bus, id, model } = this.facts[name] ?? {};
       const title = `${model ?? ''} id ${id ?? '?'} on ${bus ?? '?'}; click: its curve`;
-      const row = make('tr', { title, onclick: () => this.choose(name) }, make('td', {}, name), ...COLUMNS.map(([, of]) => make('td', {}, of(joint))), make('td', {}, faults[name] ?? ''));
+      const row = make('tr', { title, onclick: () => this.choose(name) }, make('td', {}, name), ...columns.map(([, of]) => make('td', {}, of(joint))), make('td', {}, faults[name] ?? ''));
       row.className = faults[name] ? 'bad' : joint.temperature_C >= HOT_C ? 'hot' : '';
       return row;
     });

@@ -7,7 +7,8 @@ const QUIET_DB = -62, LOUD_DB = -12;
 const MARKS = { nod: '↓', shake: '↔', tilt: '⟋', smile: '☺', laugh: '☺', blink: '–', gaze_shift: '→', brow_raise: '^', mm_hm: '♪' };
 const ROWS = [['voice', 0.23], ['events', 0.19], ['pose', 0.28], ['joint', 0.30]];
 const AT_MOST_MS = 80; // a curve that scrolls needs no more
-const LEFT_PX = 54, RIGHT_PX = 8, FOOT_PX = 16;
+const LEFT_PX = 64, RIGHT_PX = 8, FOOT_PX = 16, LINE_PX = 12;
+const MOST_LINES = 3; // of a joint's name, left of its curve
 
 export class Timeline {
   #changed = false;
@@ -162,11 +163,12 @@ export class Timeline {
     const low = Math.min(...values), high = Math.max(...values);
     const middle = values.length ? (low + high) / 2 : 0, most = Math.max(0.03, (high - low) / 2 || 0);
     const y = (v) => top + tall / 2 - ((v - middle) / most) * (tall / 2 - 3);
-    this.#label(pen, 'asked', top + tall * 0.5, 'asked');
-    this.#label(pen, 'read', top + tall * 0.83, 'read');
+    this.#label(pen, 'asked', top + tall * 0.70, 'asked');
+    this.#label(pen, 'read', top + tall * 0.90, 'read');
     this.#line(pen, x, this.frames, read, y, 'read', 2.2);
     this.#line(pen, x, this.frames, asked, y, 'asked', 1.2);
-    this.#label(pen, this.jointNames[chosen] ?? 'joint', top + tall * 0.12);
+    const lines = wrapped(this.jointNames[chosen] ?? 'joint', (text) => pen.measureText(text).width, LEFT_PX - 6, MOST_LINES);
+    lines.forEach((line, i) => this.#label(pen, line, top + tall * 0.06 + LINE_PX * i));
     this.#scale(pen, x, most, top, tall);
   }
 
@@ -203,6 +205,22 @@ export class Timeline {
     pen.stroke();
     pen.globalAlpha = 1;
   }
+}
+
+/** A joint's name in lines no wider than `most`, broken at its underscores; what does not fit ends in an ellipsis. */
+export function wrapped(name, width, most, lines) {
+  const out = [];
+  for (const word of name.split(/(?<=_)/)) {
+    if (out.length && width(out.at(-1) + word) <= most) out.push(out.pop() + word);
+    else out.push(word);
+  }
+  const kept = out.slice(0, lines);
+  if (out.length > lines) kept.push(`${kept.pop()}…`);
+  return kept.map((line) => {
+    let text = line;
+    while (text.length > 2 && width(text) > most) text = `${text.replace(/…$/, '').slice(0, -1)}…`;
+    return text;
+  });
 }
 
 /** The largest terms for and against, in words. */

@@ -27,7 +27,6 @@ from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
@@ -36,6 +35,7 @@ from sfms_robot.errors import PacketError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.origin import host_problem, origin_problem
+from sfms_robot.viewer.compressed_files import CompressedFiles
 from sfms_robot.viewer.frame_record import Shown, frame_json, told_json
 from sfms_robot.viewer.visitor_commands import Command, parse_command
 from sfms_robot.viewer.visitors import COMMAND_S, MOST_MALFORMED, PERSON_BYTES_PER_S, PERSON_S, Visitor, Visitors
@@ -99,6 +99,7 @@ class PageServer:
         self._recording: Path | None = None
         self._over: bytes | None = None
         self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # packed pictures, and messages
+        self._files = CompressedFiles(STATIC)
         routes = [
             Route("/", self._index),
             Route("/runs/last", self._last_run),
@@ -107,15 +108,16 @@ class PageServer:
             Route("/robot/{file:path}", self._robot),
             Route("/face_landmarker.task", self._face_model),
             WebSocketRoute("/ws", self._visit),
-            Mount("/static", StaticFiles(directory=STATIC)),
+            Mount("/static", self._files),
         ]
         self.app: ASGIApp = guarded_app(Starlette(routes=routes))
 
     # --- what the run tells ---
 
     def prepare(self) -> None:
-        """Make what takes a second, in a thread; a page waits for it."""
+        """Make what takes a second, in threads; a page waits for it."""
         self._human = asyncio.create_task(asyncio.to_thread(_human_gz))
+        self._files.prepare()
 
     def begin(self, hello: Mapping[str, Any], new_scene: NewScene = no_scene) -> None:
         """A run begins: what a page has to know of it. What is left of the last one is forgotten.
@@ -169,7 +171,7 @@ class PageServer:
     # --- over HTTP ---
 
     async def _index(self, request: Request) -> Response:
-        return FileResponse(STATIC / "index.html", media_type="text/html")
+        return await self._files.get_response("index.html", request.scope)
 
     async def _last_run(self, request: Request) -> Response:
         if not self._began.is_set():

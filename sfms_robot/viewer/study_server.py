@@ -33,6 +33,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.face.human import load_human
 from sfms_robot.face.human_mesh import packed_human
 from sfms_robot.origin import is_loopback
+from sfms_robot.viewer.compressed_files import CompressedFiles
 from sfms_robot.viewer.page_child import bound, url
 from sfms_robot.viewer.page_process import Address
 from sfms_robot.viewer.page_server import guarded_app
@@ -92,7 +93,7 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
                 Route("/next", following, methods=["POST"]),
                 Route("/answer", answer, methods=["POST"]),
                 Route("/human/head.bin", human),
-                Mount("/people", StaticFiles(directory=PAGE)),
+                Mount("/people", CompressedFiles(PAGE)),
                 Mount("/clips", StaticFiles(directory=study.clips)),
             ],
             exception_handlers={ConfigError: _refused},

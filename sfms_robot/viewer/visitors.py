@@ -178,4 +178,4 @@ class Visitors:
             each.tell(self._controls_json(each))
 
     def _controls_json(self, visitor: Visitor) -> bytes:
-        return told_json(type="controls", held=self.controls(visitor))
+        return told_json(type="controls", held=self.controls(visitor), needs_token=not visitor.allowed)

@@ -64,7 +64,9 @@ def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
         (lambda told: told["type"] == "frame" and told["j"][0] > 0.2, {"type": "halt"}),
         (at(0.0, "halted"), {"type": "resume"}),
         (at(0.0, "starting"), {"type": "record", "on": False}),
-        (lambda told: told["type"] == "record" and told["seconds"], {"type": "seed", "seed": 7}),
+        (lambda told: told["type"] == "record" and told["seconds"], {"type": "knobs", "intensity": {"neck": 0.5}}),
+        (at(0.0), {"type": "calm", "rates": {"nod": 4.0}}),
+        (at(0.0), {"type": "seed", "seed": 7}),
         (lambda told: told["type"] == "hello" and told["seed"] == 7, {"type": "listener", "name": "nobody"}),
         (kind("error"), None),
         (at(1.0), {"type": "release"}),
@@ -83,6 +85,8 @@ def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
         assert "halted" in [change["state"] for change in first["states"]["changes"]]
         assert first["observers_detached"] == second["observers_detached"] == {}
         assert (pages._folder / "recording-1" / "run.mcap").stat().st_size > 1000
+    hello = next(told for told in visit.seen if told["type"] == "hello" and told["seed"] == 7)
+    assert hello["intensity"]["neck"] == 0.5 and hello["calmness"]["nod"] == 4.0  # what was turned stays turned
     errors = [told["error"] for told in visit.seen if told["type"] == "error"]
     assert len(errors) == 1 and "nobody" in errors[0]
 

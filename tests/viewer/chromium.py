@@ -144,12 +144,15 @@ class Page:
 class ServedRun:
     """A command of `sfms-robot` with `--view`, in a process of its own, once its first frame has come.
 
-    words: `run` or `replay`, and what follows it.
+    words: `run` or `replay`, and what follows it. view: where the page is.
+
+    Attributes:
+        url: of the page, without its token. token: "" where none is needed.
     """
 
-    def __init__(self, *words: str) -> None:
+    def __init__(self, *words: str, view: str = "0") -> None:
         call = "from sfms_robot.cli.main import main; main()"
-        command = [sys.executable, "-c", call, *words, "--view", "0"]
+        command = [sys.executable, "-c", call, *words, "--view", view]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ | {"COLUMNS": "200"}
         )
@@ -159,7 +162,7 @@ class ServedRun:
         self._reader.start()
         url = self._named.get(timeout=LIMIT_S)
         assert url is not None, f"the run ended: {''.join(self.said)}"
-        self.url = url
+        self.url, _, self.token = url.partition("?token=")
 
     def __enter__(self) -> ServedRun:
         try:

@@ -1,5 +1,7 @@
 """The page in a real browser, on a run of the emulated head."""
 
+import socket
+
 import numpy as np
 import pytest
 from chromium import Page, ServedRun, missing
@@ -154,6 +156,36 @@ def test_a_slider_moves_its_joint_and_the_other_stays(page):
     press(page, "Let go of the sliders")
 
 
+def test_where_it_looks_is_a_slider_of_the_keyboard_and_a_pad(page):
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    page.until("document.querySelector('[data-look=aside] input')")
+    page.driver.execute_script("document.querySelector('.pad').closest('details').open = true")
+    pan = page.ask(JOINTS).index("head_pan")
+    aside = page.driver.find_element("css selector", "[data-look=aside] input")
+    aside.send_keys(Keys.END)
+    page.until(f"page.newest.j[{pan}] > 0.3")  # the viewer's right is its left
+    pad = page.driver.find_element("css selector", ".pad")
+    ActionChains(page.driver).move_to_element_with_offset(pad, -pad.size["width"] // 2 + 5, 0).click().perform()
+    assert float(aside.get_attribute("value")) < -40
+    page.until(f"page.newest.j[{pan}] < -0.3")
+    press(page, "Let it look where it likes")
+    assert float(aside.get_attribute("value")) == 0
+    page.until(f"Math.abs(page.newest.j[{pan}]) < 0.2")
+
+
+def test_the_table_of_servos_has_no_column_that_says_nothing(page):
+    page.until("document.querySelectorAll('tbody tr').length === page.hello.joints.length")
+    titles, cells = page.ask(
+        "[[...document.querySelectorAll('thead th')].map((each) => each.textContent),"
+        " [...document.querySelectorAll('tbody tr')].map((row) => [...row.children].map((each) => each.textContent))]"
+    )
+    assert {"read °", "mA", "°C", "V"} <= set(titles) and "load %" not in titles  # XM430s tell a current
+    for column, title in enumerate(titles[:-1]):
+        assert any(row[column] != "–" for row in cells), title
+
+
 def test_it_comes_back_by_itself_and_after_a_reload(own_page, run):
     page = own_page.open(run.url)
     page.driver.execute_script(
@@ -190,6 +222,42 @@ def test_every_control_has_a_name_that_can_be_read_out(page):
         ".map((e) => e.outerHTML)"
     )
     assert nameless == []
+
+
+def own_address():
+    """An address of this machine that is no loopback one; None: it has none. Nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return None
+        return probe.getsockname()[0]
+
+
+def test_beyond_loopback_a_wrong_token_is_refused_in_words_and_the_right_one_does(tmp_path):
+    address = own_address()
+    if address is None:
+        pytest.skip("needs an address beyond loopback")
+    flag = f"--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE {address}"
+    head = ("--port", "sim", "--head", "op3_head", "--duration", "3000")
+    notice, form = "document.getElementById('notice').textContent", "document.querySelector('#controls form')"
+    with ServedRun("run", *head, view=f"{address}:0") as served, Page(tmp_path, flag) as page:
+        assert served.token and address in served.url
+        page.open(served.url)
+        page.until(f"{form}?.checkVisibility()")
+        press(page, "Neutral")
+        page.until(f"{notice}.includes('the token is needed')")
+        box = page.driver.find_element("css selector", "#controls form input")
+        box.send_keys("wrong\n")
+        page.until(f"{notice}.includes('not the one that was printed')")
+        assert page.ask("page.connection.held") == "nobody" and page.ask(f"{form}.checkVisibility()")
+        box.clear()
+        box.send_keys(served.token + "\n")
+        page.until(f"!{form}.checkVisibility()")
+        press(page, "Neutral")
+        page.until("page.connection.held === 'you'")
+        page.open(served.url)  # it remembers
+        page.until(f"page.connection.allowed && {form} && !{form}.checkVisibility()")
 
 
 def test_what_is_wrong_with_the_run_is_said(own_page, run):

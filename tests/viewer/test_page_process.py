@@ -1,5 +1,6 @@
 """The page on real sockets of this machine, in its process: told, worked, refused, and holding nothing up."""
 
+import gzip
 import json
 import queue
 import socket
@@ -18,6 +19,7 @@ from websockets.sync.client import connect
 from sfms_robot.errors import ConfigError, InputError, PortError
 from sfms_robot.viewer.frame_record import Picture, pack_picture, rare_json
 from sfms_robot.viewer.page_process import Address, PageProcess
+from sfms_robot.viewer.page_server import STATIC
 
 WAIT_S = 30.0  # for what is bound to come
 RARE = rare_json("listening", (), {}, None)
@@ -102,6 +104,23 @@ def test_the_page_and_its_protocol_are_there(page):
         assert (hello["over"], hello["needs_token"], hello["record"]) == (False, False, None)
         says(visitor, "ping", id=[1, "x"])
         assert heard(visitor) == {"type": "pong", "id": [1, "x"]}
+
+
+def test_its_files_come_compressed_to_who_takes_that_and_once(page):
+    plain = (STATIC / "chunk.js").read_bytes()
+    body, headers = got(page.url + "static/chunk.js", **{"Accept-Encoding": "gzip, br"})
+    assert headers["Content-Encoding"] == "gzip" and gzip.decompress(body) == plain and len(body) < len(plain) / 3
+    assert headers["Vary"] == "Accept-Encoding" and "javascript" in headers["Content-Type"]
+    again, untouched = got(page.url + "static/chunk.js")
+    assert again == plain and "Content-Encoding" not in untouched
+    part, _ = got(page.url + "static/chunk.js", **{"Accept-Encoding": "gzip", "Range": "bytes=0-9"})
+    assert part == plain[:10]
+    with pytest.raises(HTTPError) as known:
+        got(page.url + "static/chunk.js", **{"If-None-Match": headers["ETag"]})
+    with known.value:
+        assert known.value.code == 304
+    index, headers = got(page.url, **{"Accept-Encoding": "gzip"})
+    assert headers["Content-Encoding"] == "gzip" and b"<!doctype html>" in gzip.decompress(index)
 
 
 def test_pictures_go_to_all_and_come_back_in_the_last_run(page):

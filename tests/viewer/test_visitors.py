@@ -38,7 +38,7 @@ def test_who_does_something_first_has_the_controls_until_they_are_given_back() -
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.admit(a, SHOW)
     assert here.visitors.controls(a) == "you" and here.visitors.controls(b) == "other"
-    assert told(b) == [{"type": "controls", "held": "other"}]
+    assert told(b) == [{"type": "controls", "held": "other", "needs_token": False}]
     with pytest.raises(PacketError, match="somebody else holds the controls"):
         here.visitors.admit(b, SHOW)
     here.visitors.give(a)

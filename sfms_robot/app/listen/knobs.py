@@ -13,6 +13,7 @@ from sfms_robot.retarget.channel_mapping import Knobs
 
 STEP: Final = 0.1  # of a key
 MOST: Final = 2.0
+KNOB_KINDS: Final = ("intensity", "style")
 
 
 class Knob:
@@ -59,8 +60,7 @@ class LiveKnobs:
         self._lock = Lock()
         self._regions = tuple(head.regions)
         self.values = {
-            kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()}
-            for kind in ("intensity", "style")
+            kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()} for kind in KNOB_KINDS
         }
         self.now: Knobs = self._face.knobs()
         for kind, given in (("intensity", intensity), ("style", style)):

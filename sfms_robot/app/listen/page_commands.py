@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.listen.knobs import LiveKnobs
+from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs
 from sfms_robot.app.listen.named_expressions import NAMED_EXPRESSIONS
 from sfms_robot.config import Calmness, parse
 from sfms_robot.errors import InputError
@@ -88,7 +88,7 @@ def _express(reach: Reach, name: str, seconds: float) -> None:
 
 
 def _turn(reach: Reach, values: Mapping[str, Mapping[str, float]]) -> None:
-    for kind in ("intensity", "style"):
+    for kind in KNOB_KINDS:
         for region, value in values[kind].items():
             setattr(reach.knobs[region], kind, value)
 

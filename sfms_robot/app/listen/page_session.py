@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
-from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
 from sfms_robot.app.listen.page_commands import PageCommands, Reach
 from sfms_robot.app.listen.page_facts import page_facts
 from sfms_robot.app.listen.page_observer import PageObserver
@@ -65,6 +65,7 @@ class PageSession:
         self._person = Visitor()
         self._interrupt: Interrupt | None = None
         self._wanted: session.RunOptions | None = None
+        self._set: dict[str, Any] = {}  # options that visitors turned in the run that went on last
         self._chosen = threading.Event()
         self._commands = PageCommands(self._choose, self._feeds, self._person)
         page.answered_by(self._commands)
@@ -98,6 +99,7 @@ class PageSession:
             stack.callback(recorder.close)
             self._commands.reach = Reach(halt, puppet, knobs, calmness, feed.calm, recorder.record, self._release)
             stack.callback(self._out_of_reach)
+            stack.callback(self._remember, knobs)
             report = session.run(
                 options, _told_to(watcher, panel), source=self._source(stack), feed=feed,
                 observers=[watcher, recorder, *lonely, *observers], knobs=knobs,
@@ -110,7 +112,7 @@ class PageSession:
         return report
 
     def next(self, stay: bool) -> bool:
-        """Whether a visitor has chosen another run, which `options` now name.
+        """Whether a visitor has chosen another run, which `options` now name; what visitors turned stays turned.
 
         `stay`: while somebody looks that is waited for. Blocks until then, or until all have gone for `AWAY_S`.
         """
@@ -120,7 +122,7 @@ class PageSession:
             alone_s = 0.0 if self.page.visitors else alone_s + _LOOK_S
         if self._wanted is None:
             return False
-        self.options, self._wanted = self._wanted, None
+        self.options, self._wanted = replace(self._wanted, **self._set), None
         return True
 
     def _lonely(self, interrupt: Interrupt) -> list[EndsAlone]:
@@ -128,11 +130,21 @@ class PageSession:
         endless = self._choices and any(_taken_of_visitors(self.options).values())
         return [EndsAlone(self.page, interrupt)] if endless else []
 
+    def _remember(self, knobs: LiveKnobs) -> None:
+        reach = self._commands.reach
+        assert reach is not None
+        turned_to = {
+            kind: tuple(f"{name}={value}" for name, value in knobs.values[kind].items()) for kind in KNOB_KINDS
+        }
+        self._set = {**turned_to, "calmness": reach.calmness}
+
     def _out_of_reach(self) -> None:
         self._commands.reach = None
 
     def _listener(self, stack: ExitStack) -> NamedFeed:
-        feed = begin_listening(self.options.listener, self.options.seed, self.options.calmness, self.options.zenoh)
+        feed = begin_listening(
+            self.options.listener, self.options.seed, self.options.calmness, self.options.zenoh, self.options.engine
+        )
         stack.callback(feed.close)
         return feed
 

@@ -1,0 +1,54 @@
+"""The page's files as browsers take them: compressed, each once, by a thread."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+from pathlib import Path
+from typing import Final
+
+from starlette.datastructures import Headers
+from starlette.responses import FileResponse, Response
+from starlette.staticfiles import StaticFiles
+from starlette.types import Scope
+
+_LEVEL: Final = 6
+_WITH_GZIP: Final = "gzip"
+_OF_PLAIN: Final = ("content-length", "accept-ranges")  # headers that are true of the plain file alone
+
+
+class CompressedFiles(StaticFiles):
+    """The files of a folder; gzip for who takes it, and the plain file for who does not or asks for a part of it."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(directory=folder)
+        self._folder = folder
+        self._packed: dict[tuple[str, float], asyncio.Task[bytes]] = {}  # by file and when it was changed
+
+    def prepare(self) -> None:
+        """Compress what lies in the folder itself, ahead of who asks; what lies deeper waits until it is asked for."""
+        for file in sorted(self._folder.iterdir()):
+            if file.is_file():
+                self._gzip(file)
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        plain = await super().get_response(path, scope)
+        asked = Headers(scope=scope)
+        if not isinstance(plain, FileResponse) or plain.status_code != 200 or scope["method"] != "GET":
+            return plain
+        plain.headers["Vary"] = "Accept-Encoding"
+        if _WITH_GZIP not in asked.get("accept-encoding", "") or "range" in asked:
+            return plain
+        packed = await self._gzip(Path(plain.path))
+        headers = {name: value for name, value in plain.headers.items() if name not in _OF_PLAIN}
+        return Response(packed, headers=headers | {"Content-Encoding": _WITH_GZIP})
+
+    def _gzip(self, file: Path) -> asyncio.Task[bytes]:
+        key = (str(file), file.stat().st_mtime)
+        if key not in self._packed:
+            self._packed[key] = asyncio.create_task(asyncio.to_thread(_compressed, file))
+        return self._packed[key]
+
+
+def _compressed(file: Path) -> bytes:
+    return gzip.compress(file.read_bytes(), _LEVEL, mtime=0)
