@@ -57,6 +57,12 @@ def test_joints_are_shown_as_they_are_asked_and_read_and_their_faults_by_name():
     assert (shown["s"], shown["w"], shown["db"], shown["talk"]) == ("degraded", ["jaw"], None, False)
 
 
+def test_a_position_that_is_old_is_not_shown_as_read():
+    page, watcher = watching()
+    watcher.tick(tick(0.0, {"yaw": Reading(0.11, 0.9), "jaw": Reading(0.12, 1.1)}))
+    assert page.pictures[0]["r"] == [0.11, None] and page.pictures[0]["u"] == [0.11, 0.2]
+
+
 def test_the_person_is_shown_by_level_and_by_whether_they_talk():
     page, watcher = watching()
     loud = np.tile(np.array([0.3, -0.3], np.float32), 320)

@@ -14,8 +14,9 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_HZ, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, Floats, ListenerEvent, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
+from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
@@ -113,8 +114,9 @@ class PageObserver:
                 self._page.say("event", **_event(event))
 
     def _read_rad(self, seen: Tick) -> Floats:
-        read = (seen.readings[joint].position_rad if joint in seen.readings else None for joint in self._joints)
-        return np.fromiter((math.nan if each is None else each for each in read), np.float32, len(self._joints))
+        """(J,) NaN where nothing was read of late: legs of a platform read at other times fit no pose of today's."""
+        read = (_position_rad(seen.readings.get(joint)) for joint in self._joints)
+        return np.fromiter(read, np.float32, len(self._joints))
 
     def _rare_json(self, seen: Tick) -> bytes:
         faults = {joint: reading.fault for joint, reading in seen.readings.items() if reading.fault}
@@ -122,6 +124,12 @@ class PageObserver:
         if key != self._rare[0]:
             self._rare = (key, rare_json(*key))
         return self._rare[1]
+
+
+def _position_rad(reading: Reading | None) -> float:
+    if reading is None or reading.position_rad is None or reading.age_s > AWAY_S:
+        return math.nan
+    return reading.position_rad
 
 
 def _drained(waiting: deque[T]) -> Iterator[T]:
