@@ -74,7 +74,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     with _interruptions(patient=group.size > 1) as pressed:
         while not position.finished:
             rate = _set_rates(job, base, position.step)
-            loss, norm, interrupted = _step(gradients, position.step, generator, pressed())
+            loss, norm, interrupted = make_step(gradients, position.step, generator, pressed())
             smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
             position = replace(position, step=position.step + 1, loss=smooth)
             looked = _look_is_due(job, position.step)
@@ -125,10 +125,12 @@ def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
     return base[0][0] * share
 
 
-def _step(gradients: Gradients, step: int, generator: torch.Generator, pressed: bool) -> tuple[float, float, bool]:
+def make_step(
+    gradients: Gradients, step: int, generator: torch.Generator, pressed: bool = False
+) -> tuple[float, float, bool]:
     """One update of the weights; returns loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
 
-    Nothing is updated when one is not finite.
+    Raises ModelError when loss or norm is not finite, and nothing is updated then; GroupError.
     """
     job, file = gradients.job, gradients.file
     for one in job.optimizers:

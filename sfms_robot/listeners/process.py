@@ -51,10 +51,12 @@ from sfms_robot.config.hop import HopChoice, Latencies, choose_hop
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.lateness import Lateness
 from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
 
 MOST_WAITING: Final = FRAME_HZ // 2  # frames
+CATCH_UP: Final = 0.5  # frames that must be waiting less after each, while it catches up: twice the person's pace
 NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
 START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
 CLOSE_LIMIT_S: Final = 0.2
@@ -95,6 +97,7 @@ class ListenerProcess:
         self._name, self._seed, self._calmness, self._wanted = name, seed, calmness, engine
         self._engine: str | None = None
         self._step_ms = Quantiles()
+        self._lateness = Lateness()
         self._skipped = 0
         self._restarted_s: list[float] = []
         self._restarts = 0
@@ -156,15 +159,16 @@ class ListenerProcess:
 
     @property
     def lost(self) -> bool:
-        """Hung, being started anew, or given up."""
-        return self._state in ("hung", "given up") or (self._restarts > 0 and self._state != "listening")
+        """Hung, being started anew, given up, or always too late."""
+        away = self._state in ("hung", "given up") or (self._restarts > 0 and self._state != "listening")
+        return away or self._lateness.lasting
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` (starting, building, listening, hung, given up), `engine` in words, `restarts`, `skipped_frames`,
-        `step_ms`, `hop` and `budget_ms` (see `config.hop`), None as long as no hop was chosen.
+        """`state` (starting, building, listening, late, hung, given up), `engine` in words, `restarts`,
+        `skipped_frames`, `step_ms`, `hop` and `budget_ms` (see `config.hop`), None as long as no hop was chosen.
         """
         return {
-            "state": self._state,
+            "state": "late" if self._state == "listening" and self._lateness.lasting else self._state,
             "engine": self._engine,
             "restarts": self._restarts,
             "skipped_frames": self._skipped,
@@ -202,6 +206,7 @@ class ListenerProcess:
                 self._state = "listening"
             if kind == "plan":
                 self._step_ms.add(number)
+                self._lateness.came(value, now_s)
                 return value  # type: ignore[no-any-return]
         return None
 
@@ -264,6 +269,7 @@ class ListenerProcess:
         self._restarted_s.append(now_s)
         self._restarts += 1
         self._state, self._waits_since_s, self._unanswered, self._probe = "starting", None, 0, None
+        self._lateness = Lateness()
         self._child = _Child(self._name, self._seed + self._restarts, self._calmness, self._wanted)
 
 
@@ -483,7 +489,8 @@ def calmed(listener: Listener, memory: Any, inbox: Inbox) -> Any:
 class Inbox:
     """Frames in the order in which they came, until None does; the newest alone when too many are waiting.
 
-    Those that came before the first one was asked for do not count as too many.
+    Those that came before the first one was asked for do not count as too many, as long as they become fewer at the
+    pace of somebody who catches up.
 
     Attributes:
         skipped: frames left out before the last one given.
@@ -493,8 +500,8 @@ class Inbox:
     def __init__(self, most: int = MOST_WAITING) -> None:
         self._queue: queue.SimpleQueue[SpeakerFrame | None] = queue.SimpleQueue()
         self._most = most
+        self._allowed: float | None = None  # to wait, while it catches up with those of before
         self._waiting: deque[SpeakerFrame | None] = deque()
-        self._kept_up = False  # at least once
         self.skipped = 0
         self.calmness: Calmness | None = None
 
@@ -509,9 +516,9 @@ class Inbox:
             self._waiting.append(self._queue.get())
         if None in self._waiting:
             return None
-        too_many = len(self._waiting) > self._most
-        self._kept_up |= not too_many
-        self.skipped = len(self._waiting) - 1 if too_many and self._kept_up else 0
+        waiting = len(self._waiting)
+        self._allowed = waiting + self._most if self._allowed is None else self._allowed - CATCH_UP
+        self.skipped = waiting - 1 if waiting > max(self._most, self._allowed) else 0
         for _ in range(self.skipped):
             self._waiting.popleft()
         return self._waiting.popleft()

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.frames import Plan, SpeakerFrame
+from sfms_robot.listeners.lateness import Lateness
 from sfms_robot.listeners.process import HUNG_S, MOST_WAITING, Inbox, calmed
 from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
@@ -31,6 +32,7 @@ class ListenerThread:
         self._inbox = Inbox()
         self._plans: queue.SimpleQueue[Plan] = queue.SimpleQueue()
         self._step_ms = Quantiles()
+        self._lateness = Lateness()
         self._pushed = self._taken = 0  # frames; each is counted by one thread alone
         self._dropped = self._skipped = 0
         self._since_s = 0.0  # nothing was waiting, or a frame was taken
@@ -59,6 +61,7 @@ class ListenerThread:
         plans = []
         while not self._plans.empty():
             plans.append(self._plans.get_nowait())
+            self._lateness.came(plans[-1], now_s)
         taken = self._taken
         if taken == self._pushed or taken != self._seen_taken:
             self._seen_taken, self._since_s = taken, now_s
@@ -74,13 +77,13 @@ class ListenerThread:
 
     @property
     def lost(self) -> bool:
-        """Hung, or failed."""
-        return self._state != "listening"
+        """Hung, failed, or always too late."""
+        return self._state != "listening" or self._lateness.lasting
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` (listening, hung, or failed and how), `restarts` 0, `skipped_frames`, `step_ms` p50 and p99."""
+        """`state` (listening, late, hung, or failed and how), `restarts` 0, `skipped_frames`, `step_ms` p50, p99."""
         return {
-            "state": self._state,
+            "state": "late" if self._state == "listening" and self._lateness.lasting else self._state,
             "restarts": 0,
             "skipped_frames": self._dropped + self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),

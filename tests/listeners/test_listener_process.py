@@ -16,6 +16,7 @@ from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
 from sfms_robot.listeners import process
 from sfms_robot.listeners.process import (
+    CATCH_UP,
     MOST_WAITING,
     RESTARTS,
     REVIEW_S,
@@ -65,6 +66,18 @@ def test_what_was_said_before_the_listener_was_ready_is_heard_in_full():
     sent = frames(5 * MOST_WAITING)
     inbox = filled(sent)
     assert [inbox.next() for _ in sent] == sent and inbox.skipped == 0
+
+
+def test_one_that_never_catches_up_gives_up_what_was_said_before():
+    """Each frame takes it as long as the person takes for one: what waits does not become less."""
+    sent = frames(5 * MOST_WAITING)
+    inbox, left_out = filled(sent), 0
+    for count in range(3 * MOST_WAITING):
+        inbox.next()
+        left_out += inbox.skipped
+        assert (left_out > 0) == (count * CATCH_UP > MOST_WAITING)
+        inbox.put(sent[0])
+    assert len(inbox._waiting) <= MOST_WAITING
 
 
 def test_the_end_waits_for_nothing():

@@ -8,8 +8,9 @@ of its own says more. Nothing is imported before it is measured: a shell that co
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.errors import ConfigError, MissingExtra
@@ -71,6 +72,14 @@ BENCHES: Final[Mapping[str, Bench]] = {
         "view_bench:measure", "a page with three who look, beside the same run without; a halt from click to wire",
         in_all=False, takes=("say",),
     ),
+    "throttle": Bench(
+        "throttle_bench:measure", "a run on a quarter of one core, beside the same on all of this machine; exit code 1 "
+        "where a command leaves its limits or the states are not those of docs/safety.md", takes=("say",),
+    ),
+    "train": Bench(
+        "train_bench:measure", "a step of each stage of training, beside plain products of as many operations",
+        takes=("say",),
+    ),
     "serve": Bench(
         "serve_bench:measure", "heads that one server answers in time, beside one head at a time", in_all=False,
         takes=("say",),
@@ -109,14 +118,28 @@ def run_bench(name: str, given: Mapping[str, Any], say: Say) -> Told:
             raise ConfigError(f"--{option} {given[option]}: only {those} takes it")
     if name != ALL:
         return _measured(chosen[name], given, say)
+    return _all(chosen, say)
+
+
+def _all(chosen: Mapping[str, Bench], say: Say) -> Told:
+    """The rows of these, one after the other; one that cannot be measured here is left out, and that is told."""
+    from sfms_robot.app.bench.measure import Told
+
     rows: dict[str, Any] = {}
+    failed: list[str] = []
     for key, one in chosen.items():
         say(key)
+        began_s = time.monotonic()
         try:
-            rows |= _measured(one, {}, say).figures
-        except MissingExtra as error:
+            told = _measured(one, {}, say)
+        except (MissingExtra, ConfigError) as error:
             say(f"{key} is left out: {error}")
-    return Told.of_rows(rows)
+            continue
+        rows |= {name: each for name, each in told.figures.items() if isinstance(each, Mapping) and "median" in each}
+        failed += [] if told.passed else [f"{key}: {line}" for line in told.lines]
+        say(f"{key} took {time.monotonic() - began_s:.0f} s")
+    found = Told.of_rows(rows)
+    return replace(found, lines=failed, passed=not failed)
 
 
 def _measured(bench: Bench, given: Mapping[str, Any], say: Say) -> Told:

@@ -1,9 +1,10 @@
 """`train ... --dry-run`: one step of every stage of a training file, on made-up frames, and what all of it would take.
 
-Operations, bytes and calls of the step are counted, not guessed; the step is made here in pieces small enough for this
-machine. A GPU's time for it is then the longest of three: operations at a share of its peak, bytes at a share of its
-bandwidth, calls at what one costs the processor that makes them; and after it the random numbers, which are drawn on
-the processor (`learning.job`). The shares are assumptions, told with the figures.
+Operations, bytes and calls are counted, not guessed: of a piece of the batch that is small enough for this machine,
+forward and backward, as often as the batch has such pieces, and of the update of all weights. A GPU's time for a step
+is then the longest of three: operations at a share of its peak, bytes at a share of its bandwidth, calls at what one
+costs the processor that makes them; and after it the random numbers, which are drawn on the processor
+(`learning.job`). The shares are assumptions, told with the figures.
 """
 
 from __future__ import annotations
@@ -71,13 +72,13 @@ def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
 
     Blocks: up to minutes at the paper's sizes on a small machine, most of it backward passes.
     """
-    stages = [_measured(name, job, steps) for name, job, steps in _jobs(settings)]
+    stages = [_measured(name, job, steps) for name, job, steps in jobs_of(settings)]
     hours = {gpu: round(sum(stage["hours"][gpu] for stage in stages), 2) for gpu in GPUS}
     return {"stages": stages, "hours": hours, "assumed": ASSUMED, "rows": [_row(stage) for stage in stages]}
 
 
-def _jobs(settings: config.Training | config.ArigTraining) -> Iterator[tuple[str, Job, int]]:
-    """Name, job and steps of each stage, on weights as they begin."""
+def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[str, Job, int]]:
+    """Name, job and steps of each stage, on weights as they begin and made-up frames."""
     cpu = torch.device("cpu")
     torch.manual_seed(settings.seed)
     listener = settings.listener
@@ -128,25 +129,26 @@ def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
 
 
 def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
+    """One piece of a batch and the update after it, made here; the pieces of a batch are all alike."""
     batch, window = job.phase.batch, job.frames_per_step // job.phase.batch
-    shares = [count for count in range(1, batch + 1) if batch % count == 0]
-    pieces = next((count for count in shares if batch // count * window <= MOST_FRAMES), batch)
+    samples = max((n for n in range(1, batch + 1) if batch % n == 0 and n * window <= MOST_FRAMES), default=1)
+    pieces = batch // samples
+    piece = replace(job, phase=job.phase.model_copy(update={"batch": samples}))
     job.model.train()
     began_s = time.perf_counter()
     with TemporaryDirectory() as scratch:
-        gradients = Gradients(job, ProcessGroup(), pieces, Path(scratch))
+        gradients = Gradients(piece, ProcessGroup(), 1, Path(scratch))
         with OperationCount() as count:
             loss = gradients.of(0, torch.Generator().manual_seed(job.seed))
-    gradients_calls = count.calls / pieces  # on a GPU the batch is one piece
     with OperationCount() as update:
         for one in job.optimizers:
             one.step()
     half = job.phase.precision == "bf16"
     figures = {
-        "operations": count.operations + update.operations,
-        "bytes": count.bytes + update.bytes,
-        "calls": round(gradients_calls + update.calls),
-        "drawn": count.drawn,
+        "operations": pieces * count.operations + update.operations,
+        "bytes": pieces * count.bytes + update.bytes,
+        "calls": count.calls + update.calls,  # on a GPU the batch is one piece
+        "drawn": pieces * count.drawn,
     }
     return {
         "stage": name,
