@@ -35,4 +35,3 @@ def test_a_step_costs_the_same_however_small_the_pieces_that_are_made_of_it(monk
     assert (found["pieces"], found["batch"], found["steps"]) == (pieces, 4, 6)
     assert found["operations"] == pytest.approx(whole["operations"], rel=0.1)
     assert found["drawn"] == pytest.approx(whole["drawn"], rel=0.1)
-    assert found["hours"]["A100"] > 0
