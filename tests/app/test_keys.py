@@ -9,6 +9,8 @@ import termios
 
 import pytest
 
+from sfms_robot.app.listen.keys import Keyboard
+
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo terminals here")
 LIMIT_S = 60.0  # only what never comes waits for so long,
 MOST = 50_000  # or until this much else was shown
@@ -129,6 +131,17 @@ def test_however_it_ends_the_terminal_is_as_it_was(note, how, code):
         shown.until(SHOW)
         assert shown.process.wait(LIMIT_S) in (code, -signal.SIGINT)
         assert termios.tcgetattr(shown.far) == shown.usual
+
+
+def test_a_keyboard_that_was_left_is_not_taken_again():
+    """Its thread may be about to, while a signal ends the program."""
+    near, far = os.openpty()
+    usual, keys = termios.tcgetattr(far), Keyboard(far)
+    assert keys.take() and termios.tcgetattr(far) != usual
+    keys.leave()
+    assert not keys.take() and termios.tcgetattr(far) == usual
+    os.close(near)
+    os.close(far)
 
 
 def test_a_suspended_run_leaves_the_terminal_and_takes_it_again():

@@ -25,17 +25,21 @@ _LOCAL, _CONTROL = 3, 6  # of what `tcgetattr` gives
 
 
 class Keyboard:
-    """The terminal behind a file descriptor: `take` for single keys, `give_back` for lines. From any thread."""
+    """The terminal behind a file descriptor: `take` for single keys, `give_back` for lines. From any thread.
+
+    `leave` gives it back for good: a thread that was about to take it does not.
+    """
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._usual: list[Any] | None = None
+        self._left = False
         self._lock = threading.RLock()  # a signal handler may interrupt who holds it
 
     def take(self) -> bool:
         """Single keys from now on; False in the background. Asked again and again: a shell may set it otherwise."""
         with self._lock:
-            if in_background(self._fd):
+            if self._left or in_background(self._fd):
                 return False
             found = termios.tcgetattr(self._fd)
             if found[_LOCAL] & termios.ICANON:
@@ -53,6 +57,11 @@ class Keyboard:
             if self._usual is not None and not in_background(self._fd):
                 termios.tcsetattr(self._fd, termios.TCSANOW, self._usual)
             self._usual = None
+
+    def leave(self) -> None:
+        with self._lock:
+            self._left = True
+            self.give_back()
 
     @contextmanager
     def lent(self) -> Iterator[None]:
@@ -111,5 +120,5 @@ def reading_keys(found: Keyboard, pressed: Callable[[str], object]) -> Iterator[
         os.close(theirs)
         if thread.ident is not None:
             thread.join(JOIN_S)
-        found.give_back()
+        found.leave()
         os.close(ours)
