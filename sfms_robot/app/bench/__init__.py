@@ -51,7 +51,8 @@ BENCHES: Final[Mapping[str, Bench]] = {
     ),
     "lead": Bench("lead:lead", "how late joints are, beside the same with no lead", takes=("head",)),
     "listener": Bench(
-        "listener_bench:listener", "a plan, beside plain fp32 and the time there is for it", takes=("budget",)
+        "listener_bench:listener", "a frame on every engine, first plan, memory, beside eager fp32 torch",
+        takes=("budget",),
     ),
     "memory": Bench(
         "memory_bench:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,

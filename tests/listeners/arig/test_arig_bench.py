@@ -4,6 +4,7 @@ import pytest
 from tiny_arig import arig_listener, talk
 
 from sfms_robot.app.bench import listener_bench as bench
+from sfms_robot.app.bench.engine_bench import TURN_HOPS, Stream, take_turns
 from sfms_robot.app.bench.in_run import in_run
 from sfms_robot.app.bench.samplers import WAYS, samplers
 from sfms_robot.listeners import checkpoint
@@ -31,9 +32,12 @@ def test_the_fast_path_is_compared_frame_by_frame():
 @pytest.mark.parametrize("minutes", [1, 60])
 def test_a_memory_minutes_old_goes_on(minutes: int):
     listener = arig_listener()
-    memory = bench._after_minutes(listener, minutes)
-    assert memory.frames == minutes * 1500
-    assert len(bench._steps(listener, memory, talk(5), 12)) == 12
+    memory = bench._later(listener, listener.start(0), talk(5), minutes)
+    assert memory.frames == minutes * 1500 and memory.context.any()
+    stream = Stream(listener, memory)
+    take_turns({"one": stream}, talk(5), turns=3)
+    assert len(stream.frame_ms) == len(stream.planning_ms) == 3 * TURN_HOPS and not stream.hearing_ms
+    assert stream.figures(stream)["ratio"] == 1
 
 
 @pytest.mark.slow
