@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 CONFIG = "config.yaml"
 WEIGHTS = "model.safetensors"
 BFLOAT16 = "BF16"
+PIECE_BYTES = 16 * 2**20
 LARGEST = 1e6  # of a tensor; a speed nobody measured is stored as this, weights are below 200, and 1e30 overflows
 
 
@@ -69,52 +70,76 @@ def load_weights(file: Path, module: nn.Module) -> None:
 
 
 def read_weights(file: Path, wanted: Mapping[str, tuple[tuple[int, ...], bool]] | None = None) -> dict[str, Array]:
-    """Tensors of a safetensors file by name, real numbers in 32 bits: plain numbers, no code is run.
+    """All `stored_tensors` of a file, by name."""
+    return dict(stored_tensors(file, wanted))
+
+
+def stored_tensors(
+    file: Path, wanted: Mapping[str, tuple[tuple[int, ...], bool]] | None = None
+) -> Iterator[tuple[str, Array]]:
+    """Names and tensors of a safetensors file, one after another, real numbers in 32 bits: plain numbers, no code is
+    run. Whoever keeps none of them needs little more memory than the largest takes.
 
     `wanted`: shape of every tensor, and whether it is of real numbers; None: whatever there is.
 
     Raises ModelError when the file or a tensor is missing, cut off, of another shape or type, not finite, or of values
-    that no trained model has.
+    that no trained model has; where names are wrong, before the first tensor.
     """
     if not file.is_file():
         raise ModelError(f"{file}: no such weights file")
     try:
         with safe_open(file, "np") as stored:
             kinds = {name: stored.get_slice(name).get_dtype() for name in stored.keys()}  # noqa: SIM118, no mapping
-            found = {name: _plain(stored.get_tensor(name)) for name, kind in kinds.items() if kind != BFLOAT16}
-        if len(found) < len(kinds):
-            found |= _read_bfloat16(file)
+        for name in wanted or ():
+            if name not in kinds:
+                raise ModelError(f"{file}: tensor {name} is missing; the weights belong to another configuration")
+        for name in kinds:
+            if wanted is not None and name not in wanted:
+                raise ModelError(f"{file}: tensor {name} is not part of the configured model")
+        for name, value in _read(file, kinds):
+            _check(file, name, value, None if wanted is None else wanted[name])
+            yield name, value
     except (SafetensorError, OSError, TypeError) as error:
         raise ModelError(f"{file}: not a readable safetensors file: {error}") from error
-    for name, (shape, real) in (wanted or {}).items():
-        if name not in found:
-            raise ModelError(f"{file}: tensor {name} is missing; the weights belong to another configuration")
-        if found[name].shape != shape:
-            raise ModelError(f"{file}: tensor {name} has shape {found[name].shape}, the configuration needs {shape}")
-        if (found[name].dtype.kind == "f") != real:
+
+
+def _check(file: Path, name: str, value: Array, wanted: tuple[tuple[int, ...], bool] | None) -> None:
+    if wanted is not None:
+        shape, real = wanted
+        if value.shape != shape:
+            raise ModelError(f"{file}: tensor {name} has shape {value.shape}, the configuration needs {shape}")
+        if (value.dtype.kind == "f") != real:
             needs = "float32" if real else "int64"
-            raise ModelError(f"{file}: tensor {name} is of {found[name].dtype}, the model needs {needs}")
-    for name, value in found.items():
-        if wanted is not None and name not in wanted:
-            raise ModelError(f"{file}: tensor {name} is not part of the configured model")
-        if value.dtype.kind != "f" or not value.size:
-            continue
-        largest = float(max(value.max(), -value.min()))  # NaN where there is any
-        if not math.isfinite(largest):
-            raise ModelError(f"{file}: tensor {name} holds values that are not finite")
-        if largest > LARGEST:
-            raise ModelError(f"{file}: tensor {name} holds {largest:g}, no trained model is above {LARGEST:g}")
-    return found
+            raise ModelError(f"{file}: tensor {name} is of {value.dtype}, the model needs {needs}")
+    if value.dtype.kind != "f" or not value.size:
+        return
+    largest = float(max(value.max(), -value.min()))  # NaN where there is any
+    if not math.isfinite(largest):
+        raise ModelError(f"{file}: tensor {name} holds values that are not finite")
+    if largest > LARGEST:
+        raise ModelError(f"{file}: tensor {name} holds {largest:g}, no trained model is above {LARGEST:g}")
 
 
-def _read_bfloat16(file: Path) -> dict[str, Array]:
+def _read(file: Path, kinds: Mapping[str, str]) -> Iterator[tuple[str, Array]]:
+    """Tensors, opening the file anew every `PIECE_BYTES`: it is mapped, and what was read stays resident until then."""
+    names = [name for name, kind in kinds.items() if kind != BFLOAT16]
+    while names:
+        with safe_open(file, "np") as stored:
+            left = PIECE_BYTES
+            while names and left > 0:
+                value = stored.get_tensor(name := names.pop(0))
+                left -= value.nbytes
+                yield name, _plain(value)
+    if BFLOAT16 in kinds.values():
+        yield from _read_bfloat16(file)
+
+
+def _read_bfloat16(file: Path) -> Iterator[tuple[str, Array]]:
     """Tensors of a kind that numpy does not know: the upper half of a 32-bit number."""
-    out = {}
     for name, stored in deserialize(file.read_bytes()):  # type: ignore[no-untyped-call]
         if stored["dtype"] == BFLOAT16:
             upper = np.frombuffer(stored["data"], np.uint16).astype(np.uint32) << 16
-            out[name] = upper.view(np.float32).reshape(stored["shape"])
-    return out
+            yield name, upper.view(np.float32).reshape(stored["shape"])
 
 
 def _plain(value: Array) -> Array:

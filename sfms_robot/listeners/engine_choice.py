@@ -42,7 +42,7 @@ def engine_of(
     graphs = _graphs(folder, settings, wanted, precision)
     if graphs is not None:
         file = folder / checkpoint.WEIGHTS
-        return OnnxEngine(folder, graphs, lambda: checkpoint.read_weights(file, graphs.wanted), threads or 1)
+        return OnnxEngine(folder, graphs, lambda: checkpoint.stored_tensors(file, graphs.wanted), threads or 1)
     if find_spec("torch") is None:
         raise MissingExtra(f"{folder}: no graphs for engine onnx, and torch is not installed: pip install torch")
     engine = torch_engine()

@@ -8,7 +8,7 @@ what it takes to read its weights. Those are rounded per output row as they are 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,12 +29,13 @@ class OnnxEngine:
     Args:
         folder: of the listener, for messages.
         graphs: of its networks.
-        weights: by their name in model.safetensors; asked for again whenever the number of threads changes.
+        weights: tensors of model.safetensors with their names, one after another; asked for again whenever the number
+            of threads changes.
         threads: that each network may use.
     """
 
     def __init__(
-        self, folder: Path, graphs: GraphFolder, weights: Callable[[], Mapping[str, Array]], threads: int = 1
+        self, folder: Path, graphs: GraphFolder, weights: Callable[[], Iterable[tuple[str, Array]]], threads: int = 1
     ) -> None:
         self._folder, self._graphs, self._weights = folder, graphs, weights
         self.tensors: Mapping[str, Array] = {}
@@ -62,9 +63,12 @@ class OnnxEngine:
         """Use so many from now on; takes as long as loading."""
         if threads == self._threads:
             return
-        weights = dict(self._weights())
-        self.tensors = {name: value for name, value in weights.items() if value.size <= KEPT}
-        values = _Values(weights, self._graphs.graphs.values())
+        values, small = _Values(self._graphs.graphs.values()), {}
+        for name, weight in self._weights():
+            values.add(name, weight)
+            if weight.size <= KEPT:
+                small[name] = weight
+        self.tensors = small
         for name, graph in self._graphs.graphs.items():
             self._sessions[name] = _session(self._folder, name, graph, values, threads)
             self._inputs[name] = [each.name for each in self._sessions[name].get_inputs()]
@@ -72,23 +76,24 @@ class OnnxEngine:
 
 
 class _Values:
-    """Weights as onnxruntime takes them, each made once; one in integers leaves nothing of itself behind."""
+    """Weights as onnxruntime takes them; of one in integers only those are kept."""
 
-    def __init__(self, weights: dict[str, Array], graphs: Any) -> None:
-        self._weights = weights
-        self._made: dict[str, Any] = {}
+    def __init__(self, graphs: Collection[Graph]) -> None:
+        self._real = {name for graph in graphs for name in graph.weights if name not in graph.integers}
         self._integers = {name for graph in graphs for name in graph.integers}
+        self._made: dict[str, Any] = {}
+
+    def add(self, name: str, weight: Array) -> None:
+        """Take one, in all forms that graphs want of it."""
+        if name in self._real:
+            self._made[name] = _value(weight)
+        if name in self._integers:
+            self._made[f"{name}.int8"], self._made[f"{name}.scale"] = map(_value, integers(weight))
 
     def of(self, graph: Graph) -> tuple[list[str], list[Any]]:
         """Names of the initialisers of a graph, and their values."""
         names = [name for name in graph.weights if name not in graph.integers]
-        for name in graph.integers:
-            names += [f"{name}.int8", f"{name}.scale"]
-            if f"{name}.int8" not in self._made:
-                self._made[f"{name}.int8"], self._made[f"{name}.scale"] = map(_value, integers(self._weights[name]))
-        for name in names:
-            if name not in self._made:
-                self._made[name] = _value(self._weights[name])
+        names += [f"{name}.{part}" for name in graph.integers for part in ("int8", "scale")]
         return names, [self._made[name] for name in names]
 
 

@@ -17,7 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
-from sfms_robot.config import Coupling, Head, drives
+from sfms_robot.config import Coupling, Head
+from sfms_robot.config.drives import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, MOTION_DIM, Doubles, Floats
 from sfms_robot.retarget.compile import Indices, Program

@@ -19,7 +19,8 @@ from typing import Final
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from sfms_robot.config import Expression, Head, drives
+from sfms_robot.config import Expression, Head
+from sfms_robot.config.drives import drives
 from sfms_robot.frames import MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import ChannelMapping
 

@@ -1,5 +1,9 @@
+import tracemalloc
+
+import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save_file as save_numpy
 from safetensors.torch import load_file, save_file
 from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
 
@@ -109,3 +113,17 @@ def test_a_learned_placement_carries_its_scores(tmp_path):
     names = listener.model.state_dict()
     assert any(name.startswith("tokenizer.score.") for name in names)
     assert not any(name.startswith("tokenizer.score.") for name in SfmsModel(tiny_settings()).state_dict())
+
+
+def test_tensors_are_read_one_at_a_time(tmp_path):
+    """Whoever keeps none of them needs memory for one."""
+    megabyte = np.zeros(2**18, np.float32)
+    save_numpy({f"layer{index}": megabyte + index for index in range(12)}, tmp_path / "weights.safetensors")
+    tracemalloc.start()
+    try:
+        seen = [(name, float(value[0])) for name, value in checkpoint.stored_tensors(tmp_path / "weights.safetensors")]
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert dict(seen) == {f"layer{index}": index for index in range(12)}
+    assert peak_bytes < 5 * megabyte.nbytes

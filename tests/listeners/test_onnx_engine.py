@@ -11,7 +11,7 @@ import pytest
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
-from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, read_weights
+from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, stored_tensors
 from sfms_robot.listeners.graph_folder import digest, read_graphs
 from sfms_robot.listeners.onnx_engine import HALF, OnnxEngine, integers
 from sfms_robot.listeners.registry import at_hop, engine_name, load_listener
@@ -86,7 +86,7 @@ def test_graphs_that_ship_are_of_the_configuration_and_the_weights_that_ship(fol
     found = read_graphs(folder, settings)
     weights = folder / WEIGHTS
     if weights.is_file():
-        OnnxEngine(folder, found, lambda: read_weights(weights, found.wanted))
+        OnnxEngine(folder, found, lambda: stored_tensors(weights, found.wanted))
 
 
 def test_no_torch_where_the_engine_is_onnx():

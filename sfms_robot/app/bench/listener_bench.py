@@ -52,7 +52,8 @@ def listener(budget: bool = False) -> Told:
 
         return counted()
 
-    threads, rows = torch.get_num_threads(), {}
+    threads = torch.get_num_threads()
+    rows: dict[str, Row] = {}
     torch.set_num_threads(1)
     try:
         for name in NAMES:

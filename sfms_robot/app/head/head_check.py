@@ -18,8 +18,9 @@ from sfms_robot.app.head.faces import recorded_faces
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import firmware_maps
-from sfms_robot.config import Head, drives, load_head
+from sfms_robot.config import Head, load_head
 from sfms_robot.config.check import check_head
+from sfms_robot.config.drives import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, POSE_CHANNELS, Doubles, Floats
 from sfms_robot.motion.limits import JointLimits
