@@ -25,13 +25,14 @@ from typing import Any, Final, Protocol, Self, cast
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import FRAME_HZ, FRAME_S, POSE, Doubles, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.events.model import Decision, EventMemory, EventModel
 from sfms_robot.listeners.idle_motion import IdleMotion, IdleStream
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.control import control_track
 from sfms_robot.signals.gaze_kinematics import GazeState
 
+EYES: Final = list(gaze_kinematics.EYE_CHANNELS)
 AT_THE_PERSON: Final = np.zeros(2)
 
 
@@ -190,15 +191,15 @@ class EventfulListener:
         newest = memory.gaze[min(1, len(memory.gaze) - 1) :]  # one frame has passed
         if plan is None:
             return None, replace(memory, gaze=newest)
-        frames, states = plan.frames.copy(), [newest[0]]
-        for row, time_s in enumerate(plan.times_s):
-            seen, state = gaze_kinematics.step(target_at(memory.events, time_s), frames[row, POSE], states[-1])
-            frames[row] = seen.applied(frames[row])
-            states.append(state)
+        targets = [target_at(memory.events, time_s) for time_s in plan.times_s.tolist()]
+        head_rad, eyes, states = gaze_kinematics.follow(targets, plan.frames, newest[0])
+        frames = plan.frames.copy()
+        frames[:, :3] += head_rad
+        frames[:, EYES] = eyes
         if memory.idle is not None:
             frames = memory.idle.added(frames, plan.times_s)
         told = replace(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
-        return told, replace(memory, news=(), gaze=tuple(states))
+        return told, replace(memory, news=(), gaze=(newest[0], *states))
 
 
 def frame_of(speaker: SpeakerFrame) -> int:

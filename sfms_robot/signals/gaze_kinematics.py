@@ -59,13 +59,6 @@ class GazeFrame:
     head_rad: Floats
     eyes: Floats
 
-    def applied(self, motion: Floats) -> Floats:
-        """(58,) the motion with this look: a new row."""
-        row = np.array(motion, np.float32)
-        row[:3] += self.head_rad
-        row[list(EYE_CHANNELS)] = self.eyes
-        return row
-
 
 @dataclass(frozen=True)
 class GazeState:
@@ -119,16 +112,20 @@ def step(target_rad: ArrayLike, pose: ArrayLike, state: GazeState) -> tuple[Gaze
     return _step((yaw, pitch), (turned, tilted), state)
 
 
-def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, GazeState]:
-    """`step` over targets (N, 2) and poses (N, 6): the head's part (N, 3), the eyes (N, 8), the state after them."""
+def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, list[GazeState]]:
+    """`step` over targets (N, 2) and poses (N, 6): the head's part (N, 3), the eyes (N, 8), the state after each."""
     targets, heads = np.asarray(targets_rad, np.float64), np.asarray(poses, np.float64)[:, POSE]
     if not (np.isfinite(targets).all() and np.isfinite(heads[:, 1:3]).all()):
         raise ValueError("gaze targets or head poses are not finite")
-    head, eyes = np.zeros((len(targets), 3), np.float32), np.zeros((len(targets), len(EYE_CHANNELS)), np.float32)
-    for row, ((yaw, pitch), (tilted, turned)) in enumerate(zip(targets.tolist(), heads[:, 1:3].tolist(), strict=True)):
-        frame, state = _step((yaw, pitch), (turned, tilted), state)
-        head[row], eyes[row] = frame.head_rad, frame.eyes
-    return head, eyes, state
+    looks, states = [], []
+    for (yaw, pitch), (tilted, turned) in zip(targets.tolist(), heads[:, 1:3].tolist(), strict=True):
+        look, state = _step((yaw, pitch), (turned, tilted), state)
+        looks.append(look)
+        states.append(state)
+    head, eyes = np.zeros((len(looks), 3), np.float32), np.zeros((len(looks), len(EYE_CHANNELS)), np.float32)
+    if looks:
+        head[:], eyes[:] = [look.head_rad for look in looks], [look.eyes for look in looks]
+    return head, eyes, states
 
 
 def _step(target: Pair, body: Pair, state: GazeState) -> tuple[GazeFrame, GazeState]:

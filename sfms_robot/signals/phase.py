@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -26,6 +27,9 @@ SPEECH_KNOTS_S: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 SILENCE_KNOTS_S: Final = (0.0, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8)
 PHRASE_KNOTS_S: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
 FEATURES: Final = len(SPEECH_KNOTS_S) + len(SILENCE_KNOTS_S) + len(PHRASE_KNOTS_S)  # 21
+LONGEST: Final = round(
+    max(*SPEECH_KNOTS_S, *SILENCE_KNOTS_S, *PHRASE_KNOTS_S) / FRAME_S
+)  # frames: no feature tells more
 _SOFT_S: Final = 0.2  # the grid is logarithmic from here up
 
 
@@ -82,7 +86,15 @@ def step_level(level_db: float, state: State) -> tuple[Floats, State]:
     """The same from the level of the frame (`voice_activity.levels_db`, `mel_levels_db`)."""
     ear = voice_activity.step(level_db, state.ear)
     phase = state.phase.after(ear.active)
-    return features(np.array([phase.times_s]))[0], State(ear, phase)
+    return _row(*(min(count, LONGEST) for count in (phase.speech, phase.silence, phase.last))), State(ear, phase)
+
+
+@lru_cache(maxsize=4096)
+def _row(speech: int, silence: int, last: int) -> Floats:
+    """`features` (21,) of counts of frames, not to be changed."""
+    out: Floats = features(np.array([SpeechPhase(speech, silence, last).times_s]))[0]
+    out.flags.writeable = False
+    return out
 
 
 def of_audio(audio: Floats) -> Floats:

@@ -70,5 +70,5 @@ def export_graphs(folder: Path, out: Path, int8: bool = False) -> list[Path]:
 
     settings = _settings(folder)
     model = ArigModel(settings).eval()
-    integers = {"frame": fast.large_layers(model)} if int8 else {}
+    integers = {"frame": fast.large_layers(model), "draw": fast.SAMPLER_LAYERS} if int8 else {}
     return export(out, settings, model, networks(model, kept=False), examples(settings, EXAMPLE_STREAMS), integers)

@@ -18,6 +18,7 @@ from sfms_robot.errors import ModelError
 from sfms_robot.listeners.arig.model import ArigModel
 
 PARTS = ("sound_in", "merge_agent", "merge_user", "short", "long", "states", "progress")
+SAMPLER_LAYERS = ("head.modulation.linear.weight",)  # of graphs in integers: a third of what the sampler takes
 SMALLEST = 64 * 1024  # weights of a layer below which integers gain nothing
 
 

@@ -71,11 +71,15 @@ def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceSta
         return Signs(), replace(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
     motion = face.motion
     nods, state = _nod(float(motion[_PITCH]), state)
-    smiles, beams, state = _smile(float(np.clip(motion[_CORNERS].mean(), 0, 1)), state)
-    jaw = float(np.clip(motion[_JAW], 0, 1))
+    smiles, beams, state = _smile(_within(float(motion[_CORNERS].mean())), state)
+    jaw = _within(float(motion[_JAW]))
     opening = state.opening + _MOTION * (abs(jaw - state.jaw) - state.opening)
     moves = opening > OPENING
     return Signs(nods, smiles, beams and moves, moves), replace(state, frame=state.frame + 1, jaw=jaw, opening=opening)
+
+
+def _within(value: float) -> float:
+    return min(max(value, 0.0), 1.0)
 
 
 def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:

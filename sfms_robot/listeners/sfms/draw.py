@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +36,7 @@ SILENCE_LATELY = np.array(
     [0.0] * len(SPEECH_KNOTS_S) + [float(knot <= 1.6) for knot in SILENCE_KNOTS_S] + [0.0] * len(PHRASE_KNOTS_S),
     np.float32,
 )
+NEEDED = 0.5  # of what a class in the nucleus has at least: sums are rounded
 LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing, and sorting it takes time
 
 
@@ -110,7 +110,8 @@ class Sampler:
         logits = by_group(flat, self._place)  # (B, N, G, V)
         known: Floats = guided(logits[:, 0], logits[:, 1], guidance) if logits.shape[1] > 1 else logits[:, 0]
         too_soon = self._reach.too_soon(last.tokens[..., 0], frame - last.at[..., 0])
-        possible = np.asarray(np.where(too_soon, np.float32(-np.inf), known) / self._temperature, np.float32)
+        possible = np.where(too_soon, np.float32(-np.inf), known)
+        possible /= self._temperature
         return sample(possible, self._bias, nucleus, chance)
 
     def _lately(self, seen: Seen) -> Floats:
@@ -147,15 +148,33 @@ def sample(logits: Floats, bias: Floats, nucleus: Floats, chance: Doubles) -> To
     """
     biased = logits.copy()
     biased[..., 0] += bias
-    likely = np.exp(biased - biased.max(-1, keepdims=True))
-    total = likely.sum(-1, keepdims=True)
-    count = min(LIKELIEST, logits.shape[-1])
-    classes: NDArray[Any] = np.argpartition(likely, -count, axis=-1)[..., -count:]
-    found = np.take_along_axis(likely, classes, -1)
-    order = np.argsort(-found, axis=-1, kind="stable")
-    values = np.take_along_axis(found, order, -1) / total
+    biased -= biased.max(-1, keepdims=True)
+    likely = np.exp(biased, out=biased)
+    shares = likely.reshape(-1, likely.shape[-1])  # (R, V), a row for every draw
+    shares /= shares.sum(-1, keepdims=True)
+    within = np.broadcast_to(nucleus, likely.shape[:-1]).reshape(-1, 1)
+    values, classes = _sorted(shares, NEEDED * (1 - within) / shares.shape[-1])
     mass = values.cumsum(-1)
-    kept = ((mass - values) < nucleus[..., None]).sum(-1, keepdims=True)
-    whole = np.take_along_axis(mass, kept - 1, -1)
-    place = np.minimum((mass <= chance[..., None] * whole).sum(-1, keepdims=True), kept - 1)
-    return np.take_along_axis(classes, np.take_along_axis(order, place, -1), -1)[..., 0]
+    kept = ((mass - values) < within).sum(-1)
+    row = np.arange(len(mass))
+    whole = mass[row, kept - 1]
+    place = np.minimum((mass <= (chance.reshape(-1) * whole)[:, None]).sum(-1), kept - 1)
+    drawn: Tokens = classes[row, place]
+    return drawn.reshape(likely.shape[:-1])
+
+
+def _sorted(shares: Floats, least: NDArray[np.floating]) -> tuple[Floats, NDArray[np.int64]]:
+    """Shares (R, V) of at least `least` (R, 1): the `LIKELIEST` of each row, largest first, (R, K), and their classes.
+
+    Rows of fewer end in shares of 0. Of V classes that hold a nucleus none has less than a V-th of what is left
+    outside: what is below that need not be sorted.
+    """
+    rows, found = np.nonzero(shares >= least)
+    counts = np.bincount(rows, minlength=len(shares))
+    place = np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]
+    values = np.zeros((len(shares), int(counts.max())), shares.dtype)
+    classes = np.zeros(values.shape, np.int64)
+    values[rows, place], classes[rows, place] = shares[rows, found], found
+    order = np.argsort(-values, axis=-1, kind="stable")[:, :LIKELIEST]
+    row = np.arange(len(shares))[:, None]
+    return values[row, order], classes[row, order]
