@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -105,10 +106,10 @@ def decode(
     if flame is not None and known.jaw is None:
         raise ConfigError(f"{space} already is ARKit's expression: it takes no matrix (deca56 does)")
     rest = np.asarray(known.neutral) if neutral is None else np.asarray(neutral)[known.rotation]
-    axes = np.array(known.axes, dtype=np.float64)
+    axes, upright = _at_rest(space, *rest.tolist())
 
     motion = np.zeros((len(values), MOTION_DIM))
-    turned = _rotations(known, values[:, known.rotation]) @ _rotations(known, rest[None])[0].T
+    turned = _rotations(known, values[:, known.rotation]) @ upright.T
     motion[:, POSE][:, :3] = angles_of(axes @ turned @ axes.T)
     scale = metres_per_unit if metres_per_unit is not None else known.metres_per_unit
     if known.translation is not None and scale is not None and len(values):
@@ -141,10 +142,10 @@ def encode(
     """
     known = _space(space)
     values = np.asarray(motion, dtype=np.float64)
-    axes = np.array(known.axes, dtype=np.float64)
     rest = rest_of(space) if neutral is None else np.asarray(neutral, dtype=np.float64)
+    axes, upright = _at_rest(space, *rest[known.rotation].tolist())
     turned = axes.T @ turned_by(values[:, POSE][:, :3]) @ axes
-    whole = turned @ _rotations(known, rest[known.rotation][None])[0]
+    whole = turned @ upright
     out = np.tile(rest, (len(values), 1))
     if known.euler:
         out[:, known.rotation] = angles_of(whole)
@@ -185,6 +186,13 @@ def _space(name: str) -> Space:
     if name not in SPACES:
         raise ConfigError(f"motion space {name!r} is not known ({', '.join(SPACES)})")
     return SPACES[name]
+
+
+@lru_cache(maxsize=64)
+def _at_rest(space: str, *rotation: float) -> tuple[Doubles, Doubles]:
+    """A (3, 3) of a space, and the rotation (3, 3) of a face at rest as the space writes it; not to be changed."""
+    known = _space(space)
+    return np.array(known.axes, dtype=np.float64), _rotations(known, np.array([rotation]))[0]
 
 
 def _rotations(space: Space, values: Doubles) -> Doubles:

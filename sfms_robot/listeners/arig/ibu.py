@@ -28,6 +28,7 @@ from sfms_robot.listeners.arig.parts import (
     split_heads,
 )
 from sfms_robot.listeners.arig.rotary import rates
+from sfms_robot.listeners.layers import exported_attention
 
 
 class Merge(Part):
@@ -105,6 +106,9 @@ class Integrated(Part):
 
 def _attend(qkv: Tensor, heads: int) -> Tensor:
     """Full self-attention of (N, S, 3D) -> (N, S, D)."""
+    if torch.compiler.is_exporting():
+        q, k, v = qkv.chunk(3, dim=-1)
+        return exported_attention(q, k, v, heads)
     q, k, v = split_heads(qkv, 3 * heads).chunk(3, dim=1)
     return join_heads(attend(q, k, v))
 

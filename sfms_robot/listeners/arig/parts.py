@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sfms_robot.listeners.layers import exported_attention
+
 
 class Part(nn.Module):
     """Called without a module's hooks, which nothing here uses: for one frame they cost as much as a product."""
@@ -130,9 +132,13 @@ class CrossAttention(Part):
 
     def forward(self, x: Tensor, keys: Tensor) -> Tensor:
         """x (N, D) looking at keys (N, slots, 2D) -> (N, D)."""
-        q = split_heads(self.query(self.norm(x))[:, None], self.heads)
-        k, v = split_heads(keys + self.slots, 2 * self.heads).chunk(2, dim=1)
-        seen = attend(q, k, v)
-        x = x + self.out(join_heads(seen)[:, 0])
+        query, told = self.query(self.norm(x))[:, None], keys + self.slots
+        if torch.compiler.is_exporting():
+            k, v = told.chunk(2, dim=-1)
+            seen = exported_attention(query, k, v, self.heads)
+        else:
+            k, v = split_heads(told, 2 * self.heads).chunk(2, dim=1)
+            seen = join_heads(attend(split_heads(query, self.heads), k, v))
+        x = x + self.out(seen[:, 0])
         out: Tensor = x + self.ffn(self.ffn_norm(x))
         return out

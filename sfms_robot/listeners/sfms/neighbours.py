@@ -8,6 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+BEYOND = 1e4  # frames, more than any window has
 POSITION_BITS = 6  # distances to the neighbouring keyframes up to 63 frames, as binary digits
 
 
@@ -92,5 +93,6 @@ def _highest_so_far(numbers: Tensor) -> Tensor:
     if not torch.compiler.is_exporting():
         return numbers.cummax(1).values
     t = numbers.shape[1]  # cummax is not known to ONNX
-    past = torch.ones(t, t, dtype=torch.bool).tril()[None, :, :, None]  # (1, T, T, 1): frame s up to frame t
-    return torch.where(past, numbers[:, None], -1).amax(2)
+    to_come = torch.full((t, t), -BEYOND).triu(1)  # [t, s]: frame s is after frame t
+    found = numbers.float().transpose(1, 2)[:, :, None] + to_come  # (B, G, T, T), exact: numbers of frames
+    return found.amax(-1).transpose(1, 2).long()

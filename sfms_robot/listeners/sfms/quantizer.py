@@ -164,8 +164,10 @@ class GroupMLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, T, G, inputs) -> (B, T, G, outputs)."""
-        y = torch.einsum("btgi,gih->btgh", x, self.w1) + self.b1
-        return torch.einsum("btgh,gho->btgo", F.gelu(y), self.w2) + self.b2
+        b, t, g, _ = x.shape
+        rows = x.permute(2, 0, 1, 3).flatten(1, 2)  # (G, B * T, inputs): a product of matrices for each group
+        y = F.gelu(rows @ self.w1 + self.b1[:, None]) @ self.w2 + self.b2[:, None]
+        return y.view(g, b, t, -1).permute(1, 2, 0, 3)
 
 
 class Quantizer(nn.Module):
