@@ -40,6 +40,7 @@ class Part(StrEnum):
 
 LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 JSON = typer.Option(False, "--json", help="Print one JSON object.")
+ENGINES, ENGINE_HELP = "auto|onnx|torch", "What computes the listener; its precision is as its config.yaml says."
 HOP = typer.Option(None, min=1, help="Frames between plans, as a run chooses them; default: what its config.yaml says.")
 
 
@@ -159,13 +160,18 @@ def timing(
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices, sampling and intervals."),
     jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
     hop: int | None = HOP,
+    engine: str = typer.Option("torch", metavar=ENGINES, help=ENGINE_HELP),
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
     from sfms_robot.app.evaluate.meetings import TimingOptions, evaluate_timing
+    from sfms_robot.app.listen.preflight import engine_named
     from sfms_robot.cli.show_learning import print_timing, show
 
-    options = TimingOptions(listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop)
+    runs_on = engine_named(engine)
+    options = TimingOptions(
+        listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop, runs_on
+    )
     show(evaluate_timing(options), json, print_timing)
 
 
@@ -197,13 +203,16 @@ def naturalness(
     clips: int | None = typer.Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
     drift: float = typer.Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    engine: str = typer.Option("auto", metavar=ENGINES, help=ENGINE_HELP),
     json: bool = JSON,
 ) -> None:
     """How a listener moves beside people whose motion it never saw: nods, smiles, gaze, sway, and a network's guess."""
     from sfms_robot.app.evaluate.naturalness import evaluate_naturalness
+    from sfms_robot.app.listen.preflight import engine_named
     from sfms_robot.cli.show_learning import print_figures, show
 
-    show(evaluate_naturalness(listener, data, split, clips, drift, seed), json, print_figures)
+    found = evaluate_naturalness(listener, data, split, clips, drift, seed, engine_named(engine))
+    show(found, json, print_figures)
 
 
 @app.command("metrics")

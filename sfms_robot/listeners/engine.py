@@ -60,5 +60,6 @@ def model_of(engine: Engine) -> Any:
 
 def one_of(array: Array, streams: int) -> Array:
     """An input (N or 1, ...) as an array of its own of (N, ...)."""
-    whole = array if len(array) == streams else np.broadcast_to(array, (streams, *array.shape[1:]))
-    return np.ascontiguousarray(whole)
+    if len(array) == streams:
+        return array if array.flags.c_contiguous else np.ascontiguousarray(array)
+    return np.ascontiguousarray(np.broadcast_to(array, (streams, *array.shape[1:])))

@@ -57,7 +57,7 @@ class OnnxEngine:
         """See `engine.Engine`."""
         streams = max(map(len, inputs))
         names = self._inputs[network]
-        told = {name: one_of(each, streams) for name, each in zip(names, inputs, strict=True) if name in names}
+        told = {name: one_of(each, streams) for name, each in zip(names, inputs, strict=True)}
         return tuple(self._sessions[network].run(None, told))
 
     def set_threads(self, threads: int) -> None:

@@ -34,8 +34,10 @@ from sfms_robot.evaluation.listener_meetings import ListenerMeeting, listener_me
 from sfms_robot.evaluation.reference_hazard import ReferenceHazard
 from sfms_robot.evaluation.rollout import rollout
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame
+from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.registry import engine_name
 from sfms_robot.ports import Listener
 
 _PREFIXES: Final = {"decided": "decided_", "people": "people_", "R2": "r2_"}
@@ -52,7 +54,7 @@ class TimingOptions:
         minutes: of motion from the middle of each meeting; 0: none, which takes minutes instead of hours.
         seeds: how often a listener is left to itself in each.
         jobs: processes; None: as many as there are cores.
-        hop: see `load_at_hop`.
+        hop, engine: see `load_at_hop`.
     """
 
     listener: str
@@ -65,6 +67,7 @@ class TimingOptions:
     seed: int = 1
     jobs: int | None = None
     hop: int | None = None
+    engine: EngineName = "torch"
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     """
     where = Path(options.listener) if options.listener.endswith(".yaml") else None
     where = where or find("listeners", options.listener, "config.yaml")
-    heard_by = _listener(where, options.hop)  # what is wrong with it is said here, not by a process
+    heard_by = _listener(where, options.hop, options.engine)  # what is wrong with it is said here, not by a process
     everybody = read_people(tables(options.data))
     chosen = spread(people_of(everybody, options.split, options.allow_training), options.meetings)
     tasks = list(_tasks(options, where, everybody, chosen))
@@ -118,6 +121,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "minutes_of_motion_each": options.minutes,
         "seeds": options.seeds,
         "hop": None if isinstance(heard_by, EventModel) else heard_by.hop,
+        "engine": None if isinstance(heard_by, EventModel) else engine_name(heard_by),
         **{name: _rounded(one.value) for name, one in found.items()},
         "people_smiles_per_minute": None,
         "people_blinks_per_minute": None,
@@ -178,7 +182,7 @@ def _play(task: _Task) -> _Played:
     options, (voices, laughter, motions) = task.options, _material(task.options.split, task.options.data)
     rng = np.random.default_rng([options.seed, task.number])
     one = listener_meeting(task.person, voices, laughter, motions, rng)
-    listener, alone = _listener(task.where, options.hop), without_own_voice(one.speaker)
+    listener, alone = _listener(task.where, options.hop, options.engine), without_own_voice(one.speaker)
     first, frames = middle(one.frames, 0.0 if isinstance(listener, EventModel) else options.minutes)
     played = np.zeros(one.frames, bool)
     played[first : first + frames] = True
@@ -226,8 +230,8 @@ def _by_events(
 
 
 @cache
-def _listener(where: Path, hop: int | None) -> Listener | EventModel:
-    return EventModel.load(where) if where.suffix == ".yaml" else load_at_hop(where, hop)
+def _listener(where: Path, hop: int | None, engine: EngineName) -> Listener | EventModel:
+    return EventModel.load(where) if where.suffix == ".yaml" else load_at_hop(where, hop, engine)
 
 
 @cache

@@ -23,7 +23,8 @@ from sfms_robot.evaluation import manners as manner
 from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
 from sfms_robot.evaluation.two_sample import FOLDS, REGIONS, Told, told_apart, windows
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame
-from sfms_robot.listeners.registry import load_listener, one_thread
+from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.registry import engine_name, load_listener, one_thread
 from sfms_robot.ports import Listener
 
 DRIFT_S: Final = 600.0
@@ -32,7 +33,7 @@ _LEAST_DYADS: Final = 2 * FOLDS
 
 
 def evaluate_naturalness(
-    name: str, data: Path, split: str, clips: int | None, drift_s: float, seed: int
+    name: str, data: Path, split: str, clips: int | None, drift_s: float, seed: int, engine: EngineName = "auto"
 ) -> dict[str, Any]:
     """Roll a listener out over the dyads of `split`, and hold what it did against what their listeners did.
 
@@ -42,7 +43,7 @@ def evaluate_naturalness(
     dyads = _spread([at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, split))], clips)
     if len(dyads) < _LEAST_DYADS:
         raise ConfigError(f"{data}: {len(dyads)} dyads of {split}; people are told apart in {_LEAST_DYADS} or more")
-    listener = load_listener(find("listeners", name, "config.yaml"))
+    listener = load_listener(find("listeners", name, "config.yaml"), engine=engine)
     heard = [frames_of_dyad(dyad) for dyad in dyads]
     with Progress(console=Console(stderr=True)) as progress:
         playing = progress.add_task(f"{name} listens", total=len(dyads) + 1)
@@ -58,6 +59,7 @@ def evaluate_naturalness(
     addressed = [asked_for(dyad) for dyad in dyads]
     return {
         "listener": name,
+        "engine": engine_name(listener),
         "split": split,
         "dyads": len(dyads),
         "minutes": round(sum(map(len, ours)) * FRAME_S / 60, 1),
