@@ -6,8 +6,8 @@ Both directions are messages behind a header, over the child's stdin and stdout:
     uint8     kind: P packed picture, J JSON, V a visitor's voice or face (from the child)
     uint32    number of a visitor, 0 for none
 
-The run's side hands over numbers and small documents; a thread writes them, of pictures the newest. The child makes
-JSON of pictures, talks to visitors, and sends back what they ask for. It ends with its pipe.
+The run's side hands over numbers and small documents (`pipe_writer`). The child makes JSON of pictures, talks to
+visitors, and sends back what they ask for. It ends with its pipe.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from __future__ import annotations
 import logging
 import struct
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -26,6 +25,7 @@ import orjson
 
 from sfms_robot.child_process import end_child, start_child
 from sfms_robot.errors import ConfigError, PortError, RobotError
+from sfms_robot.viewer.pipe_writer import PipeWriter
 from sfms_robot.viewer.visitor_commands import Command
 
 HEADER: Final = struct.Struct("<IBI")
@@ -101,13 +101,12 @@ class PageProcess:
         self._problem: RobotError | None = None
         self._bound = threading.Event()
         self._process = start_child(child)
-        self._waiting: deque[tuple[int, int, bytes]] = deque([(DOCUMENT, 0, orjson.dumps(asdict(address)))])
-        self._picture: Callable[[], bytes] | None = None
-        self._changed = threading.Condition()
         self._closing = False
+        assert self._process.stdin is not None
+        self._writer = PipeWriter(self._process.stdin)
+        self._writer.send(_message(DOCUMENT, 0, orjson.dumps(asdict(address))))
         self._reading = threading.Thread(target=self._read, name="page", daemon=True)
         self._reading.start()
-        threading.Thread(target=self._write, name="page", daemon=True).start()
 
     @property
     def process_id(self) -> int:
@@ -131,51 +130,27 @@ class PageProcess:
         """Who does from now on what visitors ask for; None: nobody, they are told so."""
         self._asked = asked
 
-    def show(self, pack: Callable[[], bytes]) -> None:
-        """A packed picture, made by the thread that sends it; an older one that has not left yet is left out."""
-        with self._changed:
-            self._picture = pack
-            self._changed.notify()
+    def show(self, record: bytes) -> None:
+        """A packed picture; an older one that has not left yet is left out."""
+        self._writer.send_newest(_message(PICTURE, 0, record))
 
     def keep(self, record: bytes) -> None:
         """A packed picture of a run that is over: all of them arrive, in order."""
-        with self._changed:
-            self._waiting.append((PICTURE, 0, record))
-            self._changed.notify()
+        self._writer.send(_message(PICTURE, 0, record))
 
     def say(self, do: str, visitor: int = 0, **values: Any) -> None:
         """One of `page_child`'s documents, in order."""
-        message = orjson.dumps({"do": do, **values}, default=str)
-        with self._changed:
-            self._waiting.append((DOCUMENT, visitor, message))
-            self._changed.notify()
+        self._writer.send(_message(DOCUMENT, visitor, orjson.dumps({"do": do, **values}, default=str)))
+
+    def later(self, task: Callable[[], None]) -> None:
+        """Have the thread that sends do what takes longer than a tick has, such as putting a document together."""
+        self._writer.later(task)
 
     def close(self) -> None:
         """End the server; blocks for twice `CLOSE_LIMIT_S` at most. Idempotent."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify()
+        self._closing = True
+        self._writer.close()
         end_child(self._process, CLOSE_LIMIT_S)
-
-    def _write(self) -> None:
-        pipe = self._process.stdin
-        assert pipe is not None
-        try:
-            with pipe:
-                while True:
-                    with self._changed:
-                        self._changed.wait_for(lambda: self._closing or self._waiting or self._picture is not None)
-                        if self._closing and not self._waiting:
-                            return
-                        pack, self._picture = self._picture, None
-                    packed = [] if pack is None else [(PICTURE, 0, pack())]
-                    with self._changed:
-                        messages = [*self._waiting, *packed]
-                        self._waiting.clear()
-                    pipe.write(b"".join(HEADER.pack(len(data), kind, of) + data for kind, of, data in messages))
-                    pipe.flush()
-        except (BrokenPipeError, OSError, ValueError):
-            return  # it died: the reader sees that too, and says so
 
     def _read(self) -> None:
         pipe = self._process.stdout
@@ -217,6 +192,10 @@ class PageProcess:
             do(asked)
         except RobotError as error:
             self.say("error", visitor, error=str(error))
+
+
+def _message(kind: int, visitor: int, data: bytes) -> bytes:
+    return HEADER.pack(len(data), kind, visitor) + data
 
 
 def _person(visitor: int, message: bytes, asked: Asked) -> None:

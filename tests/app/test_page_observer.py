@@ -21,8 +21,11 @@ class Sent:
         self.pictures = []
         self.said = []
 
-    def show(self, pack):
-        self.pictures.append(json.loads(frame_json(pack())))
+    def show(self, record):
+        self.pictures.append(json.loads(frame_json(record)))
+
+    def later(self, task):
+        task()
 
     def say(self, do, **values):
         self.said.append((do, values))
@@ -94,5 +97,5 @@ def test_the_status_is_told_once_a_second_while_somebody_looks():
     watcher.document = lambda: {"state": "listening"}
     for index in range(100):
         watcher.tick(tick(index / 25))
-        page.visitors = int(index >= 50)
+        page.visitors = int(index >= 49)
     assert page.said == [("status", {"status": {"state": "listening"}})] * 2

@@ -127,7 +127,7 @@ def test_pictures_go_to_all_and_come_back_in_the_last_run(page):
     with ExitStack() as stack:
         visitors = [stack.enter_context(visit(page)) for _ in range(10)]
         assert all(heard(visitor)["type"] == "hello" for visitor in visitors)
-        page.show(lambda: picture(1.0))
+        page.show(picture(1.0))
         assert all(heard(visitor, "frame")["t"] == 1.0 for visitor in visitors)
         page.say("event", event="nod", at_s=1.2)
         page.say("status", status={"state": "listening"})
@@ -145,7 +145,7 @@ def test_pictures_go_to_all_and_come_back_in_the_last_run(page):
 def test_another_run_begins_behind_the_same_page(page):
     with visit(page) as visitor:
         assert heard(visitor)["type"] == "hello"
-        page.show(lambda: picture(5.0))
+        page.show(picture(5.0))
         assert heard(visitor)["t"] == 5.0
         page.say("begin", **{**HELLO, "head": "op3_head"})
         assert heard(visitor, "hello")["head"] == "op3_head"
@@ -325,7 +325,7 @@ def test_a_page_whose_process_dies_takes_no_run_with_it(caplog):
         page._process.kill()
         page._process.wait()
         for _ in range(100):
-            page.show(lambda: picture(1.0))
+            page.show(picture(1.0))
             page.say("status", status={})
         page._reading.join(WAIT_S)
         assert page.visitors == 0 and "the page is away" in caplog.text

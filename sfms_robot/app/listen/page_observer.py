@@ -1,7 +1,7 @@
 """A run as its page shows it: 25 pictures a second, events as they are decided, once a second how it is.
 
-The loop pays for a few assignments a tick. Numbers are put together in the thread that sends them, and turned into text
-in the page's process.
+The loop packs a picture's numbers and hands them over, 25 times a second; they are turned into text in the page's
+process. What takes a millisecond, once a second, is done by a thread.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -23,9 +22,8 @@ from sfms_robot.signals.audio import energy_db
 from sfms_robot.viewer.frame_record import NOTHING, Picture, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
-EVENTS_S: Final = 1.0  # between two looks for events in the plans of a listener that decides none
-STATUS_S: Final = 1.0
-_WAITING: Final = 25  # frames and plans, of a second, that nobody has looked at
+TOLD_S: Final = 1.0  # between two documents, and two looks for events in the plans of a listener that decides none
+_WAITING: Final = 50  # plans that nobody has looked at
 _EPS_FRAMES: Final = 1e-6
 
 T = TypeVar("T")
@@ -45,43 +43,42 @@ class PageObserver:
         self.document: Callable[[], Mapping[str, Any]] | None = None
         self._page, self._joints = page, tuple(joints)
         self._index = -1
-        self._tick: Tick | None = None
-        self._frames: deque[SpeakerFrame] = deque(maxlen=_WAITING)
-        self._plans: deque[Plan] = deque(maxlen=_WAITING)
-        # Below: of the thread that sends.
         self._frame: SpeakerFrame | None = None
         self._voice_db = self._own_db = NOTHING
         self._ear = voice_activity.start()
-        self._events = PlannedEvents()
         self._hazards_hz: Mapping[str, float] = {}
-        self._looked_s = self._told_s = -math.inf
+        self._told_s = -math.inf
         self._rare: tuple[Any, bytes] = (None, b"")
+        self._plans: deque[Plan] = deque(maxlen=_WAITING)
+        self._events = PlannedEvents()  # of the thread that sends
 
     def tick(self, seen: Tick) -> None:
         index = math.floor(seen.time_s * FRAME_HZ + _EPS_FRAMES)
-        if index != self._index:
-            self._index = index
-            self._tick = replace(seen, readings=dict(seen.readings))  # the bus may go on changing its own
-            self._page.show(self._pack)
+        if index == self._index:
+            return
+        self._index = index
+        self._page.show(self._packed(seen))
+        if seen.time_s - self._told_s >= TOLD_S:
+            self._told_s = seen.time_s
+            self._page.later(self._tell)
 
     def heard(self, frame: SpeakerFrame) -> None:
-        self._frames.append(frame)
+        self._frame = frame
+        self._voice_db = energy_db(frame.audio) if len(frame.audio) else NOTHING
+        if len(frame.audio):
+            self._ear = voice_activity.step(self._voice_db, self._ear)
+        self._own_db = NOTHING if frame.agent_audio is None else energy_db(frame.agent_audio)
 
     def planned(self, plan: Plan) -> None:
         self._plans.append(plan)
+        self._hazards_hz = plan.hazards_hz
+        if plan.events:
+            self._page.later(self._tell_events)
 
     def close(self) -> None:
         """The page is closed by who opened it."""
 
-    def _pack(self) -> bytes:
-        """The newest tick, for the page's process."""
-        seen = self._tick
-        assert seen is not None
-        self._hear()
-        self._look(seen.time_s)
-        if self.document is not None and self._page.visitors and seen.time_s - self._told_s >= STATUS_S:
-            self._told_s = seen.time_s
-            self._page.say("status", status=self.document())
+    def _packed(self, seen: Tick) -> bytes:
         frame = self._frame
         place_m = None if frame is None else frame.place_m
         attention = None if frame is None else frame.attention
@@ -93,25 +90,17 @@ class PageObserver:
             )
         )  # fmt: skip
 
-    def _hear(self) -> None:
-        for frame in _drained(self._frames):
-            self._frame = frame
-            self._voice_db = energy_db(frame.audio) if len(frame.audio) else NOTHING
-            if len(frame.audio):
-                self._ear = voice_activity.step(self._voice_db, self._ear)
-            self._own_db = NOTHING if frame.agent_audio is None else energy_db(frame.agent_audio)
+    def _tell(self) -> None:
+        """Once a second; some milliseconds."""
+        self._tell_events()
+        if self.document is not None and self._page.visitors:
+            self._page.say("status", status=self.document())
 
-    def _look(self, now_s: float) -> None:
-        """Events of the plans; looking for those that a listener does not tell takes a millisecond: once a second."""
-        decides = False
+    def _tell_events(self) -> None:
         for plan in _drained(self._plans):
             self._events.join(plan)
-            self._hazards_hz = plan.hazards_hz
-            decides = bool(plan.events or plan.hazards_hz)
-        if decides or now_s - self._looked_s >= EVENTS_S:
-            self._looked_s = now_s
-            for event in self._events.news():
-                self._page.say("event", **_event(event))
+        for event in self._events.news():
+            self._page.say("event", **_event(event))
 
     def _read_rad(self, seen: Tick) -> Floats:
         """(J,) NaN where nothing was read of late: legs of a platform read at other times fit no pose of today's."""
