@@ -54,6 +54,8 @@ def site(folder: Path) -> None:
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"  # connections stay, as the page's own server keeps them
+
     def log_message(self, *_: object) -> None:
         """Nothing."""
 

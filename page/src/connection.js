@@ -19,6 +19,10 @@ export class Connection extends EventTarget {
     this.held = 'nobody';
     this.allowed = false; // more than to look
     this.roundTripMs = null;
+  }
+
+  /** Connect, and stay so. */
+  begin() {
     this.#open();
     setInterval(() => this.#ping(), PING_MS);
     document.addEventListener('visibilitychange', () => document.hidden || this.#ping());

@@ -218,8 +218,15 @@ class Page {
   }
 }
 
-const early = () => document.documentElement.classList.remove('early');
-addEventListener('first-picture', () => requestAnimationFrame(early));
-setTimeout(early, EARLY_MS);
+/** The face is there, or is late: now the rest of the page, and the run, whose messages take the processor's time too. */
+function begin() {
+  if (begun) return;
+  begun = true;
+  document.documentElement.classList.remove('early');
+  globalThis.page.connection.begin();
+}
+let begun = false;
+addEventListener('first-picture', () => requestAnimationFrame(begin));
+setTimeout(begin, EARLY_MS);
 globalThis.page = new Page();
-if (!globalThis.page.stage) early();
+if (!globalThis.page.stage) begin();

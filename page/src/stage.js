@@ -74,7 +74,6 @@ export class Stage {
   #motion = new Eased();
   #joints = new Eased();
   #dirty = true;
-  #faceDrawn = false;
   #told = false; // that the face has been drawn
   #fence = null;
   #drawing = null; // motion of the picture that is being drawn
@@ -148,11 +147,6 @@ export class Stage {
     if (this.#fence) { this.pictures += 1; this.seen = this.#drawing; }
     gl.deleteSync(this.#fence);
     this.#fence = null;
-    if (this.#faceDrawn && !this.#told) {
-      this.#told = true;
-      performance.mark('first picture');
-      dispatchEvent(new Event('first-picture'));
-    }
     return false;
   }
 
@@ -181,7 +175,15 @@ export class Stage {
     const gl = renderer.getContext();
     this.#fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    this.#faceDrawn = this.human !== null;
+    if (this.human && !this.#told) this.#tell(gl);
+  }
+
+  /** The face is seen for the first time: that is waited for, nothing else is there yet to be held up. */
+  #tell(gl) {
+    gl.finish();
+    this.#told = true;
+    performance.mark('first picture');
+    dispatchEvent(new Event('first-picture'));
   }
 
   #viewAt(x) {
