@@ -3,7 +3,7 @@
     idle          an empty loop of 100 Hz: how punctual this machine is with nothing of ours to do
     live          the run that is measured, with a recording of it
     file          the same head and listener with a recorded person, for comparison
-    first_write   `run` is typed with live sources -> its first goal on the wire
+    first_write   `run` is typed with live sources -> its first goal on the wire; the median of some starts
 
 The microphone is a null sink of a PulseAudio of our own, into which a recorded voice is played, so that PortAudio's
 callbacks, the audio process and the grid are those of a real one; "push" hands the same voice over by calls. The phone
@@ -56,6 +56,7 @@ Audio = Literal["mic", "push"]
 MINUTES: Final = 10.0
 IDLE_S: Final = 5.0
 FILE_S: Final = 60.0
+STARTS: Final = 5
 SINK: Final = "person"
 BUSY_JITTER_MS: Final = 0.5  # of an empty loop, p99
 GOALS: Final[Mapping[str, float]] = {  # at most, but for the share of ticks in time
@@ -85,9 +86,15 @@ def live(minutes: float, audio: Audio, say: Say) -> dict[str, Any]:
         compared = _run({}, audio="default", face="auto", duration_s=min(minutes * 60, FILE_S), record=None)
         say("`run` until its first goal")
         words = ["--head", str(patient_head(Path(folder))), "--audio", audio, "--face", person.face]
-        typed_s = first_goal_s(words, {**os.environ, **person.environment})
+        typed_s = _median([first_goal_s(words, {**os.environ, **person.environment}) for _ in range(STARTS)])
     result = {"audio": audio, "idle": idle, "live": told, "file": compared, "first_write_s": typed_s}
     return {**result, "goals": goals(result)}
+
+
+def _median(times_s: Sequence[float | None]) -> float | None:
+    """None where one start had no goal."""
+    told = [each for each in times_s if each is not None]
+    return float(np.median(told)) if len(told) == len(times_s) else None
 
 
 def idle_loop(duration_s: float, rate_hz: float = 100.0) -> dict[str, Any]:
