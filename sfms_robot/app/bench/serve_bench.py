@@ -57,11 +57,13 @@ def measure(say: Callable[[str], None]) -> Told:
         torch.set_num_threads(threads)
     table = [
         {
-            "listener": name, "heads in time": each["heads"], "p99 ms": each["p99_ms"], "hop": each["hop"],
-            "one at a time": each["peer_heads"], "ratio": each["ratio"], "batch": each["batch_size_p50"],
+            "listener": name, "heads in time": each["median"], "p99 ms": each["p99_ms"], "hop": each["hop"],
+            "one at a time": each["peer_median"], "ratio": each["ratio"], "batch": each["batch_size_p50"],
+            **{f"ms a frame, batch of {size}": each["cost_ms_per_head_and_frame"][size] for size in ("1", "8", "32")},
         }
         for name, each in figures.items()
     ]  # fmt: skip
+    figures = {f"serve.{name}": each for name, each in figures.items()}
     return Told(figures, table, [f"within {DEADLINE_S * 1e3:.0f} ms, p99, {WORKERS} threads on {machine()}"])
 
 
@@ -79,7 +81,8 @@ def _served(name: str, say: Callable[[str], None]) -> dict[str, Any]:
     best = next((each for each in curve if each["heads"] == most), curve[0])
     alone = _alone(capacity)
     return {
-        "heads": most,
+        "median": most,
+        "unit": "heads",
         "p99_ms": best["p99_ms"],
         "p50_ms": best["p50_ms"],
         "deadline_ms": DEADLINE_S * 1e3,
@@ -91,7 +94,7 @@ def _served(name: str, say: Callable[[str], None]) -> dict[str, Any]:
             str(size): round(_per_frame_s(capacity, size) * 1e3, 3) for size in capacity.sizes
         },
         "peer": "one head at a time, one core",
-        "peer_heads": alone,
+        "peer_median": alone,
         "ratio": round(most / max(alone, 1), 2),
         "repeats": len(curve),
         "machine": machine(),

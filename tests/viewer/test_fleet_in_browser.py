@@ -1,0 +1,72 @@
+"""The fleet's page in a real browser: a tile per head over real zenoh, and a button that halts all of them."""
+
+import json
+import socket
+from contextlib import closing
+
+import pytest
+from chromium import Page, missing
+
+from sfms_robot.app.fleet.fleet_client import Fleet
+from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead
+from sfms_robot.app.fleet.fleet_page import FleetPage
+from sfms_robot.network import close_session, serve_session, session_config
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt
+
+pytest.importorskip("zenoh", reason="needs the extra [remote]")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}")]
+
+TILES = "[...document.querySelectorAll('#heads li')]"
+NAMES = ("hall", "kitchen")
+
+
+class Head:
+    """A run as a fleet knows it: what it tells, and what may be done to it."""
+
+    def __init__(self, name, file):
+        self.halt = HaltLatch()
+        self.head = FleetHead(name, self.document, FleetControls(self.halt, Interrupt(), None, None), file)
+
+    def document(self):
+        by = self.halt.by
+        return {
+            "head": "face28", "listener": "sfms-small", "state": "listening" if by is None else "halted",
+            "why": [] if by is None else [by], "hottest": {"joint": "jaw", "temperature_C": 41}, "faults": {},
+        }  # fmt: skip
+
+
+@pytest.fixture
+def fleet(tmp_path):
+    """Two heads, their page, and the browser that looks at it."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    quiet = {"scouting": {"multicast": {"enabled": False}}}
+    file = tmp_path / "robot.json5"
+    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}, **quiet}))
+    router = serve_session(session_config("serve", None, endpoint))
+    heads = {name: Head(name, file) for name in NAMES}
+    try:
+        with Fleet(file) as asked, closing(FleetPage(asked, 0)) as page, Page(tmp_path / "chromium") as browser:
+            browser.driver.get(page.url)
+            browser.until(f"{TILES}.length == {len(NAMES)}")
+            yield heads, browser
+    finally:
+        for each in heads.values():
+            each.head.close()
+        close_session(router)
+
+
+def test_a_tile_says_what_a_head_does_and_one_button_halts_all(fleet):
+    heads, browser = fleet
+    assert [text.splitlines()[:2] for text in browser.ask(f"{TILES}.map(each => each.innerText)")] == [
+        [name, "listening"] for name in NAMES
+    ]
+    browser.ask("document.getElementById('all').click()")
+    browser.until(f"{TILES}.every(each => each.className == 'halted')")
+    assert {each.halt.by for each in heads.values()} == {"the fleet's page"}
+    browser.ask(f"{TILES}[0].querySelectorAll('button')[1].click()")
+    browser.until(f"{TILES}[0].className == 'listening'")
+    assert heads["hall"].halt.by is None and heads["kitchen"].halt.by is not None
+    assert "hall: resume" in browser.ask("document.getElementById('said').textContent")
+    assert browser.complaints() == []
