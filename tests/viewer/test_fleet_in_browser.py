@@ -49,6 +49,7 @@ def fleet(tmp_path):
     try:
         with Fleet(file) as asked, closing(FleetPage(asked, 0)) as page, Page(tmp_path / "chromium") as browser:
             browser.driver.get(page.url)
+            browser.ask("(said.textContent = nobody)")  # as of a page that was there before the heads
             browser.until(f"{TILES}.length == {len(NAMES)}")
             yield heads, browser
     finally:
@@ -59,9 +60,10 @@ def fleet(tmp_path):
 
 def test_a_tile_says_what_a_head_does_and_one_button_halts_all(fleet):
     heads, browser = fleet
-    assert [text.splitlines()[:2] for text in browser.ask(f"{TILES}.map(each => each.innerText)")] == [
+    assert browser.ask(f"{TILES}.map(each => [each.children[0].textContent, each.children[1].textContent])") == [
         [name, "listening"] for name in NAMES
     ]
+    browser.until("said.textContent == ''")
     browser.ask("document.getElementById('all').click()")
     browser.until(f"{TILES}.every(each => each.className == 'halted')")
     assert {each.halt.by for each in heads.values()} == {"the fleet's page"}
