@@ -209,10 +209,9 @@ def naturalness(
     """How a listener moves beside people whose motion it never saw: nods, smiles, gaze, sway, and a network's guess."""
     from sfms_robot.app.evaluate.naturalness import evaluate_naturalness
     from sfms_robot.app.listen.preflight import engine_named
-    from sfms_robot.cli.show_learning import print_figures, show
+    from sfms_robot.cli.show_learning import show
 
-    found = evaluate_naturalness(listener, data, split, clips, drift, seed, engine_named(engine))
-    show(found, json, print_figures)
+    show(evaluate_naturalness(listener, data, split, clips, drift, seed, engine_named(engine)), json)
 
 
 @app.command("metrics")
