@@ -4,8 +4,11 @@ import json
 
 import numpy as np
 import pytest
+import soundfile
 
 from sfms_robot.app.evaluate.people_study import Study, StudyOptions, clip_name, prepare, read_answers, table
+from sfms_robot.corpora import clips
+from sfms_robot.corpora.clips import Dyad
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.preferences import QUESTIONS
 
@@ -44,6 +47,24 @@ def test_all_answered_is_the_end_and_an_answer_counts_once(tmp_path):
         here.answer("me", number, ALL_LEFT)
         here.answer("me", number, ALL_LEFT)
     assert here.next("me") == {"answered": 3, "trials": 3} and len(read_answers(tmp_path / "answers.csv")) == 12
+
+
+def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path):
+    draw, frames = np.random.default_rng(0), 60
+    speaker, listener = draw.uniform(0, 0.4, (2, frames, 58)).astype(np.float32)
+    audio = draw.normal(0, 0.1, frames * 640).astype(np.float32).clip(-1, 1)
+    clips.save(tmp_path / "data" / "test", [Dyad("one", audio, speaker, listener, np.ones(frames, bool))])
+    options = StudyOptions(["sfms-small", "recorded"], tmp_path / "data", 1, 2.0, 5, tmp_path / "study")
+    made = prepare(options)
+    shown = {
+        name: np.fromfile(made.clips / f"{clip_name(5, name, 0)}.f32", "<f4").reshape(-1, 58)
+        for name in options.conditions
+    }
+    np.testing.assert_allclose(shown["recorded"], listener[-50:], atol=1e-3)
+    assert shown["sfms-small"].shape == (50, 58) and np.isfinite(shown["sfms-small"]).all()
+    voice, rate_hz = soundfile.read(made.clips / "voice-0.wav")
+    assert (len(voice), rate_hz) == (32_000, 16_000)
+    assert prepare(options).conditions == ["sfms-small", "recorded"]  # it goes on
 
 
 @pytest.mark.parametrize(
