@@ -115,9 +115,7 @@ class _Values:
 
 
 def _value(array: Array) -> Any:
-    import onnxruntime
-
-    return onnxruntime.OrtValue.ortvalue_from_numpy(np.asarray(array, order="C"))
+    return _onnxruntime().OrtValue.ortvalue_from_numpy(np.asarray(array, order="C"))
 
 
 def _session(folder: Path, name: str, graph: Graph, values: _Values, threads: int) -> Any:
