@@ -291,7 +291,10 @@ def _wait_listening(command: _Command) -> None:
         try:
             with urllib.request.urlopen(f"http://127.0.0.1:{command.port}/", timeout=5) as answer:
                 told = json.load(answer)
-            if told["listener_state"]["state"] == "listening" and told["state"] not in ("starting", "degraded"):
+            if told.get("listener_state", {}).get("state") == "listening" and told["state"] not in (
+                "starting",
+                "degraded",
+            ):
                 return
         except OSError:
             pass  # not yet
