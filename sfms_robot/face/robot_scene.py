@@ -92,7 +92,7 @@ class RobotScene:
     def values(self, read_rad: Doubles) -> Doubles:
         """Angles (J,) in the head's order -> values (U,) of `joints`; an angle that is not finite stays as it last was.
 
-        A platform is searched from the pose that was found last; where the angles fit none, it stays there.
+        Where the angles of a platform fit no pose, it stays where it last was.
         """
         read = np.asarray(read_rad, dtype=np.float64)
         if read.shape != self._read.shape:
@@ -178,11 +178,20 @@ class _NeckPose:
 
     def values(self, read: Doubles) -> Doubles:
         angles = read[self._columns]
-        pose = self._neck.forward(angles, self._pose)
+        pose = self._neck.forward(angles, self._home(angles))
         if np.isfinite(pose).all():
             self._pose = pose
         table = self._pose if self._rods is None else np.concatenate([self._pose, self._rod_angles(angles)])
         return np.asarray(table[self._order])
+
+    def _home(self, angles: Doubles) -> Doubles:
+        """Where the search for the pose begins: at home on the body as it is turned, never at the last pose.
+
+        Several poses fit the legs of a platform. After a gap in what is read the last pose may lead to one that the
+        head can only reach by falling through, and from there it would never come back.
+        """
+        body = angles[0] if self._neck.turns_body else 0.0
+        return np.array([0.0, 0.0, body, 0.0, 0.0, 0.0])
 
     def _rod_angles(self, angles: Doubles) -> Doubles:
         """(12,) swing and lean of each leg."""

@@ -89,6 +89,15 @@ def test_the_rods_of_the_platform_end_on_the_head():
         np.testing.assert_allclose(tip, places["head"] @ [*leg.rod_end_m, 1], atol=2e-5)
 
 
+def test_what_is_drawn_is_of_what_is_read_whatever_was_before():
+    """A platform has several poses for the same legs; after a head that hung the next reading leads to no other."""
+    scene = scene_of(load_head("reachy_mini"))
+    rest = scene.rest()
+    hangs = scene.values(np.array([-0.84, 0.19, -0.86, 0.19, -0.86, 0.07, -0.86, -0.38, -0.04]))  # sunk, each by itself
+    assert np.abs(hangs - rest).max() > 1.0
+    assert scene.rest() == pytest.approx(rest, abs=1e-9)
+
+
 def test_an_angle_that_was_never_read_stays_at_rest():
     scene = scene_of(load_head("op3_head"))
     assert scene.values(np.array([np.nan, 0.2])).tolist() == [0.0, 0.2]
