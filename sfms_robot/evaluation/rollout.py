@@ -25,6 +25,7 @@ from sfms_robot.corpora.conversational_states import UNKNOWN
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.learning.sfms.features import frames_of
 from sfms_robot.listeners.arig.stream import Memory as ArigMemory
+from sfms_robot.listeners.eventful import EventfulMemory
 from sfms_robot.listeners.events.model import LEAD_FRAMES
 from sfms_robot.listeners.sfms.draw import Seen
 from sfms_robot.listeners.sfms.keyframes import later, passed, revoked
@@ -123,8 +124,9 @@ def rollout(
                 motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
                 decided[row] += plan.events
         for row, memory in enumerate(memories):
-            if isinstance(memory, ArigMemory):
-                states[row, index + 1] = paper_state(memory.state)
+            how = memory.how if isinstance(memory, EventfulMemory) else memory
+            if isinstance(how, ArigMemory):
+                states[row, index + 1] = paper_state(how.state)
     return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
 
 

@@ -53,7 +53,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
     Raises ConfigError for a listener that knows no states, or data without a set that speaks.
     """
     listener = load_listener(find("listeners", name, "config.yaml"))
-    settings = getattr(listener, "settings", None)
+    settings = getattr(getattr(listener, "how", listener), "settings", None)
     if not isinstance(settings, config.Arig):
         raise ConfigError(f"--listener {name}: does not speak; this looks at listeners of kind arig")
     held_out = {scene: spread(dyads, clips) for scene, dyads in open_scenes(data, "validation").items()}

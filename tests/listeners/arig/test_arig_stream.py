@@ -56,9 +56,9 @@ def test_stream_equals_offline(changes):
 
 
 def shipped(name: str, **changes) -> ArigListener:
-    """With the sizes of a shipped listener and seeded weights."""
+    """With the sizes of a shipped listener and seeded weights; told of nothing, as its paper has it."""
     settings = config.load(config.Arig, data_dir("configs") / "listeners" / name / "config.yaml")
-    settings = settings.model_copy(update=changes)
+    settings = settings.model_copy(update={"events": False, "draws": "motion", **changes})
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return ArigListener(settings, torch_engine(settings, ArigModel(settings)))
