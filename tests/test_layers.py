@@ -11,7 +11,19 @@ import pytest
 import sfms_robot
 
 PACKAGE = Path(sfms_robot.__file__).parent
-BASE = {"errors", "frames", "ports", "signals", "data", "config", "ranges", "child_process", "origin", "network"}
+BASE = {
+    "errors",
+    "frames",
+    "ports",
+    "signals",
+    "data",
+    "config",
+    "ranges",
+    "child_process",
+    "endpoint",
+    "origin",
+    "network",
+}
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
 ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from sfms_robot.data import data_dir
+from sfms_robot.endpoint import LOOPBACK, port_number
 from sfms_robot.errors import ConfigError
 
 RATE_HZ: Final = 60.0
@@ -106,10 +107,11 @@ class EmulatedPhone:
 def main(arguments: Sequence[str]) -> None:
     """Send to `[HOST:]PORT` until interrupted. Raises ConfigError."""
     target = arguments[0] if arguments else str(PORT)
-    host, _, port = target.rpartition(":")
-    if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+    host, _, number = target.rpartition(":")
+    port = port_number(number, least=1)
+    if port is None:
         raise ConfigError(f"{target!r} is no place to send to (PORT, HOST:PORT)")
-    phone = EmulatedPhone(host or "127.0.0.1", int(port))
+    phone = EmulatedPhone(host or LOOPBACK, port)
     try:
         phone.play()
     finally:

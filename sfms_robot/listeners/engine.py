@@ -7,7 +7,7 @@ A stream asks networks by name: arrays in, arrays out, nothing kept. An engine h
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +50,24 @@ class Engine(Protocol):
         """Use so many from now on."""
 
 
-def model_of(engine: Engine) -> Any:
-    """The torch model that an engine runs. Raises ModelError for one that has none."""
-    try:
-        return engine.model  # type: ignore[attr-defined]
-    except AttributeError:
-        raise ModelError(f"this listener runs on {engine.name}: what looks into its model needs torch") from None
+class RunsOnEngine:
+    """What listeners share whose networks an engine runs."""
+
+    engine: Engine
+
+    @property
+    def model(self) -> Any:
+        """The torch model behind it. Raises ModelError where it runs on another engine."""
+        try:
+            return self.engine.model  # type: ignore[attr-defined]
+        except AttributeError:
+            name = self.engine.name
+            raise ModelError(f"this listener runs on {name}: what looks into its model needs torch") from None
+
+    def build_graphs(self) -> Self:
+        """See `Engine`. Itself."""
+        self.engine.build_graphs()
+        return self
 
 
 def one_of(array: Array, streams: int) -> Array:

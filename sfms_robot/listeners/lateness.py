@@ -23,6 +23,10 @@ class Lateness:
         self.lasting = False
         self._since_s: float | None = None  # of the first late one in a row
 
+    def named(self, state: str) -> str:
+        """The state that a listener tells: "late" for one that listens, and for nothing."""
+        return "late" if self.lasting and state == "listening" else state
+
     def came(self, plan: Plan, now_s: float) -> None:
         """A plan at `now_s`, by the clock of its frames."""
         if now_s <= plan.times_s[-1]:

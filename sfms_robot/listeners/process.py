@@ -168,7 +168,7 @@ class ListenerProcess:
         `skipped_frames`, `step_ms`, `hop` and `budget_ms` (see `config.hop`), None as long as no hop was chosen.
         """
         return {
-            "state": "late" if self._state == "listening" and self._lateness.lasting else self._state,
+            "state": self._lateness.named(self._state),
             "engine": self._engine,
             "restarts": self._restarts,
             "skipped_frames": self._skipped,

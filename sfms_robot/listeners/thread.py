@@ -83,7 +83,7 @@ class ListenerThread:
     def statistics(self) -> Mapping[str, Any]:
         """`state` (listening, late, hung, or failed and how), `restarts` 0, `skipped_frames`, `step_ms` p50, p99."""
         return {
-            "state": "late" if self._state == "listening" and self._lateness.lasting else self._state,
+            "state": self._lateness.named(self._state),
             "restarts": 0,
             "skipped_frames": self._dropped + self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),

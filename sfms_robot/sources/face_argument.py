@@ -13,12 +13,11 @@ from typing import Final
 
 import numpy as np
 
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Floats
 
 _OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
-LOOPBACK: Final = "127.0.0.1"
-_HIGHEST_PORT: Final = 65535
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,11 @@ def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:
         return LOOPBACK, port
     if _is_address(place.strip("[]")):
         return place.strip("[]"), port
-    named, colon, number = place.rpartition(":")
-    if not (number.isascii() and number.isdigit() and 0 < int(number) <= _HIGHEST_PORT) or (colon and not named):
-        choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT, {kind}:ADDRESS; PORT 1 to {_HIGHEST_PORT}"
+    found = host_and_port(place, least=1)
+    if found is None:
+        choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT, {kind}:ADDRESS; PORT 1 to {HIGHEST_PORT}"
         raise ConfigError(f"--face {kind}:{place}: {place!r} is no UDP port ({choices})")
-    return (named.strip("[]") if colon else LOOPBACK), int(number)
+    return found
 
 
 def _is_address(text: str) -> bool:

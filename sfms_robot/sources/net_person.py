@@ -10,7 +10,6 @@ One server for all flags that name the same address. What programs hand over goe
 
 from __future__ import annotations
 
-import hmac
 import ipaddress
 import logging
 import secrets
@@ -21,8 +20,10 @@ from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 
+from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.origin import token_admits
 from sfms_robot.sources.net_clock import SenderClock
 from sfms_robot.sources.net_intake import Intake
 from sfms_robot.sources.net_messages import (
@@ -44,10 +45,8 @@ from sfms_robot.sources.push import PushedSight, PushedSpeech, PushedVoice
 logger = logging.getLogger(__name__)
 
 PORT: Final = 8765
-LOOPBACK: Final = "127.0.0.1"
 SILENT_S: Final = 2.0
 FLAGS: Final = {"voice": "--audio push", "face": "--face push", "speech": "--agent-audio tcp"}
-_HIGHEST_PORT: Final = 65535
 
 _open: dict[tuple[str, int], NetPerson] = {}
 _opening: Final = threading.Lock()
@@ -151,7 +150,7 @@ class NetPerson:
     def _greet(self, connection: Connection, hello: Hello) -> None:
         if connection.greeted:
             raise PacketError("a second hello")
-        if self.token is not None and not hmac.compare_digest(hello.token.encode(), self.token.encode()):
+        if not token_admits(hello.token, self.token):
             raise PacketError("the token is not the one that the robot printed when it started")
         if hello.name:
             connection.name = f"{hello.name} ({connection.name})"
@@ -284,9 +283,9 @@ def _person(flag: str, argument: str) -> NetPerson:
 def _parsed(flag: str, argument: str) -> tuple[str, int]:
     if not argument:
         return LOOPBACK, PORT
-    host, colon, number = argument.rpartition(":")
-    if not (number.isascii() and number.isdigit() and int(number) <= _HIGHEST_PORT) or (colon and not host):
+    place = host_and_port(argument)
+    if place is None:
         raise ConfigError(
             f"{flag}:{argument}: {argument!r} is no TCP port ({flag}, {flag}:PORT, {flag}:HOST:PORT; 0 for a free one)"
         )
-    return host.strip("[]") if colon else LOOPBACK, int(number)
+    return place

@@ -20,7 +20,7 @@ from sfms_robot.child_process import take_pipes
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.origin import is_loopback
-from sfms_robot.viewer.page_process import DOCUMENT, HEADER, PERSON, PICTURE, Address
+from sfms_robot.viewer.page_process import DOCUMENT, HEADER, PERSON, PICTURE, Address, packed_message
 from sfms_robot.viewer.page_server import PageServer
 from sfms_robot.viewer.visitor_commands import LONGEST_PERSON, Command
 
@@ -46,7 +46,7 @@ class RunPipe:
 
     def person(self, visitor: int, message: bytes) -> None:
         if self._transport is not None and self._transport.get_write_buffer_size() < MOST_UNSENT:
-            self._transport.write(HEADER.pack(len(message), PERSON, visitor) + message)
+            self._transport.write(packed_message(PERSON, visitor, message))
 
     def left(self, visitor: int) -> None:
         self.send(visitor, left=True)
@@ -57,8 +57,7 @@ class RunPipe:
     def send(self, visitor: int, **told: Any) -> None:
         """A document to the run."""
         if self._transport is not None:
-            message = orjson.dumps(told)
-            self._transport.write(HEADER.pack(len(message), DOCUMENT, visitor) + message)
+            self._transport.write(packed_message(DOCUMENT, visitor, orjson.dumps(told)))
 
 
 class FromRun(asyncio.Protocol):

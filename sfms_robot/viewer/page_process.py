@@ -24,6 +24,7 @@ from typing import IO, Any, Final, Protocol
 import orjson
 
 from sfms_robot.child_process import end_child, start_child
+from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.viewer.pipe_writer import PipeWriter
 from sfms_robot.viewer.visitor_commands import Command
@@ -33,9 +34,7 @@ PICTURE, DOCUMENT, PERSON = b"PJV"
 START_LIMIT_S: Final = 30.0  # importing on a small board with a cold disk
 CLOSE_LIMIT_S: Final = 1.0
 CHILD: Final = "sfms_robot.viewer.page_child:main"
-LOOPBACK: Final = "127.0.0.1"
 PORT: Final = 8780
-_HIGHEST_PORT: Final = 65535
 
 log = logging.getLogger(__name__)
 
@@ -64,10 +63,10 @@ class Address:
         files = (None if certificate is None else str(certificate), None if key is None else str(key))
         if wanted == "auto":
             return cls(LOOPBACK, PORT, *files)
-        host, colon, number = wanted.rpartition(":")
-        if not (number.isascii() and number.isdigit() and int(number) <= _HIGHEST_PORT) or (colon and not host):
+        place = host_and_port(wanted)
+        if place is None:
             raise ConfigError(f"--view {wanted}: is no TCP port (PORT, HOST:PORT; 0 for a free one, or none)")
-        return cls(host.strip("[]") if colon else LOOPBACK, int(number), *files)
+        return cls(*place, *files)
 
 
 class Asked(Protocol):
@@ -104,7 +103,7 @@ class PageProcess:
         self._closing = False
         assert self._process.stdin is not None
         self._writer = PipeWriter(self._process.stdin)
-        self._writer.send(_message(DOCUMENT, 0, orjson.dumps(asdict(address))))
+        self._writer.send(packed_message(DOCUMENT, 0, orjson.dumps(asdict(address))))
         self._reading = threading.Thread(target=self._read, name="page", daemon=True)
         self._reading.start()
 
@@ -132,15 +131,15 @@ class PageProcess:
 
     def show(self, record: bytes) -> None:
         """A packed picture; an older one that has not left yet is left out."""
-        self._writer.send_newest(_message(PICTURE, 0, record))
+        self._writer.send_newest(packed_message(PICTURE, 0, record))
 
     def keep(self, record: bytes) -> None:
         """A packed picture of a run that is over: all of them arrive, in order."""
-        self._writer.send(_message(PICTURE, 0, record))
+        self._writer.send(packed_message(PICTURE, 0, record))
 
     def say(self, do: str, visitor: int = 0, **values: Any) -> None:
         """One of `page_child`'s documents, in order."""
-        self._writer.send(_message(DOCUMENT, visitor, orjson.dumps({"do": do, **values}, default=str)))
+        self._writer.send(packed_message(DOCUMENT, visitor, orjson.dumps({"do": do, **values}, default=str)))
 
     def later(self, task: Callable[[], None]) -> None:
         """Have the thread that sends do what takes longer than a tick has, such as putting a document together."""
@@ -194,7 +193,8 @@ class PageProcess:
             self.say("error", visitor, error=str(error))
 
 
-def _message(kind: int, visitor: int, data: bytes) -> bytes:
+def packed_message(kind: int, visitor: int, data: bytes) -> bytes:
+    """With its header."""
     return HEADER.pack(len(data), kind, visitor) + data
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import gzip
-import hmac
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -34,9 +33,10 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import PacketError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import FRAME_HZ
-from sfms_robot.origin import host_problem, origin_problem
+from sfms_robot.origin import host_problem, origin_problem, token_admits
 from sfms_robot.viewer.compressed_files import CompressedFiles
 from sfms_robot.viewer.frame_record import Shown, frame_json, told_json
+from sfms_robot.viewer.human_file import human_gz
 from sfms_robot.viewer.visitor_commands import Command, parse_command
 from sfms_robot.viewer.visitors import COMMAND_S, MOST_MALFORMED, PERSON_BYTES_PER_S, PERSON_S, Visitor, Visitors
 
@@ -116,7 +116,7 @@ class PageServer:
 
     def prepare(self) -> None:
         """Make what takes a second, in threads; a page waits for it."""
-        self._human = asyncio.create_task(asyncio.to_thread(_human_gz))
+        self._human = asyncio.create_task(asyncio.to_thread(human_gz))
         self._files.prepare()
 
     def begin(self, hello: Mapping[str, Any], new_scene: NewScene = no_scene) -> None:
@@ -190,7 +190,7 @@ class PageServer:
 
     async def _download(self, request: Request) -> Response:
         token = request.query_params.get("token", "")
-        if self._token is not None and not hmac.compare_digest(token.encode(), self._token.encode()):
+        if not token_admits(token, self._token):
             return PlainTextResponse("the token is needed for this: /recording?token=\n", 403)
         if self._recording is None:
             return PlainTextResponse("nothing was recorded\n", 404)
@@ -292,14 +292,6 @@ class PageServer:
             type="hello", **self._hello, controls=self._visitors.controls(visitor), needs_token=not visitor.allowed,
             over=self._over is not None, record=self._record,
         )  # fmt: skip
-
-
-def _human_gz() -> bytes:
-    """The virtual human's mesh, compressed; a second's work."""
-    from sfms_robot.face.human import load_human
-    from sfms_robot.face.human_mesh import packed_human
-
-    return gzip.compress(packed_human(load_human()), 6)
 
 
 def _values(scene: RobotScene | None) -> Shown | None:

@@ -12,11 +12,8 @@ Beyond loopback every POST needs the token of the printed address, as `X-Token`.
 from __future__ import annotations
 
 import asyncio
-import gzip
-import hmac
 import secrets
 from collections.abc import Callable, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -30,10 +27,9 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.human import load_human
-from sfms_robot.face.human_mesh import packed_human
-from sfms_robot.origin import is_loopback
+from sfms_robot.origin import is_loopback, token_admits
 from sfms_robot.viewer.compressed_files import CompressedFiles
+from sfms_robot.viewer.human_file import human_gz
 from sfms_robot.viewer.page_child import bound, url
 from sfms_robot.viewer.page_process import Address
 from sfms_robot.viewer.page_server import guarded_app
@@ -83,7 +79,7 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
         return FileResponse(PAGE / "index.html", media_type="text/html")
 
     async def human(request: Request) -> Response:
-        return Response(await asyncio.to_thread(_human_gz), headers={"content-encoding": "gzip"})
+        return Response(await asyncio.to_thread(human_gz), headers={"content-encoding": "gzip"})
 
     return guarded_app(
         Starlette(
@@ -119,7 +115,7 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 
 async def _document(request: Request, token: str | None) -> dict[str, Any]:
-    if token is not None and not hmac.compare_digest(request.headers.get("x-token", "").encode(), token.encode()):
+    if not token_admits(request.headers.get("x-token", ""), token):
         raise ConfigError("the token of the printed address is needed")
     body = b""
     async for part in request.stream():
@@ -144,8 +140,3 @@ def _participant(told: Mapping[str, Any]) -> str:
 
 def _json(told: Mapping[str, Any]) -> Response:
     return Response(orjson.dumps(told), media_type="application/json")
-
-
-@cache
-def _human_gz() -> bytes:
-    return gzip.compress(packed_human(load_human()), 6)

@@ -10,12 +10,12 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final
 
 from sfms_robot.errors import PacketError
+from sfms_robot.origin import token_admits
 from sfms_robot.viewer.frame_record import told_json
 from sfms_robot.viewer.visitor_commands import VERSION, Command
 
@@ -130,7 +130,7 @@ class Visitors:
             raise PacketError(f"this page is of version {hello.values['version']}, not {VERSION}: load it anew")
         token = hello.values["token"]
         if self._token is not None and token:
-            if not hmac.compare_digest(token.encode(), self._token.encode()):
+            if not token_admits(token, self._token):
                 raise PacketError("the token is not the one that was printed when the robot started")
             visitor.allowed = True
         visitor.tell(self._controls_json(visitor))

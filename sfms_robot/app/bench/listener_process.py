@@ -13,10 +13,11 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 
+from sfms_robot.app.bench.procfs import memory_mb
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
@@ -75,7 +76,7 @@ def main() -> None:
         elif plan is not None:
             planned = True
             _say("plan")
-    _say(json.dumps({"resident_mb": _status_mb("VmRSS"), "peak_mb": _status_mb("VmHWM")}))
+    _say(json.dumps({"resident_mb": _own_mb("VmRSS"), "peak_mb": _own_mb("VmHWM")}))
 
 
 def _say(line: str) -> None:
@@ -83,10 +84,9 @@ def _say(line: str) -> None:
     sys.stdout.flush()
 
 
-def _status_mb(key: str) -> float:
+def _own_mb(key: Literal["VmRSS", "VmHWM"]) -> float:
     """Of this process, Linux only."""
     try:
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        return memory_mb(key) or float("nan")
     except OSError:
         return float("nan")
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:"))

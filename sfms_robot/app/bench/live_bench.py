@@ -33,6 +33,7 @@ import yaml
 from sfms_robot.app.bench.live_stamps import SETTLED_S, StampedSource, Stamps
 from sfms_robot.app.bench.measure import HEAD, LISTENER
 from sfms_robot.app.bench.memory_bench import ResidentMemory
+from sfms_robot.app.bench.procfs import children_of, processor_time_s
 from sfms_robot.app.bench.startup_bench import first_goal_s
 from sfms_robot.app.session import SIM_READ_DEADLINE_S, RunOptions, run
 from sfms_robot.config import load_head
@@ -336,22 +337,19 @@ class ProcessorTime(Observer):
 def processor_times_s() -> dict[str, float]:
     """Of this process ("main") and its children by role, since each began."""
     used = {"main": time.process_time()}
-    ticks_hz = os.sysconf("SC_CLK_TCK")
     for role, pid in children(os.getpid()):
         with suppress(OSError):
-            fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-            used[role] = used.get(role, 0.0) + (int(fields[11]) + int(fields[12])) / ticks_hz
+            used[role] = used.get(role, 0.0) + processor_time_s(pid)
     return used
 
 
 def children(pid: int) -> list[tuple[str, int]]:
     """Roles and ids of the processes that a run has started: listener, audio, emulator."""
     found = []
-    for task in Path(f"/proc/{pid}/task").iterdir():
+    for child in children_of(pid):
         with suppress(OSError):
-            for child in (task / "children").read_text(encoding="utf-8").split():
-                command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8")
-                found += [(role, int(child)) for part, role in _ROLES.items() if part in command]
+            command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8")
+            found += [(role, child) for part, role in _ROLES.items() if part in command]
     return found
 
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from sfms_robot.app.bench.measure import HEAD, MAIN, Row, environment, row
+from sfms_robot.app.bench.procfs import memory_mb
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
@@ -130,10 +131,9 @@ def _run(env: Mapping[str, str] | None, more: Sequence[str] = ("--audio", DEFAUL
 
 def _peak_mb(pid: int) -> float:
     try:
-        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
+        return memory_mb("VmHWM", pid) or 0.0
     except OSError:
         return 0.0  # just over
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
 
 
 @contextmanager

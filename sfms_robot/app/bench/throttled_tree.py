@@ -19,6 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from sfms_robot.app.bench.procfs import children_of, processor_time_s
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.safety import realtime_priority
 
@@ -52,9 +53,7 @@ def processes_of(pid: int) -> list[int]:
         one = ahead.pop()
         found.append(one)
         with suppress(OSError):
-            for task in Path(f"/proc/{one}/task").iterdir():
-                with suppress(OSError):
-                    ahead += map(int, (task / "children").read_text(encoding="utf-8").split())
+            ahead += children_of(one)
     return found
 
 
@@ -63,8 +62,7 @@ def used_s(pids: Sequence[int]) -> dict[int, float]:
     used = {}
     for pid in pids:
         with suppress(OSError):
-            fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-            used[pid] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+            used[pid] = processor_time_s(pid)
     return used
 
 

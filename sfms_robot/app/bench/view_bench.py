@@ -12,7 +12,6 @@ client, until the goals of the first braking tick are written.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -27,6 +26,7 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from sfms_robot.app.bench.measure import HEAD, Told, machine, row
+from sfms_robot.app.bench.procfs import processor_time_s
 from sfms_robot.app.listen.page_session import page_session
 from sfms_robot.app.listen.preflight import begin_page
 from sfms_robot.app.session import RunOptions, run
@@ -171,12 +171,8 @@ def _own_s() -> float:
 
 
 def _other_s(process: int | None) -> float:
-    """Processor time of a process."""
-    if process is None:
-        return 0.0
-    fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    ticks: float = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return ticks
+    """Processor time of a process; 0 of none."""
+    return 0.0 if process is None else processor_time_s(process)
 
 
 @contextmanager

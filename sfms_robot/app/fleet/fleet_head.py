@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.listen.knobs import LiveKnobs
+from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs
 from sfms_robot.config import Calmness
 from sfms_robot.config.base import parse
 from sfms_robot.errors import ConfigError, RobotError
@@ -95,7 +95,7 @@ class FleetControls:
     def _turn(self, asked: Mapping[str, Any]) -> None:
         if self._knobs is None:
             raise ConfigError("knobs: this run has none")
-        for kind in ("intensity", "style"):
+        for kind in KNOB_KINDS:
             for region, value in _mapping(asked, kind).items():
                 if not isinstance(value, int | float):
                     raise ConfigError(f"knobs: {kind} of {region} = {value!r} is no number")

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.app.fleet.fleet_client import Fleet, FleetBoard
+from sfms_robot.endpoint import LOOPBACK
 from sfms_robot.errors import PortError, RobotError
 from sfms_robot.origin import host_problem, origin_problem
 
-LOOPBACK: Final = "127.0.0.1"
 PORT: Final = 8776
 PAGE: Final = Path(__file__).with_name("fleet.html")
 _LONGEST: Final = 4096

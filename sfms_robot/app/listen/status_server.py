@@ -14,13 +14,12 @@ from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, PortError
 
-LOOPBACK: Final = "127.0.0.1"
 AUTO: Final = "auto"  # `--status` without a port: `PORT`, or the next that is free
 PORT: Final = 8775
 _TRIED: Final = 20
-_HIGHEST_PORT: Final = 65535
 
 Document = Callable[[], Mapping[str, Any]]
 
@@ -96,8 +95,8 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _bound(wanted: str) -> _Server:
-    if wanted != AUTO and not (wanted.isascii() and wanted.isdigit() and int(wanted) <= _HIGHEST_PORT):
-        raise ConfigError(f"--status {wanted}: is no TCP port (0 to {_HIGHEST_PORT}, 0 for a free one, or none)")
+    if wanted != AUTO and port_number(wanted) is None:
+        raise ConfigError(f"--status {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or none)")
     ports = [*range(PORT, PORT + _TRIED), 0] if wanted == AUTO else [int(wanted)]
     problem: object = None
     for port in ports:

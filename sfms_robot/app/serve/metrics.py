@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
 
-LOOPBACK: Final = "127.0.0.1"
-_HIGHEST_PORT: Final = 65535
 _MS: Final = 1e-3
 
 # Name, kind, what it says, where in the statistics of `StreamServer`, and the factor to the unit of the name.
@@ -96,7 +95,8 @@ class _Collector:
 
 
 def _address(wanted: str) -> tuple[str, int]:
-    host, _, port = wanted.rpartition(":")
-    if not (port.isascii() and port.isdigit() and int(port) <= _HIGHEST_PORT):
-        raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {_HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
-    return host or LOOPBACK, int(port)
+    host, _, number = wanted.rpartition(":")
+    port = port_number(number)
+    if port is None:
+        raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
+    return host or LOOPBACK, port

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.listeners.arig.audio_frontend import AudioState
 from sfms_robot.listeners.arig.rotary import rotary
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST, Sojourn, draw_sojourn, with_feedback
-from sfms_robot.listeners.engine import Engine, model_of
+from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.lots import Use, normals, uniforms
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
@@ -89,7 +89,7 @@ class Heard:
         return self.agent_voice.voiced, self.user_voice.voiced
 
 
-class ArigListener:
+class ArigListener(RunsOnEngine):
     """`ports.BatchListener`. Holds weights only: its engine does, which runs the networks of `frame`."""
 
     def __init__(self, settings: config.Arig, engine: Engine, space: MotionSpace | None = None) -> None:
@@ -101,16 +101,6 @@ class ArigListener:
         self.space = space or MotionSpace.of(settings)
         self._scales = engine.tensors
         self._noise_shape = (1, 1) if settings.discrete else (settings.diffusion.steps, len(settings.channels))
-
-    @property
-    def model(self) -> Any:
-        """The torch model behind it. Raises ModelError where it runs on another engine."""
-        return model_of(self.engine)
-
-    def build_graphs(self) -> Self:
-        """See `engine.Engine`. Itself."""
-        self.engine.build_graphs()
-        return self
 
     @property
     def hop(self) -> int:

@@ -14,14 +14,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.listeners.engine import Engine, model_of
+from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
 from sfms_robot.listeners.sfms.channels import HEAD, head_channels
 from sfms_robot.listeners.sfms.draw import Sampler, Seen
@@ -73,7 +73,7 @@ class Memory:
     sway: Doubles
 
 
-class SfmsListener:
+class SfmsListener(RunsOnEngine):
     """`ports.BatchListener`. Holds weights only: its engine does, which runs `networks`."""
 
     def __init__(
@@ -102,16 +102,6 @@ class SfmsListener:
         sizes, bounded = [group.codes for group in groups], settings.sampling.reach
         reach = Reach(codes[0], own, sizes, self._scales["motion_speed"], bounded)
         self.sampler = Sampler(settings, engine, reach)
-
-    @property
-    def model(self) -> Any:
-        """The torch model behind it. Raises ModelError where it runs on another engine."""
-        return model_of(self.engine)
-
-    def build_graphs(self) -> Self:
-        """See `engine.Engine`. Itself."""
-        self.engine.build_graphs()
-        return self
 
     @property
     def hop(self) -> int:
