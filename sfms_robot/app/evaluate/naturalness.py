@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -37,9 +37,12 @@ def evaluate_naturalness(
 ) -> dict[str, Any]:
     """Roll a listener out over the dyads of `split`, and hold what it did against what their listeners did.
 
-    Raises ConfigError for fewer than ten dyads. Blocks for minutes; shows how far it is.
+    Raises ConfigError for fewer than ten dyads, and for people who were trained on. Blocks for minutes; shows how far
+    it is.
     """
     one_thread()
+    if split == "train":
+        raise ConfigError("--split train: listeners were trained on these people; validation and test are others")
     dyads = _spread([at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, split))], clips)
     if len(dyads) < _LEAST_DYADS:
         raise ConfigError(f"{data}: {len(dyads)} dyads of {split}; people are told apart in {_LEAST_DYADS} or more")
@@ -66,7 +69,17 @@ def evaluate_naturalness(
         **told,
         **figures(manner.manners(ours, addressed), manner.manners(theirs, addressed)),
         **drifted(drift, theirs),
+        "notes": list(notes(dyads, taught)),
     }
+
+
+def notes(dyads: Sequence[Dyad], taught: Sequence[Floats]) -> Iterator[str]:
+    """What the figures do not say by themselves."""
+    unknown = sum(dyad.attention is None for dyad in dyads)
+    if unknown:
+        yield f"nobody knows where the person looks in {unknown} dyads: gaze counts all the time there"
+    if not taught:
+        yield "too few dyads of training: how well its people are told from these is not known"
 
 
 def of_training(data: Path, count: int) -> list[Floats]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ami_tables import UNTIL_S, words, write_tables
 
 from sfms_robot.corpora.compose.ami import Person, phrases
 from sfms_robot.corpora.meeting_evidence import meeting_evidence
@@ -22,20 +23,6 @@ from sfms_robot.listeners.events.hazards import HazardBank, load_tables
 from sfms_robot.listeners.events.model import EventModel
 
 NONE = np.zeros((0, 2))
-UNTIL_S = 600.0
-
-
-def words(seed, until_s=UNTIL_S, pause_s=2.0):
-    """(K, 2) words of 0.2 to 0.5 s in phrases of 2 to 20 of them."""
-    rng = np.random.default_rng(seed)
-    spans, at = [], 1.0
-    while at < until_s - 20:
-        for _ in range(rng.integers(2, 20)):
-            length = rng.uniform(0.2, 0.5)
-            spans.append((at, at + length))
-            at += length + 0.05
-        at += rng.exponential(pause_s) + 0.3
-    return np.round(spans, 2)
 
 
 def person(nods=NONE, other=None, **more):
@@ -169,45 +156,11 @@ def test_a_folder_that_is_not_there_is_one_line(tmp_path, data, out, problem):
     assert "\n" not in str(raised.value)
 
 
-AMI_TABLES = {
-    "participants": "meeting,agent,participant,role,head_annotated_until_s,n,has_gaze_focus",
-    "head_gestures": "meeting,agent,start_s,end_s,type,form",
-    "gaze_focus": "meeting,agent,start_s,end_s,type,target",
-    "words": "meeting,agent,start_s,end_s,kind,text",
-    "dialogue_acts": "meeting,agent,start_s,end_s,type",
-}
-
-
-def lacking(folder, kind, meeting="ES2002a"):
-    """Tables of two people in which everything happens but for one kind."""
-    said = [f"{meeting},B,{a},{b},w,yes" for a, b in words(0).tolist()]
-    laughs = [f"{meeting},A,{at},{at + 1},vocalsound,laugh" for at in range(20, 580, 40)]
-    laughs += [f"{meeting},B,{at},{at + 1},vocalsound,laugh" for at in range(22, 580, 40)]
-    heads = [
-        f"{meeting},A,{at + delay},{at + delay + 0.6},{type_},{form}"
-        for at in range(10, 580, 12)
-        for delay, type_, form in ((0, "concord_signal", "nod"), (4, "negative_signal", "shake"),
-                                   (8, "other_comm_head", ""))
-    ]  # fmt: skip
-    gaze = [f"{meeting},A,{at},{at + 4},person,B" for at in range(0, 590, 6)]
-    gaze += [f"{meeting},A,{at + 4},{at + 6},place,table" for at in range(0, 590, 6)]
-    short = [f"{meeting},A,{at},{at + 0.3},w,mm-hm" for at in range(15, 580, 25)]
-    rows = {
-        "participants": [f"{meeting},{agent},{agent}1,PM,600,1,{int(kind != 'gaze_shift')}" for agent in "AB"],
-        "head_gestures": heads,
-        "gaze_focus": [] if kind == "gaze_shift" else sorted(gaze),
-        "words": said + short + ([] if kind == "laugh" else laughs),
-        "dialogue_acts": [f"{meeting},B,{at},{at + 1},el.inf" for at in range(30, 580, 30)],
-    }
-    for name, header in AMI_TABLES.items():
-        (folder / f"{name}.csv").write_text("\n".join([header, *rows[name]]) + "\n")
-
-
 @pytest.mark.parametrize("kind", ["gaze_shift", "laugh"])
 def test_meetings_in_which_nobody_does_it_teach_nobody_and_say_so(tmp_path, kind):
     from sfms_robot.app.train.event_training import train_events
 
-    lacking(tmp_path, kind)
+    write_tables(tmp_path, lacking=kind)
     with pytest.raises(ConfigError, match=f"there is no {kind}") as raised:
         train_events(tmp_path, None, False, 1)
     assert "\n" not in str(raised.value) and str(tmp_path) in str(raised.value)
@@ -216,7 +169,7 @@ def test_meetings_in_which_nobody_does_it_teach_nobody_and_say_so(tmp_path, kind
 def test_without_people_of_validation_nothing_is_ranked(tmp_path):
     from sfms_robot.app.train.event_training import train_events
 
-    lacking(tmp_path, None)
+    write_tables(tmp_path)
     found = train_events(tmp_path, tmp_path / "events.yaml", False, 1)
     assert found["people"]["validation"] == 0 and "rollout" not in found
     assert load_tables(tmp_path / "events.yaml").hazards["nod"].per_minute > 1
