@@ -47,6 +47,7 @@ from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
 from sfms_robot.network import check_zenoh
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Timeline
+from sfms_robot.realtime import realtime_priority
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.spontaneous import Life
 from sfms_robot.runtime.clock import RealClock, VirtualClock
@@ -57,7 +58,7 @@ from sfms_robot.runtime.heat import HeatGuard
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
-from sfms_robot.runtime.safety import Interrupt, realtime_priority, signals_to
+from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.runtime.service_notify import NotifyingObserver, ServiceManager
 from sfms_robot.runtime.status import RunStatus
 from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
@@ -69,7 +70,6 @@ from sfms_robot.sources.registry import open_source, split_kind
 
 logger = logging.getLogger(__name__)
 
-SIM_READ_DEADLINE_S: Final = 0.02  # an emulator shares the computer's cores: it may be late without being silent
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 INTERRUPTED: Final = 130
 
@@ -260,7 +260,7 @@ def _build_one(
         more = {"faults": head.faults}
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
-        deadline_s = max(deadline_s, SIM_READ_DEADLINE_S)
+        deadline_s = max(deadline_s, where.read_deadline_s)
     bus: Bus = family.bus_class()(
         name,
         servos,

@@ -34,6 +34,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -43,6 +44,7 @@ from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.pseudo_terminal import PseudoTerminal
 from sfms_robot.errors import ConfigError
+from sfms_robot.realtime import realtime_priority
 from sfms_robot.servo.registers import Table
 
 _CHUNK: Final = 4096
@@ -276,13 +278,12 @@ def main() -> None:
     link = description["link"] or os.path.join(folder, "device")
     try:
         server = Server(wire, description["virtual"], folder, link)
-        ready = json.dumps({"device": link, "control": server.control, "folder": folder})
-        sys.stdout.write(f"ready {ready}\n")
-        sys.stdout.flush()
-        try:
+        # A servo has a processor of its own: it answers in time whatever else this computer does.
+        with closing(server), realtime_priority(wanted=not description["virtual"]) as priority:
+            ready = {"device": link, "control": server.control, "folder": folder, "priority": priority}
+            sys.stdout.write(f"ready {json.dumps(ready)}\n")
+            sys.stdout.flush()
             server.run()
-        finally:
-            server.close()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

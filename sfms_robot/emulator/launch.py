@@ -29,6 +29,9 @@ from sfms_robot.errors import BusError, ConfigError
 
 __all__ = ["Chain", "EmulatedServo", "launch", "wait"]
 
+READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
+PROMPT_DEADLINE_S = 0.005  # one with real-time priority
+
 _START_S = 20.0
 
 
@@ -40,6 +43,7 @@ class Chain:
         control: path of the control socket.
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
         servos: what is plugged in.
+        priority: "fifo" where it answers as promptly as hardware; else why not (`realtime.realtime_priority`).
     """
 
     def __init__(
@@ -50,17 +54,24 @@ class Chain:
         device: str,
         control: str,
         folder: str,
+        priority: str,
     ) -> None:
         self.servos = tuple(servos)
         self.virtual = virtual
         self.device = device
         self.control = control
+        self.priority = priority
         self._process = process
         self._folder = folder
 
     @property
     def pid(self) -> int:
         return self._process.pid
+
+    @property
+    def read_deadline_s(self) -> float:
+        """Silence after which one of its servos is rightly called silent."""
+        return PROMPT_DEADLINE_S if self.priority == "fifo" else READ_DEADLINE_S
 
     def kill(self, servo_id: int) -> None:
         """The servo falls silent, as with its cable out; its motor keeps doing what it was told."""
@@ -201,7 +212,7 @@ def launch(
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
     process, told = _started(description)
-    return Chain(process, servos, virtual, told["device"], told["control"], told["folder"])
+    return Chain(process, servos, virtual, told["device"], told["control"], told["folder"], told["priority"])
 
 
 def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:

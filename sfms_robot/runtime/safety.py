@@ -1,11 +1,9 @@
-"""What keeps a run safe from the outside: the way to rest, signals turned into a request to end, real-time priority."""
+"""What keeps a run safe from the outside: the way to rest, and signals turned into a request to end."""
 
 from __future__ import annotations
 
 import logging
-import os
 import signal
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -24,7 +22,6 @@ ARRIVED_RAD: Final = 1e-4  # of a goal
 STANDS_RAD: Final = 0.01  # of a servo: its gear and its load leave it a little short
 FOLLOW_S: Final = 0.3  # that servos are given after their goals have arrived
 FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
-SWITCH_S: Final = 0.0001  # a tick waits that long for another thread; Python's own 5 ms is half a tick
 
 T = TypeVar("T", float, Doubles)
 Seen = Callable[[float, float, Doubles, Mapping[str, Reading]], None]  # time, share of the way ahead, goals, readings
@@ -154,37 +151,3 @@ def signals_to(interrupt: Interrupt) -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def realtime_priority(wanted: bool = True) -> Iterator[str]:
-    """SCHED_FIFO while inside, where the system grants it. Yields "fifo", "not asked for", or why it was refused.
-
-    Inside, other threads of this process (a recorder, a progress bar) also hand the interpreter back ten times sooner.
-    """
-    if not wanted:
-        yield "not asked for"
-        return
-    usual_s = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_S)
-    try:
-        with _fifo() as outcome:
-            yield outcome
-    finally:
-        sys.setswitchinterval(usual_s)
-
-
-@contextmanager
-def _fifo() -> Iterator[str]:
-    try:
-        before = (os.sched_getscheduler(0) | os.SCHED_RESET_ON_FORK, os.sched_getparam(0))
-        # What is started meanwhile, such as a listener that died, is not to compete with the loop.
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        os.sched_setscheduler(0, policy, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
-    except (AttributeError, OSError) as error:
-        yield f"refused: {error}"
-        return
-    try:
-        yield "fifo"
-    finally:
-        os.sched_setscheduler(0, *before)

@@ -1,13 +1,10 @@
 """Signals become a request to end, and easing is smooth at both ends."""
 
-import os
 import signal
-import subprocess
-import sys
 
 import pytest
 
-from sfms_robot.runtime.safety import Interrupt, Released, realtime_priority, signals_to, smooth
+from sfms_robot.runtime.safety import Interrupt, Released, signals_to, smooth
 
 
 class NoBus:
@@ -65,18 +62,3 @@ def test_easing_starts_and_ends_at_rest_and_never_turns_back() -> None:
     assert values[0] == 0.0 and values[-1] == 1.0
     assert all(a <= b for a, b in zip(values, values[1:], strict=False))
     assert smooth(1e-3) < 1e-7 and 1 - smooth(1 - 1e-3) < 1e-7
-
-
-def test_priority_says_what_became_of_it() -> None:
-    with realtime_priority() as outcome:
-        assert outcome == "fifo" or outcome.startswith("refused: ")
-    with realtime_priority(wanted=False) as outcome:
-        assert outcome == "not asked for"
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no real-time priority here")
-def test_what_is_started_meanwhile_does_not_inherit_the_priority() -> None:
-    code = "import os; print(os.sched_getscheduler(0))"
-    with realtime_priority():
-        told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(told.stdout) == os.SCHED_OTHER

@@ -1,4 +1,5 @@
-"""A head that listens live: `face28` on emulated servos, `sfms-small`, a microphone and a phone, all in real time.
+"""A head that listens live: `face28` on emulated servos with the timing of a wire, `sfms-small`, a microphone and a
+phone, all in real time.
 
     idle          an empty loop of 100 Hz: how punctual this machine is with nothing of ours to do
     live          the run that is measured, with a recording of it
@@ -35,16 +36,18 @@ from sfms_robot.app.bench.measure import HEAD, LISTENER
 from sfms_robot.app.bench.memory_bench import ResidentMemory
 from sfms_robot.app.bench.procfs import children_of, processor_time_s
 from sfms_robot.app.bench.startup_bench import first_goal_s
-from sfms_robot.app.session import SIM_READ_DEADLINE_S, RunOptions, run
+from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir
+from sfms_robot.emulator.launch import READ_DEADLINE_S, launch
 from sfms_robot.emulator.phone import EmulatedPhone
 from sfms_robot.emulator.sound_server import SoundServer
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import AUDIO_HZ
 from sfms_robot.ports import Observer, Source
+from sfms_robot.realtime import realtime_priority
 from sfms_robot.runtime.clock import RealClock, tick_times
-from sfms_robot.runtime.safety import realtime_priority
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.quantiles import Quantiles
 from sfms_robot.sources.live_link import open_live_link
@@ -192,12 +195,12 @@ def live_person(folder: Path, audio: Audio) -> Iterator[LivePerson]:
                 thread.join()
 
 
-def patient_head(folder: Path) -> Path:
+def patient_head(folder: Path, deadline_s: float = READ_DEADLINE_S) -> Path:
     """`HEAD`, with the patience for emulated servos that `--port sim` has: they share this computer's cores."""
     place = folder / HEAD
     shutil.copytree(data_dir("configs") / "heads" / HEAD, place)
     raw = yaml.safe_load((place / "head.yaml").read_text(encoding="utf-8"))
-    raw["buses"]["main"]["read_deadline_ms"] = SIM_READ_DEADLINE_S * 1e3
+    raw["buses"]["main"]["read_deadline_ms"] = deadline_s * 1e3
     raw.pop("calibrate_first", None)
     (place / "head.yaml").write_text(yaml.safe_dump(raw, sort_keys=False), encoding="utf-8")
     return place
@@ -262,9 +265,13 @@ def measured_run() -> None:
     stamps = Stamps(source.loop_s, lambda: source.latency_s, rate_hz)
     memory = ResidentMemory(options["duration_s"] / _MEMORY_LOOKS)
     cpu = ProcessorTime()
-    run_options = RunOptions(HEAD, listener=LISTENER, duration_s=options["duration_s"], record=record)
+    how = {"listener": LISTENER, "duration_s": options["duration_s"], "record": record}
     try:
-        report = run(run_options, source=source, observers=[stamps, memory, cpu])
+        with TemporaryDirectory() as folder, launch(emulated(load_head(HEAD))["main"], timing="wire") as chain:
+            head = str(patient_head(Path(folder), chain.read_deadline_s))
+            report = run(
+                RunOptions(head, port=chain.device, yes=True, **how), source=source, observers=[stamps, memory, cpu]
+            )
     finally:
         over.set()
         source.close()

@@ -101,8 +101,8 @@ def tortured(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str,
     config = load_head(HEAD)
     with TemporaryDirectory() as name, live_person(Path(name), audio) as person:
         folder = Path(name)
-        with launch(emulated(config)["main"]) as chain:
-            with _running(folder, chain.device, person, audio) as command:
+        with launch(emulated(config)["main"], timing="wire") as chain:
+            with _running(folder, chain, person, audio) as command:
                 blows = _strike(_Victim(command, chain, config, person), order, minutes * 60, seed, say)
                 report = _ended(command)
             torque = [servo.id for servo in chain.servos if chain.state(servo.id)["torque"]]
@@ -188,6 +188,7 @@ def _degraded_by(why: str, wanted: bool, status: Mapping[str, Any]) -> bool:
 def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torque: Sequence[int]) -> dict[str, Any]:
     recording = read_recording(folder)
     missed = missed_ticks(recording.times_s, [blow.at_s for blow in blows])
+    near = {kind: missed_ticks(recording.times_s, [blow.at_s for blow in blows if blow.kind == kind]) for kind in KINDS}
     states = states_of(folder)
     recorded = sum(_recorded(blow, states) for blow in blows)
     changes = [each["state"] for each in report["states"]["changes"]]
@@ -197,6 +198,7 @@ def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torq
             "passed": sum(blow.passed for blow in of_kind),
             "degraded_s": max((blow.degraded_s for blow in of_kind if blow.degraded_s is not None), default=None),
             "well_s": max((blow.well_s for blow in of_kind if blow.well_s is not None), default=None),
+            "missed_ticks": near[kind]["after_a_blow"],
         }
         for kind in KINDS
     }
@@ -260,10 +262,11 @@ class _Command:
 
 
 @contextmanager
-def _running(folder: Path, device: str, person: LivePerson, audio: Audio) -> Iterator[_Command]:
+def _running(folder: Path, chain: Chain, person: LivePerson, audio: Audio) -> Iterator[_Command]:
     port, said = free_port(), folder / "said"
     words = [
-        "run", "--head", str(patient_head(folder)), "--port", device, "--listener", LISTENER, "--audio", audio,
+        "run", "--head", str(patient_head(folder, chain.read_deadline_s)), "--port", chain.device,
+        "--listener", LISTENER, "--audio", audio,
         "--face", person.face, "--record", str(folder / "run"), "--status", str(port), "--json", "--yes",
     ]  # fmt: skip
     paths = os.pathsep.join(filter(None, sys.path))
