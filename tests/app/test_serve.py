@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+
 pytest.importorskip("zenoh", reason="needs the extra [remote]")
 pytest.importorskip("prometheus_client", reason="needs the extra [remote]")
 

@@ -4,6 +4,8 @@ import pytest
 
 from sfms_robot.cli.meter import LevelMeter, meter_line
 
+pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+
 
 def test_port_list_shows_serial_ports_and_what_records_and_plays(sound_server, command_line):
     ended = command_line("port", "list", "--json")

@@ -26,6 +26,8 @@ from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
 from sfms_robot.sources.sound_devices import SoundDevice
 
+pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+
 PATIENCE_S = 60.0  # on a computer with nothing to spare
 TICK_S = 0.01
 LATENCY_S = 0.06

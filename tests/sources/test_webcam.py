@@ -18,6 +18,8 @@ from sfms_robot.sources.webcam import Webcam, open_webcam
 from sfms_robot.sources.webcam_worker import Landmarker, Opened, Seen, live, open_video, played, watch
 from sfms_robot.sources.worker import SourceWorker
 
+pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+
 ORIGIN_S = 1000.0
 PLACE_M = np.array([0.6, 0.0, 0.0], np.float32)
 FACE = SeenFace(face_of(pitch=0.1), PLACE_M)

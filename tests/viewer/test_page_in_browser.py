@@ -8,7 +8,11 @@ from chromium import Page, ServedRun, missing
 
 from sfms_robot.face.human import load_human
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}"),
+    pytest.mark.flaky(reruns=2),  # against clocks that all programs of this machine share
+]
 
 HUMAN = "human-cell"
 WINDOW, PHONE = (1000, 700), (390, 844)
