@@ -2,14 +2,16 @@
 
 import importlib
 import inspect
+import sys
+from types import ModuleType
 
 import pytest
 
 from sfms_robot.app import bench
-from sfms_robot.app.bench import BENCHES, performance_page, run_bench
+from sfms_robot.app.bench import BENCHES, Bench, measure_all, performance_page, run_bench
 from sfms_robot.app.bench.compute_budget import Board
 from sfms_robot.app.bench.measure import Told, row
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import BusError, ConfigError
 
 
 def quiet(line: str) -> None:
@@ -67,3 +69,15 @@ def test_a_row_says_how_often_against_what_and_on_which_machine():
     assert told.table[0] | {"p99": None} == {
         "measured": "one", "median": 2.0, "unit": "ms", "p99": None, "ratio": 0.5, "to": "somebody",
     }  # fmt: skip
+
+
+def test_a_bench_that_fails_does_not_cost_the_others_their_rows(monkeypatch):
+    def fails():
+        raise BusError("no servo answers")
+
+    module = ModuleType("of_the_test")
+    module.fails, module.works = fails, lambda: {"one": row([1.0], [2.0], "ms", "somebody")}
+    monkeypatch.setitem(sys.modules, f"{bench.__name__}.of_the_test", module)
+    both = {"first": Bench("of_the_test:fails", "fails"), "second": Bench("of_the_test:works", "works")}
+    told = measure_all(both, quiet)
+    assert not told.passed and list(told.lines) == ["first: no servo answers"] and list(told.figures) == ["one"]

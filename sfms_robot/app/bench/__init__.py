@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.errors import ConfigError, MissingExtra
+from sfms_robot.errors import ConfigError, RobotError
 
 if TYPE_CHECKING:
     from sfms_robot.app.bench.measure import Told
@@ -119,11 +119,14 @@ def run_bench(name: str, given: Mapping[str, Any], say: Say) -> Told:
             raise ConfigError(f"--{option} {given[option]}: only {those} takes it")
     if name != ALL:
         return _measured(chosen[name], given, say)
-    return _all(chosen, say)
+    return measure_all(chosen, say)
 
 
-def _all(chosen: Mapping[str, Bench], say: Say) -> Told:
-    """The rows of these, one after the other; one that cannot be measured here is left out, and that is told."""
+def measure_all(chosen: Mapping[str, Bench], say: Say) -> Told:
+    """The rows of these, one after the other; one that cannot be measured here is left out, and that is told.
+
+    One that fails does not cost the others: what went wrong is among the lines, and it has not passed.
+    """
     from sfms_robot.app.bench.measure import Told
 
     rows: dict[str, Any] = {}
@@ -133,8 +136,11 @@ def _all(chosen: Mapping[str, Bench], say: Say) -> Told:
         began_s = time.monotonic()
         try:
             told = _measured(one, {}, say)
-        except (MissingExtra, ConfigError) as error:
+        except ConfigError as error:
             say(f"{key} is left out: {error}")
+            continue
+        except RobotError as error:
+            failed.append(f"{key}: {error}")
             continue
         rows |= {name: each for name, each in told.figures.items() if isinstance(each, Mapping) and "median" in each}
         failed += [] if told.passed else [f"{key}: {line}" for line in told.lines]
