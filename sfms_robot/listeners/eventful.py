@@ -11,6 +11,9 @@ Of every frame, in this order:
 An event is decided `LEAD_FRAMES` before it begins, whatever the hop: a plan that is made in between shows it from its
 beginning. What has been decided is never taken back.
 
+The model of motion learned from people who sat before a camera. A face further from that than any camera follows
+(upside down, far off) is not one that it is shown; events judge it against its own last second (`events.face_signs`).
+
 Laws: `step_many` of several streams is each one's `step`; a plan tells each event once; with nothing decided the eyes
 look at the person; memory holds what is still under way, no more.
 """
@@ -34,6 +37,8 @@ from sfms_robot.signals.gaze_kinematics import GazeState
 
 EYES: Final = list(gaze_kinematics.EYE_CHANNELS)
 AT_THE_PERSON: Final = np.zeros(2)
+TURNED_RAD: Final = np.deg2rad(60.0)
+MOVED_M: Final = 1.0
 
 
 class MotionModel(Protocol):
@@ -124,7 +129,7 @@ class EventfulListener:
     def step(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
         decision, told = self._decided(speaker, memory)
-        plan, how = self.how.step(speaker, told.how, self._control(speaker, told))
+        plan, how = self.how.step(_believed(speaker), told.how, self._control(speaker, told))
         return self._looking(plan, decision, replace(told, how=how))
 
     def step_each(
@@ -134,7 +139,7 @@ class EventfulListener:
         decided = [self._decided(*each) for each in zip(speakers, memories, strict=True)]
         told = [memory for _, memory in decided]
         controls = [self._control(*each) for each in zip(speakers, told, strict=True)]
-        moved = self._move_each(speakers, [memory.how for memory in told], controls)
+        moved = self._move_each([*map(_believed, speakers)], [memory.how for memory in told], controls)
         return [
             self._looking(plan, decision, replace(memory, how=how))
             for (plan, how), (decision, memory) in zip(moved, decided, strict=True)
@@ -156,7 +161,7 @@ class EventfulListener:
         decided = [self._decided(speaker, memory) for memory in memories]
         told = [memory for _, memory in decided]
         controls = [self._control(speaker, memory) for memory in told]
-        plans, hows = self._move_many(speaker, [memory.how for memory in told], controls)
+        plans, hows = self._move_many(_believed(speaker), [memory.how for memory in told], controls)
         found = [
             self._looking(plan, decision, replace(memory, how=how))
             for plan, (decision, memory), how in zip(plans, decided, hows, strict=True)
@@ -200,6 +205,15 @@ class EventfulListener:
             frames = memory.idle.added(frames, plan.times_s)
         told = replace(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
         return told, replace(memory, news=(), gaze=(newest[0], *states))
+
+
+def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
+    """The frame without its face where that is turned or moved further than a person before a camera is."""
+    if speaker.face is None:
+        return speaker
+    pose = np.abs(speaker.face.pose)
+    near = bool((pose[:3] <= TURNED_RAD).all() and (pose[3:] <= MOVED_M).all())
+    return speaker if near else replace(speaker, face=None)
 
 
 def frame_of(speaker: SpeakerFrame) -> int:

@@ -7,7 +7,7 @@ import pytest
 from tiny_sfms import speech, told_listener
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import EVENT_KINDS, FRAME_S, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FaceFrame, SpeakerFrame
 from sfms_robot.listeners.eventful import EventfulListener, frame_of, target_at
 from sfms_robot.listeners.events.model import LEAD_FRAMES, EventModel
 from sfms_robot.signals.control import COLUMNS
@@ -156,6 +156,26 @@ def test_at_hop_plans_as_often_and_decides_the_same(lively):
     assert len(two) == 2 * len(four)
     events = [[(e.kind, e.start_s) for plan in plans for e in plan.events] for plans in (two, four)]
     assert events[0][: len(events[1])] == events[1] and events[1]
+
+
+@pytest.mark.parametrize(("channel", "value"), [("roll", np.pi), ("yaw", -1.1), ("x", 2.0), ("pitch", np.nan)])
+def test_a_face_as_no_camera_sees_one_moves_it_as_none_does(when, channel, value):
+    """Upside down, turned away, in another room: alone, side by side and in a batch."""
+    calm, near, motion = EventfulListener(told_listener(hop=2), when, NOTHING), speech(40), np.zeros(58, np.float32)
+    motion[CHANNEL_INDEX[channel]] = value
+    far = [replace(frame, face=FaceFrame.of(frame.time_s, motion)) for frame in near]
+    nobody = [plan.frames for plan in plans_of(calm, [replace(frame, face=None) for frame in near])[0]]
+    np.testing.assert_array_equal([plan.frames for plan in plans_of(calm, far)[0]], nobody)
+    assert not np.array_equal([plan.frames for plan in plans_of(calm, near)[0]], nobody)
+    many, each, found = [calm.start(1)], [calm.start(1)], []
+    for frame in far:
+        plans, many = calm.step_many(frame, many)
+        ((plan, one),) = calm.step_each([frame], each)
+        each = [one]
+        found += [(plans[0].frames, plan.frames)] if plan is not None else []
+    for (together, batched), alone in zip(found, nobody, strict=True):
+        np.testing.assert_allclose(together, alone, atol=1e-5)
+        np.testing.assert_allclose(batched, alone, atol=1e-5)
 
 
 def test_control_rows_are_those_the_model_asks_for(lively):
