@@ -10,15 +10,12 @@ Pages of other sites may not send commands: their browser tells whose page it is
 from __future__ import annotations
 
 import json
-import sys
-import threading
 from collections.abc import Callable, Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.app.fleet.fleet_client import Fleet, FleetBoard
-from sfms_robot.endpoint import LOOPBACK
+from sfms_robot.app.loopback_server import Answer, LoopbackServer
 from sfms_robot.errors import PortError, RobotError
 from sfms_robot.origin import host_problem, origin_problem
 
@@ -39,36 +36,27 @@ class FleetPage:
             self._server = _Server(port, fleet, board)
         except OSError as error:
             raise PortError(f"--port {port}: {error.strerror or error} (another, or 0 for a free one)") from error
-        self.url = f"http://{LOOPBACK}:{self._server.server_address[1]}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, name="fleet page", daemon=True)
-        self._thread.start()
+        self.url = self._server.url
+        self._server.begin()
 
     def close(self) -> None:
         """Give the port back."""
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
+        self._server.close()
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-
+class _Server(LoopbackServer):
     def __init__(self, port: int, fleet: Fleet, board: FleetBoard) -> None:
-        super().__init__((LOOPBACK, port), _Handler)
+        super().__init__(port, _Answer, "fleet page")
         self.fleet, self.board = fleet, board
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        if not isinstance(sys.exception(), ConnectionError):  # who has gone without waiting for the answer
-            super().handle_error(request, client_address)
 
-
-class _Handler(BaseHTTPRequestHandler):
+class _Answer(Answer):
     def do_GET(self) -> None:
         assert isinstance(self.server, _Server)
         if (problem := host_problem(self.headers.get("Host", ""))) is not None:
             self._json(403, {"error": problem})
         elif self.path == "/":
-            self._answer(200, PAGE.read_bytes(), "text/html; charset=utf-8")
+            self.answer(200, PAGE.read_bytes(), "text/html; charset=utf-8")
         elif self.path == "/heads":
             self._json(200, {"heads": self.server.board.tiles()})
         else:
@@ -106,16 +94,4 @@ class _Handler(BaseHTTPRequestHandler):
         return heads
 
     def _json(self, code: int, told: Mapping[str, Any]) -> None:
-        self._answer(code, json.dumps(told).encode(), "application/json")
-
-    def _answer(self, code: int, body: bytes, kind: str) -> None:
-        self.send_response(code)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(body)))
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Frame-Options", "DENY")
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *_: object) -> None:
-        """Nobody needs a line per request."""
+        self.answer(code, json.dumps(told).encode(), "application/json")

@@ -8,13 +8,11 @@ Read only: who can read it can change nothing.
 from __future__ import annotations
 
 import json
-import sys
-import threading
 from collections.abc import Callable, Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
+from sfms_robot.app.loopback_server import Answer, LoopbackServer
+from sfms_robot.endpoint import HIGHEST_PORT, port_number
 from sfms_robot.errors import ConfigError, PortError
 
 AUTO: Final = "auto"  # `--status` without a port: `PORT`, or the next that is free
@@ -39,10 +37,8 @@ class StatusServer:
 
     def __init__(self, wanted: str) -> None:
         self._server = _bound(wanted)
-        self.port = int(self._server.server_address[1])
-        self.url = f"http://{LOOPBACK}:{self.port}/"
+        self.port, self.url = self._server.port, self._server.url
         self._taken = f" ({PORT} is taken)" if wanted == AUTO and self.port != PORT else ""
-        self._thread: threading.Thread | None = None
 
     def __str__(self) -> str:
         """Where it is, for people."""
@@ -51,47 +47,26 @@ class StatusServer:
     def serve(self, document: Document) -> None:
         """Answer with this document from now on, in threads of its own."""
         self._server.document = document
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._server.serve_forever, name="status", daemon=True)
-            self._thread.start()
+        self._server.begin()
 
     def close(self) -> None:
         """Give the port back. Idempotent."""
-        if self._thread is not None:
-            self._server.shutdown()
-            self._thread.join()
-            self._thread = None
-        self._server.server_close()
+        self._server.close()
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-
+class _Server(LoopbackServer):
     def __init__(self, port: int) -> None:
-        super().__init__((LOOPBACK, port), _Handler)
+        super().__init__(port, _Answer, "status")
         self.document: Document = dict
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        if not isinstance(sys.exception(), ConnectionError):  # who has gone without waiting for the answer
-            super().handle_error(request, client_address)
 
-
-class _Handler(BaseHTTPRequestHandler):
+class _Answer(Answer):
     def do_GET(self) -> None:
         if self.path not in ("/", "/status"):
             self.send_error(404)
             return
         assert isinstance(self.server, _Server)
-        body = json.dumps(self.server.document(), allow_nan=False).encode()
-        self.send_response(200)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(body)))
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *_: object) -> None:
-        """Nobody needs a line per request."""
+        self.answer(200, json.dumps(self.server.document(), allow_nan=False).encode(), "application/json")
 
 
 def _bound(wanted: str) -> _Server:
