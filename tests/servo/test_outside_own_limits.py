@@ -1,6 +1,7 @@
 """Servos found outside their own stored limits, as those of a sagged head, come in gently or stay without torque."""
 
 import logging
+import math
 
 import pytest
 from chain_rig import ServoRig
@@ -241,3 +242,11 @@ def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus(make_r
         rig.chain.supply(5.0)
         _, readings = rig.until(held, lambda each: each["joint2"].rejoined, 8.0)
         assert rig.chain.state(2)["position"] >= STORED["min_position_limit"]
+
+
+def test_a_joint_outside_the_limits_of_the_head_is_told_with_its_angle_and_what_to_do(make_rig, caplog):
+    with make_rig([EmulatedServo(1, start_ticks=4000)]) as rig, caplog.at_level(logging.WARNING):
+        held = rig.hold()
+    (line,) = caplog.messages
+    assert f"joint1 (id 1) stands at {math.degrees(held[0]):.1f} deg, outside its limits " in line
+    assert "held there and led in" in line and "head calibrate" in line and "\n" not in line

@@ -349,7 +349,13 @@ class ChainBus(WireBus[L], Generic[L]):
         """The angle of a servo that holds where it stands; the range reaches out to it."""
         angle = float(self._conversion.to_rad(self._telemetry.ticks)[index])
         if not self._goals.hold(index, angle):
-            log.warning("%s (id %d) stands outside its limits and is held there", *self._name(index))
+            servo = self._servos[index]
+            stands, low, high = np.degrees([angle, servo.min_rad, servo.max_rad]).round(1)
+            log.warning(
+                "%s (id %d) stands at %g deg, outside its limits %g..%g, as after hanging without torque: it is held "
+                "there and led in (one that hangs on nothing: `sfms-robot head calibrate`)",
+                *self._name(index), stands, low, high,
+            )  # fmt: skip
         return angle
 
     # --- every tick ---------------------------------------------------------------------------------------------
