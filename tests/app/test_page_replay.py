@@ -12,6 +12,9 @@ from sfms_robot.app.listen.preflight import begin_page
 from sfms_robot.app.replay.page_replay import pictures, show_recording
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.session import RunOptions, run
+from sfms_robot.frames import MOTION_DIM, Reading
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.recorder import Recorder
 from sfms_robot.viewer.frame_record import frame_json
 
 
@@ -32,6 +35,17 @@ def test_twenty_five_pictures_a_second_are_what_was_recorded(folder):
     assert np.allclose(middle["m"], recording.motion[row], atol=6e-5)
     assert np.allclose(middle["j"], recording.goals_rad[row], atol=6e-5)
     assert [told[0]["s"], told[-1]["s"]] == ["starting", "stopping"] and middle["db"] is not None
+
+
+def test_a_position_that_was_old_is_not_shown_as_read(tmp_path):
+    recorder = Recorder(tmp_path / "run", ("slow", "away"), when_full="wait")
+    for index in range(50):
+        readings = {"slow": Reading(0.11, 0.04 * (index % 25)), "away": Reading(0.12, 0.04 * index)}
+        recorder.tick(Tick(0.04 * index, np.zeros(MOTION_DIM, np.float32), np.array([0.1, 0.2]), readings))
+    recorder.close()
+    told = [json.loads(frame_json(record)) for record in pictures(read_recording(tmp_path / "run"))]
+    assert all(each["r"][0] == 0.11 for each in told)
+    assert told[20]["r"] == [0.11, 0.12] and told[-1]["r"] == [0.11, None] and told[-1]["u"] == [0.11, 0.2]
 
 
 def test_the_page_has_all_of_it(folder):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from sfms_robot.app.listen.run_facts import LONG
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
+from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.recorder import RUN_FILE, parts_of
 
 _PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
@@ -36,7 +37,7 @@ class RunRecording:
         about: what the run wrote about itself (head, listener, seed, ...).
         joints: (J,) names.
         times_s: (N,) of the ticks. motion: (N, 58) the face asked for.
-        goals_rad, present_rad: (N, J) float32; present is NaN where no servo answered.
+        goals_rad, present_rad: (N, J) float32; present is NaN where nothing was read within `AWAY_S`.
         faults: (N, J) a named fault is there.
         heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
         energy_db: (M,). speaker: (M, 58) NaN where no face was seen.
@@ -228,7 +229,7 @@ class _Found:
     def _tick(self, time_s: float, joints: Sequence[Mapping[str, Any]]) -> None:
         self._times_s.append(time_s)
         self._goals_rad.extend(joint["goal_rad"] for joint in joints)
-        self._present_rad.extend(_or_nan(joint["present_rad"]) for joint in joints)
+        self._present_rad.extend(_read_rad(joint) for joint in joints)
         self._faults += bytes(joint["fault"] is not None for joint in joints)
 
     def _told(self, time_s: float, servos: Mapping[str, Mapping[str, Any]]) -> None:
@@ -267,6 +268,11 @@ class _Found:
 
 def _by_channel(body: Mapping[str, float | None] | None) -> list[float]:
     return [math.nan if body is None else _or_nan(body[name]) for name in CHANNELS]
+
+
+def _read_rad(joint: Mapping[str, Any]) -> float:
+    """A position that is older than the servo may be away is none."""
+    return math.nan if (joint.get("age_s") or 0.0) > AWAY_S else _or_nan(joint["present_rad"])
 
 
 def _or_nan(value: float | None) -> float:
