@@ -8,6 +8,7 @@ import { fileURLToPath } from 'node:url';
 
 const here = dirname(fileURLToPath(import.meta.url));
 const target = join(here, '..', 'sfms_robot', 'viewer', 'static');
+const SHARED = ['mesh.js', 'skin.js']; // of the page and of that of `evaluate people`: files of their own, which both load
 const VISION = ['vision_wasm_internal.js', 'vision_wasm_internal.wasm'];
 const LICENSES = `urdf-loader: Apache License 2.0, Copyright Garrett Johnson, https://github.com/gkjohnson/urdf-loaders
 @mediapipe/tasks-vision: Apache License 2.0, Copyright The MediaPipe Authors, https://github.com/google-ai-edge/mediapipe
@@ -16,14 +17,13 @@ three: as follows
 `;
 
 async function built(folder) {
+  const common = { absWorkingDir: here, outdir: folder, minify: true, target: 'es2022', legalComments: 'none', logLevel: 'warning' };
   await build({
-    absWorkingDir: here,
-    entryPoints: { app: 'src/main.js', 'voice-worklet': 'src/voice-worklet.js' },
-    outdir: folder, bundle: true, splitting: true, format: 'esm', minify: true, target: 'es2022',
-    chunkNames: '[name]', legalComments: 'none', logLevel: 'warning',
+    ...common, bundle: true, splitting: true, format: 'esm', chunkNames: '[name]', external: SHARED.map((file) => `./${file}`),
+    entryPoints: { app: 'src/main.js', people: 'src/people.js', 'voice-worklet': 'src/voice-worklet.js' },
   });
-  await build({ absWorkingDir: here, entryPoints: ['src/app.css'], outdir: folder, minify: true, logLevel: 'warning' });
-  cpSync(join(here, 'src', 'index.html'), join(folder, 'index.html'));
+  await build({ ...common, entryPoints: [...SHARED, 'app.css', 'people.css'].map((file) => `src/${file}`) });
+  for (const file of ['index.html', 'people.html']) cpSync(join(here, 'src', file), join(folder, file));
   mkdirSync(join(folder, 'vision'), { recursive: true });
   for (const file of VISION) cpSync(join(here, 'node_modules/@mediapipe/tasks-vision/wasm', file), join(folder, 'vision', file));
   writeFileSync(join(folder, 'LICENSES.txt'), LICENSES + readFileSync(join(here, 'node_modules/three/LICENSE'), 'utf8'));

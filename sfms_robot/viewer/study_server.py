@@ -1,6 +1,6 @@
 """The page of a blind comparison (`evaluate people`): two clips, some questions, one answer after the other.
 
-    /                the page             /people/...      what it loads
+    /                the page             /static/...      what it loads
     /clips/...       motion and voices    /human/head.bin  the virtual human
     POST /begin      -> {"participant", "questions"}
     POST /next       {"participant"} -> {"answered", "trials"}; if one is left {"trial", "audio", "left", "right"} too
@@ -32,9 +32,8 @@ from sfms_robot.viewer.compressed_files import CompressedFiles
 from sfms_robot.viewer.human_file import human_gz
 from sfms_robot.viewer.page_child import bound, url
 from sfms_robot.viewer.page_process import Address
-from sfms_robot.viewer.page_server import guarded_app
+from sfms_robot.viewer.page_server import STATIC, guarded_app
 
-PAGE: Final = Path(__file__).with_name("people")
 MOST_BYTES: Final = 4096  # of a message
 MOST_NAME: Final = 64
 
@@ -76,7 +75,7 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
         return _json(study.next(participant))
 
     async def page(request: Request) -> Response:
-        return FileResponse(PAGE / "index.html", media_type="text/html")
+        return FileResponse(STATIC / "people.html", media_type="text/html")
 
     async def human(request: Request) -> Response:
         return Response(await asyncio.to_thread(human_gz), headers={"content-encoding": "gzip"})
@@ -89,7 +88,7 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
                 Route("/next", following, methods=["POST"]),
                 Route("/answer", answer, methods=["POST"]),
                 Route("/human/head.bin", human),
-                Mount("/people", CompressedFiles(PAGE)),
+                Mount("/static", CompressedFiles(STATIC)),
                 Mount("/clips", StaticFiles(directory=study.clips)),
             ],
             exception_handlers={ConfigError: _refused},

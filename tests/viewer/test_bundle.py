@@ -18,8 +18,7 @@ def test_the_bundle_is_what_the_sources_give(tmp_path):
     copy = tmp_path / "page"
     shutil.copytree(PAGE, copy, ignore=shutil.ignore_patterns("node_modules"))
     (tmp_path / "sfms_robot" / "viewer").mkdir(parents=True)
-    for made in (STATIC, STATIC.with_name("people")):
-        (tmp_path / "sfms_robot" / "viewer" / made.name).symlink_to(made)
+    (tmp_path / "sfms_robot" / "viewer" / STATIC.name).symlink_to(STATIC)
     subprocess.run(["npm", "ci", "--no-audit", "--no-fund"], cwd=copy, check=True, capture_output=True)
     done = subprocess.run(["npm", "run", "check"], cwd=copy, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -30,11 +29,18 @@ def test_it_is_small_without_face_tracking():
     assert sum(len(gzip.compress(file.read_bytes())) for file in files) < 1_500_000
 
 
-def test_everything_that_the_page_names_is_there_and_relative():
-    named = re.findall(r'(?:href|src)="([^"]+)"', (STATIC / "index.html").read_text())
+@pytest.mark.parametrize("page", ["index.html", "people.html"])
+def test_everything_that_a_page_names_is_there_and_relative(page):
+    named = re.findall(r'(?:href|src)="([^"]+)"', (STATIC / page).read_text())
     ours = [name for name in named if not name.startswith(("data:", "#"))]
     assert all(not name.startswith(("/", "http")) for name in ours)
     assert all((STATIC / name.removeprefix("static/")).is_file() for name in ours if name.startswith("static/"))
+
+
+def test_what_both_pages_draw_with_is_bundled_once():
+    ours = {file.name: file.read_text() for file in STATIC.glob("*.js")}
+    assert [name for name, text in ours.items() if "gl_FragColor = vec4(toScreen" in text] == ["skin.js"]
+    assert all('from"./skin.js"' in ours[name] and 'from"./mesh.js"' in ours[name] for name in ("app.js", "people.js"))
 
 
 def test_the_lock_file_names_no_registry():

@@ -96,7 +96,7 @@ def test_strangers_and_files_beside_the_clips_are_refused(study):
         assert served.ask("begin", {}, X_Token="secret")[0] == 200
         assert served.ask("", None, Host="evil.example")[0] == 403
         assert served.ask("clips/../study.json")[0] == 404 and served.ask("clips/%2e%2e/study.json")[0] == 404
-        assert served.ask("")[0] == 200 and served.ask("people/people.js")[0] == 200
+        assert served.ask("")[0] == 200 and served.ask("static/people.js")[0] == 200
         assert served.ask("human/head.bin")[0] == 200
 
 
