@@ -1,12 +1,13 @@
 """The page beside the servo loop: what three who look cost, and how soon a halt from the page is on the wire.
 
-    without    the default head on emulated servos listens; no page
-    with       the same, and three plain WebSocket clients in a process of their own read every picture
+    without    nobody looks, and the run tells its page nothing
+    with       it tells the page everything, and three plain WebSocket clients in a process of their own read all of it
 
-Both in turn, several times: what else a computer does changes a run's share by more than a page does. Processor time is
-that of the run's process and of the page's, once a second, and medians are compared; the listener, the servos and the
-clients have processes of their own and are not counted. A halt counts from the click, a message that leaves a fourth
-client, until the goals of the first braking tick are written.
+Windows of the default head's run on emulated servos, by turns and within one run: two runs that do the same work differ
+by several times what a page costs. Each window with clients is laid beside the mean of its two neighbours, and the
+median is what the run's process pays; the page's process exists for the page alone, and counts whole. The listener, the
+servos and the clients have processes of their own and are not counted. A halt counts from the click, a message that
+leaves a fourth client, until the goals of the first braking tick are written.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,17 +29,22 @@ from websockets.sync.client import ClientConnection, connect
 
 from sfms_robot.app.bench.measure import HEAD, Told, machine, row
 from sfms_robot.app.bench.procfs import processor_time_s
+from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_session import page_session
 from sfms_robot.app.listen.preflight import begin_page
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.session import Document, RunOptions, run
 from sfms_robot.child_process import take_pipes
+from sfms_robot.config import load_head
 from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.viewer.page_process import PageProcess
 
 SETTLE_S: Final = 4.0
-WINDOW_S: Final = 8
-ROUNDS: Final = 3
+PAUSE_S: Final = 0.5  # after a turn: who comes gets a hello, who goes says good-bye
+WINDOW_S: Final = 2.0
+PAIRS: Final = 20
 HALTS: Final = 8
 CLIENTS: Final = 3
 MOST_CPU: Final = 3.0  # % of a core
@@ -47,58 +54,94 @@ _LIMIT_S: Final = 60.0
 _CHILD: Final = "from sfms_robot.app.bench.view_bench import clients; clients()"
 
 
+@dataclass(frozen=True)
+class Window:
+    """`WINDOW_S` of a run: processor time [% of a core] of its process and of the page's, and ticks that came late."""
+
+    looked_at: bool
+    run_share: float
+    page_share: float
+    late: int
+
+
 def measure(say: Callable[[str], None]) -> Told:
-    """All runs, two and a half minutes. Linux only. Raises ConfigError elsewhere, BusError when a run ends early."""
+    """Both runs, two and a half minutes. Linux only. Raises ConfigError elsewhere, BusError when a run ends early."""
     if not Path("/proc/self/stat").is_file():
         raise ConfigError("bench view: processor time of the page's process is read from /proc (Linux)")
-    without, viewed, page_shares = [], [], []
-    late = {"without": 0, "with": 0}  # not counting a halt that ends: torque comes on again, which blocks
-    for number in range(1, ROUNDS + 1):
-        say(f"{number} of {ROUNDS}: {WINDOW_S} s without a page")
-        plain = _Watch()
-        late["without"] += _finished(run(_options(SETTLE_S + WINDOW_S + 1), observers=[plain]))["tick"]["late"]
-        without += plain.shares
-        say(f"{number} of {ROUNDS}: {WINDOW_S} s with {CLIENTS} clients")
-        watch, told, _ = _viewed(0)
-        late["with"] += told["tick"]["late"]
-        viewed += watch.shares
-        page_shares += watch.page_shares
+    say(f"{PAIRS} times {PAUSE_S + WINDOW_S:g} s with {CLIENTS} clients, and without a page before and after")
+    windows = _windows()
     say(f"{HALTS} halts")
-    _, _, clicks_ms = _viewed(HALTS)
-    figures: dict[str, Any] = {
-        "view.cpu": row(viewed, without, "% of a core", "the same run without a page"),
-        "view.halt": row(clicks_ms, [MOST_HALT_MS], "ms", "what there is time for"),
-    }
-    cost = float(np.median(viewed) - np.median(without))
-    figures |= {
-        "cost": {"share": round(cost, 3), "unit": "% of a core", "clients": CLIENTS, "wanted": MOST_CPU},
-        "late_ticks": late,
+    figures = cost_figures(windows) | {
+        "view.halt": row(_halts(), [MOST_HALT_MS], "ms", "what there is time for"),
         "machine": machine(),
     }
+    cost, late = figures["cost"], figures["late_ticks"]
     rows = Told.of_rows({name: figures[name] for name in ("view.cpu", "view.halt")}).table
     lines = [
-        f"{CLIENTS} clients: {cost:.2f} % of a core, of which the page's process {np.median(page_shares):.2f}",
+        f"{CLIENTS} clients: {cost['share']:.2f} % of a core, of which the page's process {cost['page_share']:.2f} and "
+        f"the run's {cost['run_share']:.2f} (half of the windows {cost['run_quartiles'][0]:.2f} to "
+        f"{cost['run_quartiles'][1]:.2f})",
         f"late ticks: {late['with']}, without a page {late['without']}",
     ]
     return Told(figures, rows, lines)
 
 
-class _Watch(Observer):
-    """Processor time [% of a core] of each second of the window, and when the first braking goals were written.
+def cost_figures(windows: Sequence[Window]) -> dict[str, Any]:
+    """What looking costs. `windows` are without and with clients by turns; the first and the last are without."""
+    before, looked, after = windows[:-2:2], windows[1::2], windows[2::2]
+    apart = [
+        one.run_share - (left.run_share + right.run_share) / 2
+        for left, one, right in zip(before, looked, after, strict=True)
+    ]
+    page, run = float(np.mean([one.page_share for one in looked])), float(np.median(apart))
+    whole = [one.run_share + one.page_share for one in looked]
+    return {
+        "view.cpu": row(whole, [one.run_share for one in windows[::2]], "% of a core", "the same run without a page"),
+        "cost": {
+            "share": round(page + run, 3), "page_share": round(page, 3), "run_share": round(run, 3),
+            "run_quartiles": [round(float(each), 3) for each in np.percentile(apart, [25, 75])],
+            "unit": "% of a core", "clients": CLIENTS, "wanted": MOST_CPU,
+        },
+        "late_ticks": {
+            "without": sum(one.late for one in windows[2::2]),  # as many windows as with
+            "with": sum(one.late for one in looked),
+        },
+    }  # fmt: skip
+
+
+class _Turns(Observer):
+    """Tells an observer what happens while `on`; set `settled` once the run is under way."""
+
+    def __init__(self, inner: Observer) -> None:
+        self.on, self.settled = False, threading.Event()
+        self._inner = inner
+
+    def tick(self, seen: Tick) -> None:
+        if seen.time_s >= SETTLE_S:
+            self.settled.set()
+        if self.on:
+            self._inner.tick(seen)
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        if self.on:
+            self._inner.heard(frame)
+
+    def planned(self, plan: Plan) -> None:
+        if self.on:
+            self._inner.planned(plan)
+
+
+class _Halted(Observer):
+    """Says when the run was under way, and when the first braking goals were written.
 
     Attributes:
-        shares: of this process and `page`, the number of another; page_shares: of that alone.
         halted: set at the first tick that brakes, which was at `halted_s` of `time.monotonic`.
     """
 
-    def __init__(self, page: int | None = None) -> None:
-        self.shares: list[float] = []
-        self.page_shares: list[float] = []
-        self.listening, self.halted, self.measured = threading.Event(), threading.Event(), threading.Event()
+    def __init__(self) -> None:
+        self.settled, self.halted = threading.Event(), threading.Event()
         self.halted_s = 0.0
-        self._page = page
         self._state = ""
-        threading.Thread(target=self._sample, name="sampler", daemon=True).start()
 
     def tick(self, seen: Tick) -> None:
         if seen.state != self._state:
@@ -107,49 +150,81 @@ class _Watch(Observer):
                 self.halted_s = time.monotonic()
                 self.halted.set()
         if seen.time_s >= SETTLE_S:
-            self.listening.set()
+            self.settled.set()
 
-    def _sample(self) -> None:
-        if not self.listening.wait(_LIMIT_S):
-            return
-        before_s, ours, theirs = time.monotonic(), _own_s(), _other_s(self._page)
-        for _ in range(WINDOW_S):
-            time.sleep(1.0)
-            now_s, own, other = time.monotonic(), _own_s(), _other_s(self._page)
-            self.shares.append(100 * (own - ours + other - theirs) / (now_s - before_s))
-            self.page_shares.append(100 * (other - theirs) / (now_s - before_s))
-            before_s, ours, theirs = now_s, own, other
-        self.measured.set()
+
+def _windows() -> list[Window]:
+    """One run, without and with clients by turns."""
+    found: list[Window] = []
+    page = begin_page("0")
+    assert page is not None
+    with closing(page), _readers() as look:
+        page.wait()
+        page.say("begin", scene=HEAD)
+        watcher = PageObserver(page, list(load_head(HEAD).joints))
+        turns = _Turns(watcher)
+
+        @contextmanager
+        def sampled(document: Document, *_: object) -> Iterator[None]:
+            watcher.document = document
+            by_turns = threading.Thread(target=_sample, args=(document, turns, page, look, found), daemon=True)
+            by_turns.start()
+            yield
+
+        duration_s = SETTLE_S + (2 * PAIRS + 1) * (PAUSE_S + WINDOW_S) + PAUSE_S
+        _finished(run(_options(duration_s), sampled, observers=[turns]))
+    if len(found) < 2 * PAIRS + 1:
+        raise BusError(f"the run ended after {len(found)} of {2 * PAIRS + 1} windows")
+    return found
+
+
+def _sample(
+    document: Document, turns: _Turns, page: PageProcess, look: Callable[[str | None], None], found: list[Window]
+) -> None:
+    """The windows of a run, in a thread of their own."""
+    if not turns.settled.wait(_LIMIT_S):
+        return
+    for number in range(2 * PAIRS + 1):
+        turns.on = number % 2 == 1
+        look(page.url if turns.on else None)
+        time.sleep(PAUSE_S)
+        late, began_s, ours_s, theirs_s = _late(document), time.monotonic(), _own_s(), _of(page)
+        time.sleep(WINDOW_S)
+        share = 100 / (time.monotonic() - began_s)
+        found.append(
+            Window(turns.on, share * (_own_s() - ours_s), share * (_of(page) - theirs_s), _late(document) - late)
+        )
+    look(None)
 
 
 def _options(duration_s: float) -> RunOptions:
     return RunOptions(head=HEAD, audio=DEFAULT_SPEAKER, duration_s=duration_s)
 
 
-def _viewed(halts: int) -> tuple[_Watch, dict[str, Any], list[float]]:
-    """The run with a page: what was seen, its report, and how long each halt took [ms]."""
-    options = _options(SETTLE_S + WINDOW_S + 1 + (halts and (halts + 1) * _BETWEEN_S + 1))
+def _halts() -> list[float]:
+    """How long each halt took [ms], of a run with a page that others look at too."""
+    options = _options(SETTLE_S + (HALTS + 1) * _BETWEEN_S + 1)
     page = begin_page("0")
     assert page is not None
     clicks_ms: list[float] = []
-    with closing(page), page_session(page, options) as pages:
-        watch = _Watch(page.process_id)
-        with _reading(page.url):
-            clicker = threading.Thread(target=_click, args=(page.url, watch, halts, clicks_ms), daemon=True)
-            clicker.start()
-            report = _finished(pages.run(observers=[watch]))
-            clicker.join(_LIMIT_S)
-    return watch, report, clicks_ms
+    with closing(page), page_session(page, options) as pages, _readers() as look:
+        look(page.url)
+        watch = _Halted()
+        clicker = threading.Thread(target=_click, args=(page.url, watch, clicks_ms), daemon=True)
+        clicker.start()
+        _finished(pages.run(observers=[watch]))
+        clicker.join(_LIMIT_S)
+    return clicks_ms
 
 
-def _click(url: str, watch: _Watch, halts: int, clicks_ms: list[float]) -> None:
-    """Halt again and again, once processor time was measured."""
-    if not halts or not watch.measured.wait(_LIMIT_S):
+def _click(url: str, watch: _Halted, clicks_ms: list[float]) -> None:
+    """Halt again and again."""
+    if not watch.settled.wait(_LIMIT_S):
         return
     with suppress(WebSocketException), _visitor(url) as visitor:
         reader = threading.Thread(target=_read_all, args=(visitor,), daemon=True)
         reader.start()
-        for _ in range(halts):
+        for _ in range(HALTS):
             watch.halted.clear()
             clicked_s = time.monotonic()
             visitor.send('{"type": "halt"}')
@@ -170,22 +245,31 @@ def _own_s() -> float:
     return time.process_time()
 
 
-def _other_s(process: int | None) -> float:
-    """Processor time of a process; 0 of none."""
-    return 0.0 if process is None else processor_time_s(process)
+def _of(page: PageProcess) -> float:
+    return processor_time_s(page.process_id)
+
+
+def _late(document: Document) -> int:
+    """Ticks that came late so far."""
+    late: int = document()["tick"]["late"]
+    return late
 
 
 @contextmanager
-def _reading(url: str) -> Iterator[None]:
-    """Clients that read all there is, in a process of their own, while inside."""
+def _readers() -> Iterator[Callable[[str | None], None]]:
+    """Clients in a process of their own that read all there is; to be told whose page, or None: nobody's."""
     with subprocess.Popen([sys.executable, "-P", "-c", _CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
         assert child.stdin is not None
-        child.stdin.write(json.dumps(url).encode() + b"\n")
-        child.stdin.flush()
+        pipe = child.stdin
+
+        def look(url: str | None) -> None:
+            pipe.write(json.dumps(url).encode() + b"\n")
+            pipe.flush()
+
         try:
-            yield
+            yield look
         finally:
-            child.stdin.close()
+            pipe.close()
 
 
 def _visitor(url: str) -> ClientConnection:
@@ -199,14 +283,13 @@ def _read_all(visitor: ClientConnection) -> None:
 
 
 def clients() -> None:
-    """The clients' process: reads until its pipe ends."""
+    """The clients' process: a line per page that is to be looked at, until its pipe ends."""
     incoming, _ = take_pipes()
-    url = json.loads(incoming.readline())
-    for _ in range(CLIENTS):
-        threading.Thread(target=_read, args=(url,), daemon=True).start()
-    incoming.read()
-
-
-def _read(url: str) -> None:
-    with _visitor(url) as visitor:
-        _read_all(visitor)
+    visitors: list[ClientConnection] = []
+    for line in incoming:
+        for visitor in visitors:
+            visitor.close()
+        url = json.loads(line)
+        visitors = [] if url is None else [_visitor(url) for _ in range(CLIENTS)]
+        for visitor in visitors:
+            threading.Thread(target=_read_all, args=(visitor,), daemon=True).start()

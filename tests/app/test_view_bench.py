@@ -1,0 +1,29 @@
+"""What a page costs, from windows with clients and without by turns."""
+
+import pytest
+
+from sfms_robot.app.bench.view_bench import Window, cost_figures
+
+
+def windows(run_shares, page_share=1.5, late=()):
+    """By turns, the first without clients."""
+    return [
+        Window(bool(number % 2), share, page_share * (number % 2), late[number] if late else 0)
+        for number, share in enumerate(run_shares)
+    ]
+
+
+def test_a_window_with_clients_is_laid_beside_its_neighbours_so_that_a_drift_costs_nothing():
+    cost = cost_figures(windows([20.0, 21.0 + 0.5, 22.0, 23.0 + 0.5, 24.0]))["cost"]
+    assert (cost["run_share"], cost["page_share"], cost["share"]) == (0.5, 1.5, 2.0)
+
+
+def test_one_window_in_which_something_else_ran_changes_nothing():
+    cost = cost_figures(windows([20.0, 20.5, 20.0, 35.0, 20.0, 20.5, 20.0]))["cost"]
+    assert cost["run_share"] == 0.5 and cost["run_quartiles"][0] == 0.5
+
+
+def test_late_ticks_are_counted_over_as_many_windows_of_each_kind():
+    figures = cost_figures(windows([20.0] * 5, late=[9, 1, 2, 0, 4]))
+    assert figures["late_ticks"] == {"without": 6, "with": 1}
+    assert figures["view.cpu"]["repeats"] == 2 and figures["view.cpu"]["ratio"] == pytest.approx(21.5 / 20.0)
