@@ -26,7 +26,7 @@ import orjson
 from sfms_robot.child_process import end_child, start_child
 from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PortError, RobotError
-from sfms_robot.viewer.pipe_writer import PipeWriter
+from sfms_robot.viewer.pipe_writer import THREAD, PipeWriter
 from sfms_robot.viewer.visitor_commands import Command
 
 HEADER: Final = struct.Struct("<IBI")
@@ -104,7 +104,7 @@ class PageProcess:
         assert self._process.stdin is not None
         self._writer = PipeWriter(self._process.stdin)
         self._writer.send(packed_message(DOCUMENT, 0, orjson.dumps(asdict(address))))
-        self._reading = threading.Thread(target=self._read, name="page", daemon=True)
+        self._reading = threading.Thread(target=self._read, name=THREAD, daemon=True)
         self._reading.start()
 
     @property

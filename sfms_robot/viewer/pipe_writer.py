@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import IO, Final
 
+THREAD: Final = "page"  # names of the threads that a page has in the run's process
 _LOOK_S: Final = 0.5  # at a pipe that is full, whether it is to be closed
 _AT_ONCE: Final = os.name == "posix"  # elsewhere a pipe cannot be asked not to block
 
@@ -35,7 +36,7 @@ class PipeWriter:
         self._closing = self._broken = False
         if _AT_ONCE:
             os.set_blocking(pipe.fileno(), False)
-        threading.Thread(target=self._work, name="page", daemon=True).start()
+        threading.Thread(target=self._work, name=THREAD, daemon=True).start()
 
     def send(self, message: bytes) -> None:
         """In order, whole."""

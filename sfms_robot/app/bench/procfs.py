@@ -9,9 +9,10 @@ from typing import Literal
 _KIB_PER_MIB = 1024
 
 
-def processor_time_s(pid: int) -> float:
-    """In user and kernel mode, since it began."""
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+def processor_time_s(pid: int, thread: int | None = None) -> float:
+    """In user and kernel mode, since it began; of one of its threads by the number of that."""
+    place = f"/proc/{pid}/stat" if thread is None else f"/proc/{pid}/task/{thread}/stat"
+    fields = Path(place).read_text(encoding="utf-8").rpartition(")")[2].split()
     ticks: float = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
     return ticks
 

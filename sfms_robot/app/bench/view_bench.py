@@ -4,8 +4,9 @@
     with       it tells the page everything, and three plain WebSocket clients in a process of their own read all of it
 
 Windows of the default head's run on emulated servos, by turns and within one run: two runs that do the same work differ
-by several times what a page costs. Each window with clients is laid beside the mean of its two neighbours, and the
-median is what the run's process pays; the page's process exists for the page alone, and counts whole. The listener, the
+by several times what a page costs. What looking costs is the processor time of the page's process, of the loop's thread
+while it tells the page, and of the threads that send. Whole windows differ by chance more than by that; beside it
+stands what the run's process took in each window with clients, less the mean of its two neighbours. The listener, the
 servos and the clients have processes of their own and are not counted. A halt counts from the click, a message that
 leaves a fourth client, until the goals of the first braking tick are written.
 """
@@ -13,6 +14,7 @@ leaves a fourth client, until the goals of the first braking tick are written.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -40,11 +42,12 @@ from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
+from sfms_robot.viewer.pipe_writer import THREAD
 
 SETTLE_S: Final = 4.0
-PAUSE_S: Final = 0.5  # after a turn: who comes gets a hello, who goes says good-bye
-WINDOW_S: Final = 2.0
-PAIRS: Final = 20
+PAUSE_S: Final = 1.0  # after a turn: who comes gets a hello, who goes says good-bye
+WINDOW_S: Final = 4.0
+PAIRS: Final = 10
 HALTS: Final = 8
 CLIENTS: Final = 3
 MOST_CPU: Final = 3.0  # % of a core
@@ -56,10 +59,12 @@ _CHILD: Final = "from sfms_robot.app.bench.view_bench import clients; clients()"
 
 @dataclass(frozen=True)
 class Window:
-    """`WINDOW_S` of a run: processor time [% of a core] of its process and of the page's, and ticks that came late."""
+    """`WINDOW_S` of a run: processor time [% of a core] of its process, of what it does for the page, and of the page's
+    process, and ticks that came late."""
 
     looked_at: bool
     run_share: float
+    telling_share: float
     page_share: float
     late: int
 
@@ -75,12 +80,13 @@ def measure(say: Callable[[str], None]) -> Told:
         "view.halt": row(_halts(), [MOST_HALT_MS], "ms", "what there is time for"),
         "machine": machine(),
     }
-    cost, late = figures["cost"], figures["late_ticks"]
+    cost, apart, late = figures["cost"], figures["run_apart"], figures["late_ticks"]
     rows = Told.of_rows({name: figures[name] for name in ("view.cpu", "view.halt")}).table
     lines = [
-        f"{CLIENTS} clients: {cost['share']:.2f} % of a core, of which the page's process {cost['page_share']:.2f} and "
-        f"the run's {cost['run_share']:.2f} (half of the windows {cost['run_quartiles'][0]:.2f} to "
-        f"{cost['run_quartiles'][1]:.2f})",
+        f"{CLIENTS} clients: {cost['share']:.2f} % of a core: the page's process {cost['page_share']:.2f}, telling it "
+        f"{cost['telling_share']:.2f}",
+        f"the run's process beside that without a page: {apart['median']:+.2f} (half of the windows "
+        f"{apart['quartiles'][0]:+.2f} to {apart['quartiles'][1]:+.2f})",
         f"late ticks: {late['with']}, without a page {late['without']}",
     ]
     return Told(figures, rows, lines)
@@ -93,14 +99,19 @@ def cost_figures(windows: Sequence[Window]) -> dict[str, Any]:
         one.run_share - (left.run_share + right.run_share) / 2
         for left, one, right in zip(before, looked, after, strict=True)
     ]
-    page, run = float(np.mean([one.page_share for one in looked])), float(np.median(apart))
+    page, telling = (
+        float(np.mean(shares)) for shares in zip(*[(w.page_share, w.telling_share) for w in looked], strict=True)
+    )
     whole = [one.run_share + one.page_share for one in looked]
     return {
         "view.cpu": row(whole, [one.run_share for one in windows[::2]], "% of a core", "the same run without a page"),
         "cost": {
-            "share": round(page + run, 3), "page_share": round(page, 3), "run_share": round(run, 3),
-            "run_quartiles": [round(float(each), 3) for each in np.percentile(apart, [25, 75])],
+            "share": round(page + telling, 3), "page_share": round(page, 3), "telling_share": round(telling, 3),
             "unit": "% of a core", "clients": CLIENTS, "wanted": MOST_CPU,
+        },
+        "run_apart": {
+            "median": round(float(np.median(apart)), 3),
+            "quartiles": [round(float(each), 3) for each in np.percentile(apart, [25, 75])], "unit": "% of a core",
         },
         "late_ticks": {
             "without": sum(one.late for one in windows[2::2]),  # as many windows as with
@@ -110,25 +121,33 @@ def cost_figures(windows: Sequence[Window]) -> dict[str, Any]:
 
 
 class _Turns(Observer):
-    """Tells an observer what happens while `on`; set `settled` once the run is under way."""
+    """Tells an observer what happens while `on`.
+
+    Attributes:
+        settled: set once the run is under way.
+        spent_s: processor time of the loop's thread in `inner`.
+    """
 
     def __init__(self, inner: Observer) -> None:
-        self.on, self.settled = False, threading.Event()
+        self.on, self.settled, self.spent_s = False, threading.Event(), 0.0
         self._inner = inner
 
     def tick(self, seen: Tick) -> None:
         if seen.time_s >= SETTLE_S:
             self.settled.set()
-        if self.on:
-            self._inner.tick(seen)
+        self._tell(self._inner.tick, seen)
 
     def heard(self, frame: SpeakerFrame) -> None:
-        if self.on:
-            self._inner.heard(frame)
+        self._tell(self._inner.heard, frame)
 
     def planned(self, plan: Plan) -> None:
+        self._tell(self._inner.planned, plan)
+
+    def _tell(self, hear: Callable[[Any], None], what: object) -> None:
         if self.on:
-            self._inner.planned(plan)
+            began_s = time.thread_time()
+            hear(what)
+            self.spent_s += time.thread_time() - began_s
 
 
 class _Halted(Observer):
@@ -188,12 +207,11 @@ def _sample(
         turns.on = number % 2 == 1
         look(page.url if turns.on else None)
         time.sleep(PAUSE_S)
-        late, began_s, ours_s, theirs_s = _late(document), time.monotonic(), _own_s(), _of(page)
+        late, began_s, before_s = _late(document), time.monotonic(), _spent_s(turns, page)
         time.sleep(WINDOW_S)
         share = 100 / (time.monotonic() - began_s)
-        found.append(
-            Window(turns.on, share * (_own_s() - ours_s), share * (_of(page) - theirs_s), _late(document) - late)
-        )
+        run_s, telling_s, page_s = (now - before for now, before in zip(_spent_s(turns, page), before_s, strict=True))
+        found.append(Window(turns.on, share * run_s, share * telling_s, share * page_s, _late(document) - late))
     look(None)
 
 
@@ -241,12 +259,11 @@ def _finished(report: dict[str, Any]) -> dict[str, Any]:
     return report
 
 
-def _own_s() -> float:
-    return time.process_time()
-
-
-def _of(page: PageProcess) -> float:
-    return processor_time_s(page.process_id)
+def _spent_s(turns: _Turns, page: PageProcess) -> tuple[float, float, float]:
+    """Processor time so far: of this process, of what it does for the page, and of the page's process."""
+    senders = [each.native_id for each in threading.enumerate() if each.name == THREAD]
+    sending_s = sum(processor_time_s(os.getpid(), thread) for thread in senders)
+    return time.process_time(), turns.spent_s + sending_s, processor_time_s(page.process_id)
 
 
 def _late(document: Document) -> int:
