@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from sfms_robot.face.drawing import BACKGROUND, add_head, add_renderer, load_vtk, look, open_window, save
+from sfms_robot.face.hair_and_collar import with_hair
 from sfms_robot.face.human import HumanHead, load_human
 from sfms_robot.face.robot_drawing import add_robot
 from sfms_robot.face.robot_scene import RobotScene
@@ -162,7 +163,7 @@ def render_sheet(
     widths, cell_high = _ALONE_PX if robot is None else _BESIDE_PX
     wide, high = sum(widths) + _GAP_PX, cell_high + _CAPTION_PX
     size = (_COLUMNS * wide + _GAP_PX, -(-len(instants) // _COLUMNS) * high + _TITLE_PX)
-    window, head = open_window(vtk, size), load_human()
+    window, head = open_window(vtk, size), with_hair(load_human())
     paper = add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
     _text(vtk, paper, title, (_GAP_PX + 4, size[1] - 42), 24, _INK, bold=True)
     for index, instant in enumerate(instants):
@@ -195,7 +196,7 @@ def render_sheet(
 def _add_portrait(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
     """The head, seen from a little to its left."""
     add_head(vtk, renderer, head, motion)
-    look(renderer, (1.07, 0.36, 0.07), (0.012, 0.0, 0.008), 16.4)
+    look(renderer, (1.07, 0.36, 0.07), (0.012, 0.0, 0.020), 17.4)
 
 
 def _text(

@@ -30,6 +30,11 @@ _BROW: Final = (74, 50, 38)
 _DARK_IRIS: Final = (71, 45, 25)
 _IRIS: Final = (122, 84, 48)
 _LASH: Final = (38, 25, 20)
+PARTS: Final = ("skin", "eye", "hair", "cloth", "teeth", "mouth", "lash")
+_PART_COLORS: Final = {
+    (242, 242, 242): "eye", _IRIS: "eye", (7, 7, 7): "eye", _BROW: "hair",
+    (242, 239, 229): "teeth", (204, 107, 107): "mouth", _LASH: "lash",
+}  # fmt: skip
 _EYE_LINE_M: Final = 0.0325
 _LIP: Final = (190, 112, 100)
 _LIP_LINE_M, _LIP_HALF_WIDTH_M, _UPPER_LIP_M, _LOWER_LIP_M = -0.0345, 0.0255, 0.0095, 0.0135
@@ -85,7 +90,16 @@ def load_human(folder: Path | None = None) -> HumanHead:
     return _with_brows(HumanHead(rest, deltas, share_of_rotation(rest), shown, _painted(rest, colors)))
 
 
+def parts_of(colors: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Colors (V, 3) of a loaded head -> (V,) what each vertex belongs to, as a number in `PARTS`."""
+    out = np.zeros(len(colors), dtype=np.int64)
+    for color, name in _PART_COLORS.items():
+        out[(colors == color).all(axis=1)] = PARTS.index(name)
+    return out
+
+
 def share_of_rotation(rest: Floats) -> Floats:
+    """(V, 3) -> (V,), see `HumanHead.share`."""
     along = (rest[:, 2] + 0.5 * rest[:, 0] - _SHARE_FROM_M) / (_SHARE_TO_M - _SHARE_FROM_M)
     t = np.clip(along, 0.0, 1.0)
     out: Floats = (t * t * (3 - 2 * t)).astype(np.float32)
