@@ -99,7 +99,7 @@ def listener_(
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
     from sfms_robot.app.evaluate.listener_evaluation import evaluate_listener, listener_table
-    from sfms_robot.cli.show_learning import print_figures, print_listener_table, show
+    from sfms_robot.cli.show_learning import print_arig_table, print_figures, print_listener_table, show
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
@@ -113,7 +113,7 @@ def listener_(
 
         ablations = AblationOptions(models, config, steps)
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
-        show(found, json, print_figures)
+        show(found, json, print_arig_table)
         return
     number = int(table.value)
     result = interruptible(
@@ -127,7 +127,9 @@ def listener_(
 @app.command()
 def papers(
     data: Path = typer.Option(..., help="Composed dyads."),
-    models: Path = typer.Option(..., help="Folder of what only tables need; what is missing is trained: hours."),
+    models: Path | None = typer.Option(
+        None, help="Folder of what only tables need; what is missing is trained: hours. Without it: said to be missing."
+    ),
     table: list[str] = typer.Option(
         [], metavar="1|2|3|4|arig-1|arig-2|arig-4", help="May be given often; all of them if not."
     ),

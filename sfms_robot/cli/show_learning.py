@@ -42,6 +42,7 @@ def print_figures(result: Mapping[str, Any]) -> None:
 def print_listener_table(result: Mapping[str, Any]) -> None:
     """Table 1 of the SFMS paper, a part of the face at a time, or its table 2."""
     _print_parts(result["rows"])
+    _print_intervals(result["rows"])
     screen().print(
         f"{result['clips']} clips of {result['frames']} frames, {result['samples']} samples; {result['features']}. "
         "The paper's rows are from other data; FRRea, a distance between rendered pictures, is out of scope.",
@@ -57,7 +58,22 @@ def print_paper_table(name: str, found: Mapping[str, Any]) -> None:
     elif name in ("3", "4"):
         print_tokenizer_tables(found)
     else:
-        print_figures(found)
+        print_arig_table(found)
+    for row, recipe in found.get("not_trained", {}).items():
+        screen().print(f"{row}: not trained ({recipe})", soft_wrap=True, markup=False)
+
+
+def print_arig_table(found: Mapping[str, Any]) -> None:
+    """Table 1, 2 or 4 of the ARIG paper."""
+    print_rows([{key: value for key, value in row.items() if key != "interval"} for row in found["rows"]])
+    _print_intervals(found["rows"])
+
+
+def _print_intervals(rows: Sequence[Mapping[str, Any]]) -> None:
+    for row in rows:
+        if row.get("interval"):
+            ends = ", ".join(f"{key} [{low:.3g}, {high:.3g}]" for key, (low, high) in row["interval"].items())
+            screen().print(f"{row['name']}, 95 % over people: {ends}", soft_wrap=True, markup=False)
 
 
 def _print_parts(rows: Sequence[Mapping[str, Any]]) -> None:

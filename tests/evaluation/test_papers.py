@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import t as student_t
 from tiny_arig_training import dyad, write
 
 from sfms_robot.app.evaluate.as_written import LABELS, training_file
 from sfms_robot.corpora import clips
+from sfms_robot.evaluation.paper.over_people import intervals, people_of
 from sfms_robot.listeners import checkpoint
 
 
@@ -48,3 +50,39 @@ def test_a_table_that_neither_paper_has_is_named(command_line, tmp_path) -> None
 @pytest.mark.parametrize("kind", ["sfms", "arig"])
 def test_how_the_papers_are_trained_is_there(kind) -> None:
     assert training_file(kind).is_file()
+
+
+@pytest.mark.slow
+def test_without_a_folder_for_models_a_table_says_what_is_not_trained_and_how_it_would_be(command_line, lively) -> None:
+    words = ("evaluate", "papers", "--data", lively, "--clips", 1, "--samples", 2)
+    words += ("--table", "4", "--table", "1", "--table", "arig-1")
+    tables = command_line(*words, "--json").told["tables"]
+    for name, label in (("4", "sparse-all-k10-as_written"), ("1", LABELS["sfms"]), ("arig-1", "ARIG")):
+        assert label not in {row["name"] for row in tables[name]["rows"] if row.get("source") == "here"}
+        assert tables[name]["not_trained"][label]
+    assert "configs/training/arig-as-written.yaml" in tables["arig-1"]["not_trained"]["w/o long-range context"]
+
+
+def _mean_of(values):
+    return lambda clips: {"mean": float(values[clips].mean()), "unknown": float("nan")}
+
+
+def test_intervals_over_people_are_those_of_their_means() -> None:
+    """One clip each: the jackknife of a mean is Student's interval."""
+    values = np.random.default_rng(0).normal(3.0, 2.0, 20)
+    found = intervals(_mean_of(values), [str(number) for number in range(20)])
+    low, high = student_t.interval(0.95, 19, values.mean(), values.std(ddof=1) / np.sqrt(20))
+    assert found == {"mean": (pytest.approx(low), pytest.approx(high))}
+
+
+def test_clips_of_one_person_hang_together() -> None:
+    values = np.repeat(np.random.default_rng(1).normal(0, 1, 6), 50)
+    (low, high) = intervals(_mean_of(values), [str(number) for number in np.repeat(range(6), 50)])["mean"]
+    (near, far) = intervals(_mean_of(values), [str(number) for number in range(300)])["mean"]
+    assert high - low > 3 * (far - near)
+    assert intervals(_mean_of(values), ["a", "b"] * 150) == {}
+
+
+def test_who_listens_is_told_by_seat_and_series_or_by_name() -> None:
+    dyads = [dyad(name, "listening", 0) for name in ("IS1000a_B_0120", "IS1000d_B_0007", "IS1000a_C_0120", "clip_7")]
+    assert people_of(dyads, [250, 600, 249, 300], 250) == ["IS1000 B"] * 3 + ["clip_7"]

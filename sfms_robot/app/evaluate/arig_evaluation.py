@@ -24,6 +24,7 @@ from sfms_robot.evaluation import interaction as scores
 from sfms_robot.evaluation.paper import arig_tables as tables
 from sfms_robot.evaluation.paper.listener_clips import spread
 from sfms_robot.evaluation.paper.listener_tables import cut
+from sfms_robot.evaluation.paper.over_people import people_of
 from sfms_robot.evaluation.rollout import Rollout, rollouts
 from sfms_robot.learning.arig.features import open_scenes
 from sfms_robot.learning.arig.trainer import train_arig
@@ -39,12 +40,14 @@ TABLES: Final = ("arig-1", "arig-2", "arig-4")
 class AblationOptions:
     """Where listeners of the tables alone are, and how those that are missing are trained.
 
-    `training`: None is the paper as written. `steps`: not the file's.
+    `training`: None is the paper as written. `steps`: not the file's. `train`: whether any is; False: rows of those
+    that are not there are left out.
     """
 
     models: Path | None = None
     training: Path | None = None
     steps: int | None = None
+    train: bool = True
 
 
 def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) -> dict[str, Any]:
@@ -138,7 +141,7 @@ def arig_table(
     if not held_out:
         raise ConfigError(f"{data}: no validation dyad is as long as a clip of {tables.CLIP_FRAMES} frames")
     folders = {one: find("listeners", one, "config.yaml") for one in names}
-    if number != 2:
+    if number != 2 and ablations.train:
         folders = _ablated(number, data, ablations) | folders
     elif ablations.models is not None:
         folders |= as_written("arig", data, ablations.models, ablations.steps)
@@ -148,10 +151,11 @@ def arig_table(
     for label, folder in folders.items():
         played = _played(label, load_listener(folder), {scene: held_out}, seed)[scene]
         answers[label] = cut([one.motion[0] for one in played], tables.CLIP_FRAMES)
+    people = people_of(held_out, [len(dyad.listener) for dyad in held_out], tables.CLIP_FRAMES)
     rows = (
-        tables.table_2(truth, speaker, answers)
+        tables.table_2(truth, speaker, answers, people)
         if number == 2
-        else tables.ablation_table(number, truth, speaker, answers)
+        else tables.ablation_table(number, truth, speaker, answers, people)
     )
     return {"table": name, "clips": len(truth), "frames": tables.CLIP_FRAMES, "rows": rows}
 

@@ -9,9 +9,12 @@ from typing import Any, Final
 
 from sfms_robot.app.evaluate.arig_evaluation import TABLES as ARIG_TABLES
 from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
+from sfms_robot.app.evaluate.as_written import LABELS, Kind, training_file
 from sfms_robot.app.evaluate.listener_evaluation import listener_table
 from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
 from sfms_robot.errors import ConfigError
+from sfms_robot.evaluation.paper.arig_tables import ABLATIONS
+from sfms_robot.evaluation.paper.tokenizer_tables import needed
 
 OURS: Final[Mapping[str, str]] = {"sfms": "sfms-small", "arig": "arig-small"}
 SFMS_TABLES: Final = ("1", "2")
@@ -25,14 +28,15 @@ class PapersOptions:
 
     Attributes:
         data: composed dyads, with speaking/ and interaction/.
-        models: folder of what only tables need, trained where it is missing.
+        models: folder of what only tables need, trained where it is missing; None: those rows are left out, and
+            `not_trained` of a table says how they come about.
         tables: of `EVERY`.
         clips: at most so many dyads a table; samples: answers to every clip of tables 1 and 2.
         steps: of every training, not its file's.
     """
 
     data: Path
-    models: Path
+    models: Path | None
     tables: Sequence[str] = EVERY
     clips: int | None = None
     samples: int = 10
@@ -56,13 +60,34 @@ def evaluate_papers(options: PapersOptions, told: Callable[[str, dict[str, Any]]
 
 
 def _table(name: str, options: PapersOptions) -> dict[str, Any]:
+    found = _scored(name, options)
+    return found if options.models is not None else {**found, "not_trained": _not_trained(name)}
+
+
+def _scored(name: str, options: PapersOptions) -> dict[str, Any]:
     if name in TOKENIZER_TABLES:
-        return evaluate_table(TableOptions(name, models=options.models / "tokenizers", steps=options.steps))
+        folder = None if options.models is None else options.models / "tokenizers"
+        return evaluate_table(TableOptions(name, models=folder, steps=options.steps))
     if name in SFMS_TABLES:
         return listener_table(
             int(name), [OURS["sfms"]], options.data, options.samples, options.clips, options.seed,
             models=options.models, steps=options.steps,
         )  # fmt: skip
     names = list(OURS.values())[::-1] if name == "arig-2" else [OURS["arig"]]
-    ablations = AblationOptions(options.models, steps=options.steps)
+    ablations = AblationOptions(options.models, steps=options.steps, train=options.models is not None)
     return arig_table(name, names, options.data, options.clips, options.seed, ablations)
+
+
+def _not_trained(name: str) -> dict[str, str]:
+    """Rows that a table has not, and what makes them."""
+    if name in TOKENIZER_TABLES:
+        lacking = set(needed(name)) - set(needed(name, shipped=True))
+        return {row: f"evaluate tokenizer --table {name} --models DIR, minutes each" for row in sorted(lacking)}
+    if name in SFMS_TABLES:
+        return {LABELS["sfms"]: f"train tokenizer, then train listener, --config {_shown('sfms')}"}
+    rows = [LABELS["arig"]] if name == "arig-2" else ["ARIG", *ABLATIONS[int(name.removeprefix("arig-"))]]
+    return {row: f"train listener --config {_shown('arig')}" for row in rows}
+
+
+def _shown(kind: Kind) -> str:
+    return "/".join(training_file(kind).parts[-3:])

@@ -8,13 +8,14 @@ sent: shapes to compare with. Table 1 and 4 of the paper give RPCC, SID and Var 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from sfms_robot.evaluation import metrics
 from sfms_robot.evaluation.paper.listener_tables import centres_of
+from sfms_robot.evaluation.paper.over_people import Chosen, intervals
 from sfms_robot.frames import POSE, SHAPES, Doubles
 
 CLIP_FRAMES: Final = 250
@@ -77,25 +78,39 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str
     return {name: found[name] for name in _NAMES}
 
 
-def table_2(truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles]) -> list[dict[str, Any]]:
-    """Rows: truth, ours by name, the paper's."""
-    centres = centres_of(truth, PARTS, CLUSTERS)
-    every = {"Ground truth": truth, **answers}
-    rows = [_row(name, "here", scores(truth, made, speaker, centres)) for name, made in every.items()]
+def table_2(
+    truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles], people: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """Rows: truth, ours by name, the paper's. `people`: who listens in each clip, for intervals over them."""
+    rows = _ours({"Ground truth": truth, **answers}, truth, speaker, people)
     rows += [_row(name, "paper", dict(zip(_NAMES, row, strict=True))) for name, row in PAPER_2.items()]
     return rows
 
 
+def _ours(
+    every: Mapping[str, Doubles], truth: Doubles, speaker: Doubles, people: Sequence[str]
+) -> list[dict[str, Any]]:
+    centres, rows = centres_of(truth, PARTS, CLUSTERS), []
+    for name, made in every.items():
+
+        def score(clips: Chosen, made: Doubles = made) -> dict[str, float]:
+            return scores(truth[clips], made[clips], speaker[clips], centres)
+
+        found = {key: [round(end, 5) for end in ends] for key, ends in intervals(score, people).items()}
+        rows.append({**_row(name, "here", score(np.arange(len(truth)))), "interval": found})
+    return rows
+
+
 def ablation_table(
-    number: int, truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles]
+    number: int, truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles], people: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
     """Table 1 or 4 without its image columns: rows as in `table_2`, with the paper's RPCC, SID and Var beside them."""
     paper = PAPER_1 if number == 1 else PAPER_4
     columns = ("paper RPCC", "paper SID", "paper Var")
-    centres, rows = centres_of(truth, PARTS, CLUSTERS), []
-    for name, made in {"GT": truth, **answers}.items():
-        beside = dict(zip(columns, paper.get(name, (None,) * 3), strict=True))
-        rows.append(_row(name, "here", scores(truth, made, speaker, centres)) | beside)
+    rows = [
+        row | dict(zip(columns, paper.get(row["name"], (None,) * 3), strict=True))
+        for row in _ours({"GT": truth, **answers}, truth, speaker, people)
+    ]
     for name in paper.keys() - {row["name"] for row in rows}:
         empty: dict[str, float | None] = dict.fromkeys(_NAMES)
         rows.append({**_row(name, "paper", empty), **dict(zip(columns, paper[name], strict=True))})

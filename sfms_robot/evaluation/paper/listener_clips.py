@@ -13,6 +13,7 @@ from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Dataset, usable
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.paper.listener_tables import FRAMES, NEEDED_FRAMES, Clips, cut
+from sfms_robot.evaluation.paper.over_people import people_of
 from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.frames import FRAME_HZ, Doubles
 from sfms_robot.learning.corpus import in_space
@@ -75,7 +76,11 @@ def collect(
     rest = torch.tensor(space.neutral, dtype=torch.float32)
     faces = [np.asarray(torch.where(one.face_known[:, None], one.face, rest)) for one in heard]  # unknown: at rest
     clips = Clips(
-        space.name, cut([np.asarray(one.motion) for one in heard], frames), cut(faces, frames), cut(learned, frames)
+        space.name,
+        cut([np.asarray(one.motion) for one in heard], frames),
+        cut(faces, frames),
+        cut(learned, frames),
+        people_of(held_out, [len(one.motion) for one in heard], frames),
     )
     answered = {}
     for name, listener in listeners.items():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import metrics
 from sfms_robot.evaluation.baselines.heuristics import HEURISTICS, Heuristic
+from sfms_robot.evaluation.paper.over_people import Chosen, intervals
 from sfms_robot.frames import Doubles, Floats
 
 PARTS: Final[Mapping[str, Mapping[str, slice]]] = {
@@ -60,12 +62,14 @@ class Clips:
 
     Attributes:
         truth, speaker: (N, T, D); train: (M, T, D) listeners of the training set.
+        people: (N,) who listens; none where nobody wants intervals over them.
     """
 
     space: str
     truth: Doubles
     speaker: Doubles
     train: Doubles
+    people: Sequence[str] = ()
 
 
 def cut(motions: Sequence[Doubles] | Sequence[Floats], frames: int) -> Doubles:
@@ -88,10 +92,12 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
     """
     score, paper = (_table_1(clips), _paper_1()) if number == 1 else (_table_2(clips), _paper_2())
     given = Heuristic(clips.train, clips.speaker, clips.space, samples, seed)
-    rows = [{"name": "Ground truth", "source": "here", **score(clips.truth[:, None])}]
-    for name, predict in HEURISTICS.items():
-        rows.append({"name": name, "source": "here", **score(predict(given))})
-    rows += [{"name": name, "source": "here", **score(motion)} for name, motion in answers.items()]
+    every = np.arange(len(clips.truth))
+    guesses = {"Ground truth": clips.truth[:, None], **{name: predict(given) for name, predict in HEURISTICS.items()}}
+    rows = []
+    for name, motion in {**guesses, **answers}.items():
+        over = intervals(partial(score, motion), clips.people) if name in answers else {}
+        rows.append({"name": name, "source": "here", **score(motion, every), "interval": over})
     return {
         "table": number,
         "space": clips.space,
@@ -124,7 +130,7 @@ def _features(number: int, space: str) -> str:
     return f"{space}, raw coefficients" + ("" if number == 1 else "; appropriate is the own listener alone")
 
 
-def _table_1(clips: Clips) -> Callable[[Doubles], dict[str, Any]]:
+def _table_1(clips: Clips) -> Callable[[Doubles, Chosen], dict[str, Any]]:
     """Every metric is the mean over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
     scaled = _scale(clips)
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
@@ -133,10 +139,10 @@ def _table_1(clips: Clips) -> Callable[[Doubles], dict[str, Any]]:
         raise ConfigError(f"table 1 needs {most} frames for the clusters of SI, the clips have {frames} in all")
     centres = centres_of(truth, PARTS[clips.space], CLUSTERS)
 
-    def score(pred: Doubles) -> dict[str, Any]:
+    def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
         row: dict[str, Any] = {}
         for part, where in PARTS[clips.space].items():
-            own, person = truth[..., where], speaker[..., where]
+            own, person = truth[chosen][..., where], speaker[chosen][..., where]
             values = [
                 (
                     metrics.l2(own, guess),
@@ -146,7 +152,7 @@ def _table_1(clips: Clips) -> Callable[[Doubles], dict[str, Any]]:
                     metrics.paired_frechet_distance(own, guess, person),
                     _rpcc(own, guess, person),
                 )
-                for guess in (scaled(pred[:, k])[..., where] for k in range(pred.shape[1]))
+                for guess in (scaled(pred[chosen, k])[..., where] for k in range(pred.shape[1]))
             ]
             row |= {f"{part} {name}": value for name, value in zip(TABLE_1, _means(values), strict=True)}
         return row
@@ -169,18 +175,18 @@ def _rpcc(truth: Doubles, guess: Doubles, person: Doubles) -> float:
     return float("nan") if np.ptp(guess) == 0 else metrics.rpcc_flat(truth, guess, person)
 
 
-def _table_2(clips: Clips) -> Callable[[Doubles], dict[str, Any]]:
+def _table_2(clips: Clips) -> Callable[[Doubles, Chosen], dict[str, Any]]:
     """FRCorr is the challenge's sum over the samples, with the mean beside it; FRSyn skips constant channels."""
-    appropriate = np.eye(len(clips.truth))
 
-    def score(pred: Doubles) -> dict[str, Any]:
+    def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
+        made, own, appropriate = pred[chosen], clips.truth[chosen], np.eye(len(chosen))
         values = (
-            metrics.frc(pred, clips.truth, appropriate),
-            metrics.reactface_frd(pred, clips.truth, appropriate),
-            metrics.frdiv(pred),
-            metrics.frvar(pred),
-            metrics.frdvs(pred),
-            metrics.frsyn(pred, clips.speaker, nan_policy="skip", samples="all"),
+            metrics.frc(made, own, appropriate),
+            metrics.reactface_frd(made, own, appropriate),
+            metrics.frdiv(made),
+            metrics.frvar(made),
+            metrics.frdvs(made),
+            metrics.frsyn(made, clips.speaker[chosen], nan_policy="skip", samples="all"),
         )
         return dict(zip(TABLE_2, values, strict=True)) | {"FRCorr per sample": values[0] / pred.shape[1]}
 
