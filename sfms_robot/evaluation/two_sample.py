@@ -68,6 +68,16 @@ def windows(motion: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(seen[: whole * WINDOW].reshape(whole, WINDOW, -1), np.float32)
 
 
+def levelled(part: Floats) -> Floats:
+    """Windows (W, 50, 58) of one motion, each channel less its mean over them and over its deviation.
+
+    What rests where, and how widely a face moves, differs from take to take; what is left is how it moves.
+    """
+    if not len(part):
+        return part
+    return np.asarray((part - part.mean(axis=(0, 1))) / part.std(axis=(0, 1)).clip(min=1e-6), np.float32)
+
+
 def told_apart(
     ours: Sequence[Floats], theirs: Sequence[Floats], region: str, each: Callable[[], object] = lambda: None
 ) -> Told:

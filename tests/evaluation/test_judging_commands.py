@@ -52,7 +52,8 @@ def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tm
     found = command_line("evaluate", "naturalness", "--data", data, "--drift", 30, "--json").told
     assert found["listener"] == "sfms-small" and found["split"] == "test" and found["dyads"] == LEAST
     assert found["minutes"] == pytest.approx(LEAST * 12 / 60, abs=0.05) and "onnx" in found["engine"]
-    for name in ("two_sample_auc", "person_two_sample_auc", "training_two_sample_auc"):
+    rows = ("two_sample_auc", "person_two_sample_auc", "training_two_sample_auc")
+    for name in (*rows, *(f"levelled_{row}" for row in rows)):
         assert set(found[name]) == set(found["interval"][name]) == set(REGIONS)
         for region, auc in found[name].items():
             low, high = found["interval"][name][region]

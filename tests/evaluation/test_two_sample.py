@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.evaluation.two_sample import FOLDS, NOISE, REGIONS, WINDOW, told_apart, windows
+from sfms_robot.evaluation.two_sample import FOLDS, NOISE, REGIONS, WINDOW, levelled, told_apart, windows
 from sfms_robot.frames import FRAME_HZ, MOTION_DIM
 
 DYADS = 10
@@ -48,6 +48,18 @@ def test_rounding_and_what_no_tracker_sees_is_not_judged():
     rough = [(np.round(sway(rng, 0.5) / 2e-4) * 2e-4 + buzz).astype(np.float32) for _ in range(DYADS)]
     told = told_apart(cut(rough), cut(smooth, 1), "head")
     assert told.low < 0.6
+
+
+@pytest.mark.slow
+def test_a_wider_swing_from_another_rest_is_told_apart_but_not_once_it_is_levelled():
+    rng = np.random.default_rng(6)
+    small, wide = [sway(rng, 0.8) for _ in range(DYADS)], [2 * sway(rng, 0.8) + 0.1 for _ in range(DYADS)]
+    raw, level = (cut(wide), cut(small, 1)), ([*map(levelled, cut(wide))], [*map(levelled, cut(small, 1))])
+    assert told_apart(*raw, "head").low > 0.95
+    assert told_apart(*level, "head").low < 0.65
+    fast = [*map(levelled, cut([sway(rng, 2.0) for _ in range(DYADS)]))]
+    assert told_apart(fast, level[1], "head").low > 0.9, "another pace is another pace"
+    assert levelled(np.zeros((0, WINDOW, MOTION_DIM), np.float32)).shape == (0, WINDOW, MOTION_DIM)
 
 
 def test_windows_lie_side_by_side_and_short_motion_gives_none():

@@ -21,7 +21,7 @@ from sfms_robot.corpora.resampling import at_frame_rate
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import manners as manner
 from sfms_robot.evaluation.rollout import frames_of_dyad, rollout
-from sfms_robot.evaluation.two_sample import FOLDS, REGIONS, Told, told_apart, windows
+from sfms_robot.evaluation.two_sample import FOLDS, REGIONS, Told, levelled, told_apart, windows
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, load_listener, one_thread
@@ -57,7 +57,7 @@ def evaluate_naturalness(
         drift = long_run(listener, heard, drift_s, seed)
         progress.advance(playing)
         theirs, taught = [dyad.listener for dyad in dyads], of_training(data, len(dyads))
-        judging = progress.add_task("telling apart", total=(3 if taught else 2) * len(REGIONS) * FOLDS)
+        judging = progress.add_task("telling apart", total=2 * (3 if taught else 2) * len(REGIONS) * FOLDS)
         told = two_samples(ours, theirs, taught, lambda: progress.advance(judging))
     addressed = [asked_for(dyad) for dyad in dyads]
     return {
@@ -127,14 +127,18 @@ def two_samples(
     """By region, `two_sample_auc`, each with its interval over dyads; and for scale two others.
 
     People against other people of the same part, and, where `taught` are given, people of training against them: who
-    imitates those without a flaw is told from these as often.
+    imitates those without a flaw is told from these as often. `levelled_`: each motion by its own mean and deviation.
     """
     rng = np.random.default_rng(0)
     made, real = ([windows(motion, rng) for motion in motions] for motions in (ours, theirs))
     half = 2 * (len(real) // 2)
-    pairs = {"two_sample_auc": (made, real), "person_two_sample_auc": (real[0:half:2], real[1:half:2])}
+    pairs: dict[str, tuple[Sequence[Floats], ...]] = {
+        "two_sample_auc": (made, real),
+        "person_two_sample_auc": (real[0:half:2], real[1:half:2]),
+    }
     if taught:
         pairs["training_two_sample_auc"] = [windows(motion, rng) for motion in taught], real
+    pairs |= {f"levelled_{name}": tuple([*map(levelled, one)] for one in pair) for name, pair in pairs.items()}
     found = {
         name: {region: told_apart(one, other, region, each) for region in REGIONS}
         for name, (one, other) in pairs.items()
