@@ -127,7 +127,9 @@ def centres_of(truth: Doubles, parts: Mapping[str, slice], clusters: Mapping[str
 def _features(number: int, space: str) -> str:
     if number == 1 and space == "deca56":
         return "L2L-standardised: less the mean, over the deviation between clips of their deviations"
-    return f"{space}, raw coefficients" + ("" if number == 1 else "; appropriate is the own listener alone")
+    if number == 1:
+        return f"{space}, less the mean of training"
+    return f"{space}, raw coefficients; appropriate is the own listener alone"
 
 
 def _table_1(clips: Clips) -> Callable[[Doubles, Chosen], dict[str, Any]]:
@@ -161,9 +163,13 @@ def _table_1(clips: Clips) -> Callable[[Doubles, Chosen], dict[str, Any]]:
 
 
 def _scale(clips: Clips) -> Callable[[Doubles], Doubles]:
-    """The space that L2L's numbers are in, for its coefficients; others stay as they are."""
+    """The space that L2L's numbers are in, for its coefficients; others less the mean of training.
+
+    Var and RPCC take all channels for one signal: a head that rests at pi about x would be all that they see.
+    """
     if clips.space != "deca56":
-        return lambda motion: motion
+        rest = clips.train.mean(axis=(0, 1))
+        return lambda motion: motion - rest
     mean, spread = metrics.l2l_mean_std(clips.train)
     if (spread < LEAST_SPREAD).all():
         raise ConfigError(f"L2L's units need training clips that differ, there is {len(clips.train)}")
