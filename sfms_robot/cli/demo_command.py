@@ -57,7 +57,13 @@ def demo(
             told = app.demo(options, None if json else live_panel, page)
     if json:
         print(json_module.dumps(told))
-    elif seeds is None:
+    elif seeds is not None:
+        nods = told["nods"]
+        scatter = "-" if nods["variance_over_mean"] is None else nods["variance_over_mean"]
+        print(
+            f"nods: {nods['mean']:g} in the mean, variance over mean {scatter}, {nods['seeds_without']} seeds without"
+        )
+    else:
         print(_line(told))
         print(f"look at {' and '.join(told['pictures'])}" if told["pictures"] else f"recorded in {told['folder']}")
         if told["missing"]:

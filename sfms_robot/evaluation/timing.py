@@ -29,6 +29,7 @@ LEAST: Final = 3  # events of a person in a meeting, to be ranked
 INTERVALS_S: Final = np.geomspace(0.2, 1200, 400)  # edges of the histogram of intervals
 SIZES_DEG: Final = np.arange(0, 40.1, 0.1)  # edges of the histogram of nods by size
 LONG_SILENCE_S: Final = 2.0
+STRETCH_S: Final = 48.0  # of listening, whose nods are counted for their variance over mean
 WHO: Final = ("", "decided_", "people_")
 ANNOTATED: Final = ("mm_hm", "laugh", "gaze_shift")  # beside nods
 AUC: Final = "_auc"  # in the names of figures that are means over people
@@ -66,6 +67,9 @@ def nod_sums(who: str, one: ListenerMeeting, runs: Runs, within: Bools | None = 
     for name, mask in times_of(one).items():
         counted = mask & played
         sums[who + name] = np.array([per_seen * counted[every].sum(), len(runs) * _minutes(counted)])
+    sums[who + "nods_variance_over_mean"] = np.sum(
+        [np.zeros(2), *(scatter(begun, one.listening & played) for begun in onsets)], axis=0
+    )
     found = [intervals_s(begun, one.listening & played) for begun in onsets]
     sums[who + "intervals"] = histogram(np.concatenate([np.zeros(0), *found]))
     return sums
@@ -75,6 +79,20 @@ def intervals_s(onsets: Ints, listening: Bools) -> Doubles:
     """From onset to onset (frames), as much of it as was listened in; onsets outside of it do not count."""
     clock_s = np.cumsum(listening) / FRAME_HZ
     return np.diff(clock_s[np.sort(onsets[listening[onsets]])])
+
+
+def scatter(onsets: Ints, listening: Bools) -> Doubles:
+    """[stretches times variance, sum] of the counts in stretches of 48 s of listening; nothing of fewer than two.
+
+    Nods that call forth nods come in bouts, and leave whole stretches without: more than 1, which is Poisson's.
+    """
+    frames = round(STRETCH_S * FRAME_HZ)
+    stretch = (np.cumsum(listening) - 1) // frames
+    whole = int(listening.sum()) // frames
+    if whole < 2:
+        return np.zeros(2)
+    counts = np.bincount(stretch[onsets[listening[onsets]]], minlength=whole)[:whole]
+    return np.array([whole * counts.var(ddof=1), counts.sum()], np.float64)
 
 
 def histogram(values: Doubles) -> Doubles:

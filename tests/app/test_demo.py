@@ -2,9 +2,10 @@
 
 import sys
 
+import numpy as np
 import pytest
 
-from sfms_robot.app.listen.demo import DemoOptions, compare_seeds, demo, free_folder
+from sfms_robot.app.listen.demo import DemoOptions, compare_seeds, demo, free_folder, nods_over_seeds
 
 
 @pytest.mark.slow
@@ -32,6 +33,12 @@ def test_seeds_are_told_one_by_one():
     told = compare_seeds(DemoOptions("op3_head", duration_s=1.0, fast=True), 2, seen.append)
     assert [row["seed"] for row in seen] == [0, 1] == [row["seed"] for row in told["runs"]]
     assert told["exit"] == "done" and told["exit_code"] == 0
+    assert told["nods"]["mean"] == np.mean([row["nods"] for row in told["runs"]])
+
+
+def test_nods_of_several_seeds_have_a_mean_a_scatter_and_those_without():
+    assert nods_over_seeds([4, 0, 8, 4]) == {"mean": 4.0, "variance_over_mean": 2.67, "seeds_without": 1}
+    assert nods_over_seeds([0, 0])["variance_over_mean"] is None is nods_over_seeds([3])["variance_over_mean"]
 
 
 def test_without_the_packages_of_pictures_the_run_is_kept_and_the_pip_install_named(tmp_path, monkeypatch):

@@ -135,6 +135,15 @@ def test_intervals_leave_out_what_was_not_listened_in():
     np.testing.assert_allclose(timing.intervals_s(np.array([50, 200, 400]), listening), [4.0])
 
 
+def test_nods_by_lot_scatter_by_their_mean_and_bouts_by_more():
+    everywhere = np.ones(FRAMES, bool)
+    lot, bouts = anywhere(400), np.sort((anywhere(100)[:, None] + np.arange(4)).ravel())
+    for nods_s, low, high in ((lot, 0.7, 1.4), (bouts, 2.5, 5.5)):
+        scaled, total = timing.scatter((nods_s * FRAME_HZ).astype(int).clip(0, FRAMES - 1), everywhere)
+        assert low < scaled / total < high
+    assert not timing.scatter(np.array([3]), np.arange(FRAMES) < 60 * FRAME_HZ).any(), "one stretch has no variance"
+
+
 def test_what_a_finder_misses_is_made_up_for():
     one, motion = meeting([]), np.zeros((1, 3000, 58), np.float32)
     when_s = np.arange(3000) / FRAME_HZ

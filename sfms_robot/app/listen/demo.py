@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
@@ -90,7 +90,21 @@ def compare_seeds(options: DemoOptions, seeds: int, each: Callable[[dict[str, An
         each(rows[-1])
         if rows[-1]["exit"] != "done":
             break
-    return {"version": 1, "exit": rows[-1]["exit"], "exit_code": rows[-1]["exit_code"], "runs": rows}
+    return {
+        "version": 1,
+        "exit": rows[-1]["exit"],
+        "exit_code": rows[-1]["exit_code"],
+        "nods": nods_over_seeds([row["nods"] for row in rows]),
+        "runs": rows,
+    }
+
+
+def nods_over_seeds(counts: Sequence[int]) -> dict[str, float | int | None]:
+    """Mean, variance over mean (1 is Poisson's; None of one seed, or of no nod), and how many seeds have none."""
+    mean = float(np.mean(counts))
+    told = len(counts) > 1 and mean > 0
+    scatter = round(float(np.var(counts, ddof=1)) / mean, 2) if told else None
+    return {"mean": round(mean, 2), "variance_over_mean": scatter, "seeds_without": sum(one == 0 for one in counts)}
 
 
 def free_folder(folder: Path) -> Path:
