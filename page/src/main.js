@@ -146,6 +146,7 @@ class Page {
     if (find('state-name').textContent !== name) find('state-name').textContent = name;
     if (find('state-why').textContent !== why) find('state-why').textContent = why;
     state.dataset.state = name;
+    state.title = why;
     find('resume').hidden = name !== 'halted';
     find('halt').setAttribute('aria-pressed', String(name === 'halted'));
   }

@@ -17,7 +17,7 @@ export function buildPanels(hello, connection, visitor, replays, chooseJoint) {
   const open = new Set([...document.querySelectorAll('#controls > details[open]')].map((each) => each.dataset.name));
   const first = !find('controls').children.length;
   const servos = new ServoTable(chooseJoint);
-  servos.begin(hello.joints);
+  servos.begin(hello);
   const held = heldPanel(hello, connection);
   const faces = facesPanel(hello, connection), look = lookPanel(connection);
   const parts = {
@@ -91,6 +91,7 @@ function rateSlider(kind, hello, connection) {
     max: MOST_PER_MINUTE[kind] ?? 10, step: 0.1, value: asked ?? PEOPLE[kind], changed: set,
     text: (value) => value.toFixed(1),
   });
+  row.classList.add('rate');
   if (asked === null) row.querySelector('output').textContent = 'as people';
   return row;
 }

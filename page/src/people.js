@@ -92,7 +92,10 @@ function stop() {
 /** The questions, open once both clips were seen to their end. */
 function ask() {
   const open = seen.size === 2;
-  $('hint').textContent = open ? 'Your answer: arrow left, arrow right, or arrow down for neither.' : 'Watch both to their end first: keys 1 and 2.';
+  const keys = document.createElement('span');
+  keys.className = 'keys'; // who has none is not told of them
+  keys.textContent = open ? ' Keys: arrow left, arrow right, arrow down for neither.' : ' Keys: 1 and 2.';
+  $('hint').replaceChildren(open ? 'Now your answer.' : 'Watch both to their end first.', keys);
   const rows = Object.entries(questions).map(([name, text]) => {
     const row = document.createElement('fieldset');
     row.disabled = !open;

@@ -3,9 +3,7 @@
 import { make } from './dom.js';
 
 export function recordingPanel(hello, connection, replays) {
-  const state = hello.record;
-  const on = state?.on ?? false;
-  const record = make('button', { type: 'button', 'aria-pressed': String(on), onclick: () => connection.send('record', { on: record.getAttribute('aria-pressed') !== 'true' }) }, on ? 'Stop recording' : 'Record');
+  const record = make('button', { type: 'button', onclick: () => connection.send('record', { on: record.getAttribute('aria-pressed') !== 'true' }) });
   const download = make('a', { href: 'recording', download: '' }, 'Download');
   download.addEventListener('click', () => { // with the token of that moment
     download.href = connection.token ? `recording?token=${encodeURIComponent(connection.token)}` : 'recording';
@@ -14,12 +12,12 @@ export function recordingPanel(hello, connection, replays) {
   const replay = make('button', { type: 'button', onclick: async () => {
     try { await replays(); said.textContent = ''; } catch (error) { said.textContent = error.message; }
   } }, 'Replay the run so far');
-  download.hidden = !state;
   const show = (now) => {
     record.setAttribute('aria-pressed', String(now.on));
-    record.textContent = now.on ? `Stop recording (${(now.seconds ?? 0).toFixed(0)} s)` : 'Record';
-    download.hidden = false;
+    record.textContent = now.on ? 'Stop recording' : 'Record';
+    download.hidden = now.on || now.seconds === null; // there is none yet
   };
+  show(hello.record ?? { on: false, seconds: null });
   connection.addEventListener('record', ({ detail }) => show(detail));
   return [make('div', { className: 'row' }, record, download, replay), said];
 }

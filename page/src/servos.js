@@ -29,22 +29,23 @@ export class ServoTable {
     this.titles = '';
   }
 
-  begin(joints) {
+  begin({ joints, replay }) {
     this.facts = Object.fromEntries(joints.map((joint) => [joint.name, joint]));
     this.body.replaceChildren();
+    this.summary.textContent = replay ? 'A recording: none is connected.' : '';
   }
 
   /** The status document's `joints` and `faults`, once a second. */
   show(status) {
     const faults = status.faults ?? {}, joints = Object.entries(status.joints ?? {});
     const columns = COLUMNS.filter(([, of]) => joints.some(([, joint]) => of(joint) !== NOTHING));
-    const titles = ['joint', ...columns.map(([title]) => title), 'fault'];
+    const titles = ['joint', ...columns.map(([title]) => title)];
     if (titles.join() !== this.titles) this.head.replaceChildren(...titles.map((title) => make('th', { scope: 'col' }, title)));
     this.titles = titles.join();
     const rows = joints.map(([name, joint]) => {
       const { bus, id, model } = this.facts[name] ?? {};
       const title = `${model ?? ''} id ${id ?? '?'} on ${bus ?? '?'}; click: its curve`;
-      const row = make('tr', { title, onclick: () => this.choose(name) }, make('td', {}, name), ...columns.map(([, of]) => make('td', {}, of(joint))), make('td', {}, faults[name] ?? ''));
+      const row = make('tr', { title, onclick: () => this.choose(name) }, make('td', {}, name, ...(faults[name] ? [make('small', {}, faults[name])] : [])), ...columns.map(([, of]) => make('td', {}, of(joint))));
       row.className = faults[name] ? 'bad' : joint.temperature_C >= HOT_C ? 'hot' : '';
       return row;
     });

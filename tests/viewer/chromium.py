@@ -125,11 +125,11 @@ class Page:
 
     def screen(self) -> bytes:
         """PNG of the window, while the page stands still."""
-        self.ask("(page.still = true)")
+        self.ask("globalThis.page && (page.still = true)")
         try:
             return self.driver.get_screenshot_as_png()
         finally:
-            self.ask("(page.still = false, 1)")
+            self.ask("globalThis.page && (page.still = false, 1)")
 
     def complaints(self) -> list[str]:
         """What the browser's console has to say that is a warning or worse."""

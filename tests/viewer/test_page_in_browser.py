@@ -186,7 +186,7 @@ def test_the_table_of_servos_has_no_column_that_says_nothing(page):
         " [...document.querySelectorAll('tbody tr')].map((row) => [...row.children].map((each) => each.textContent))]"
     )
     assert {"read °", "mA", "°C", "V"} <= set(titles) and "load %" not in titles  # XM430s tell a current
-    for column, title in enumerate(titles[:-1]):
+    for column, title in enumerate(titles):
         assert any(row[column] != "–" for row in cells), title
 
 
@@ -296,3 +296,78 @@ def test_without_webgl_it_says_so_and_the_curves_go_on(own_page, run):
         own_page.until("page.newest && page.timeline.frames.length > 10")
     assert own_page.ask("document.getElementById('no-webgl').checkVisibility()")
     assert own_page.picture("timeline").std() > 5
+
+
+@pytest.mark.parametrize("size", [WINDOW, PHONE])
+def test_no_name_and_no_value_of_a_slider_is_cut_off(own_page, run, size):
+    own_page.look(size)
+    page = own_page.open(run.url)
+    page.until("document.querySelector('[data-channel=mouthUpperUpRight]')")
+    page.driver.execute_script("for (const each of document.querySelectorAll('details')) each.open = true")
+    cut = "[...document.querySelectorAll('.slider :is(span, output)')].filter((e) => e.scrollWidth > e.clientWidth)"
+    assert page.ask(f"{cut}.map((e) => e.textContent)") == []
+    heights = page.ask("[...document.querySelectorAll('.rate output')].map((e) => e.clientHeight)")
+    assert len(heights) > 4 and len(set(heights)) == 1  # "as people" takes no more lines than a number
+
+
+def test_the_panel_of_the_curves_ends_below_them_however_long_the_controls_are(page):
+    page.driver.execute_script("for (const each of document.querySelectorAll('details')) each.open = true")
+    below = "document.querySelector('#happens').getBoundingClientRect().bottom"
+    feet = "document.querySelector('.timeline-feet').getBoundingClientRect().bottom"
+    assert 0 < page.ask(f"{below} - {feet}") < 20
+
+
+def test_on_a_phone_on_its_side_halting_leaves_the_picture_free(own_page, run):
+    own_page.look((844, 390))
+    page = own_page.open(run.url)
+    width, height = page.ask(
+        "(({width, height}) => [width, height])(document.querySelector('.stop').getBoundingClientRect())"
+    )
+    assert width < 844 / 3 and 48 <= height < 390 / 4
+
+
+def test_halt_stays_where_it_is_whatever_is_told_beside_it(page):
+    place = "JSON.stringify(document.getElementById('halt').getBoundingClientRect())"
+    before = page.ask(place)
+    page.driver.execute_script(
+        "page.still = true; document.getElementById('state-why').textContent = 'left_eyebrow_outer, '.repeat(40)"
+    )
+    try:
+        assert page.ask(place) == before
+        assert page.ask("document.documentElement.scrollWidth") <= WINDOW[0]
+    finally:
+        page.ask("(page.still = false, 1)")
+
+
+def test_a_fault_is_told_beside_its_joint_in_the_table_of_servos(page):
+    page.until("document.querySelectorAll('tbody tr').length === page.hello.joints.length")
+    told = page.ask(
+        "(() => { page.panels.servos.show({...page.status, faults: {head_pan: 'no answer'}});"
+        " const name = document.querySelector('tbody tr.bad').cells[0];"
+        " return [name.firstChild.textContent, name.querySelector('small').textContent]; })()"
+    )
+    assert told == ["head_pan", "no answer"]
+
+
+@pytest.mark.parametrize("size", [WINDOW, PHONE])
+def test_resume_does_not_come_up_under_the_hand_that_halts(own_page, run, size):
+    own_page.look(size)
+    page = own_page.open(run.url)
+    middle = "(({x, y, width, height}) => [x + width / 2, y + height / 2])(find.getBoundingClientRect())"
+    x, y = page.ask(middle.replace("find", "document.getElementById('halt')"))
+    page.driver.execute_script("page.still = true; document.getElementById('resume').hidden = false")
+    assert page.ask("document.elementFromPoint(arguments[0], arguments[1]).closest('button').id", x, y) == "halt"
+
+
+def test_there_is_something_to_download_once_it_was_recorded(own_page, run):
+    page = own_page.open(run.url)
+    download = "document.querySelector('[data-name=recording] a')"
+    page.until(download)
+    assert page.ask(f"{download}.hidden")
+    press(page, "Record")
+    page.until(
+        "[...document.querySelectorAll('#controls button')].some((each) => each.textContent === 'Stop recording')"
+    )
+    assert page.ask(f"{download}.hidden")
+    press(page, "Stop recording")
+    page.until(f"!{download}.hidden")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 import uvicorn
+from chromium import Page, missing
 
 from sfms_robot.app.evaluate.people_study import Study, clip_name, read_answers
 from sfms_robot.viewer.study_server import study_app
@@ -136,6 +137,20 @@ def test_in_a_browser_by_keys(study):
     given = read_answers(study.folder / "answers.csv")
     sides = ["neither" if a.chosen == "neither" else "left" if a.chosen == a.left else "right" for a in given]
     assert sides == ["left", "right", "neither", "left"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}")
+def test_on_a_phone_both_faces_fill_their_frames(study, tmp_path):
+    with Served(study_app(study)) as served, Page(tmp_path / "chromium", size=(390, 844)) as page:
+        page.driver.get(served.url)
+        page.until("document.querySelectorAll('fieldset').length")
+        for side in ("left", "right"):
+            face = page.picture(side)
+            high, wide = face.shape[:2]
+            assert 1.0 < high / wide < 1.2
+            assert face[-4:, wide // 4 : -wide // 4].max() < 160 < face[:4].min()  # cloth below, ground above
+        assert page.ask("document.documentElement.scrollWidth") <= 390
 
 
 def keys(browser, text):
