@@ -64,6 +64,8 @@ class ArigPhase(Phase):
         state_noise: share of previous states that are drawn by lot. A stream that goes on from its own best guess needs
             it: true ones would be copied, and it has none. One that draws its states (events) is taught with true ones.
         group_weights: of groups of channels in equation (3); None: every channel counts the same, which is the paper.
+        event_windows: share of windows in which an event other than a blink is under way, every kind as often as any
+            other, for listeners that are told of them: smiles are rare.
         drop_audio, drop_face: share of windows in which the user is not heard, not seen; drop_agent: of those in which
             the agent says nothing, that have no agent's track.
         gain_db: most that either track is louder or softer; colour_db: most that its bands are, smoothly from low to
@@ -79,6 +81,7 @@ class ArigPhase(Phase):
     speaking_noise: NonNegative = 1.0
     state_noise: Share = 0.8
     group_weights: GroupWeights | None = None
+    event_windows: Share = 0.0
     drop_audio: Share = 0.1
     drop_face: Share = 0.3
     drop_agent: Share = 0.5

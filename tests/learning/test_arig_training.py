@@ -13,7 +13,7 @@ from sfms_robot import config
 from sfms_robot.config import parse_training
 from sfms_robot.config.arig import STATES
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, ListenerEvent, SpeakerFrame
 from sfms_robot.learning.arig.features import (
     LARGEST_RHO,
     SCENES,
@@ -24,14 +24,16 @@ from sfms_robot.learning.arig.features import (
     open_scenes,
 )
 from sfms_robot.learning.arig.losses import (
+    GLIDE,
     Student,
+    _glided,
     augment,
     channel_weights,
     group_of,
     loss_parts,
     previous_states,
 )
-from sfms_robot.learning.arig.trainer import draw, train_arig, weights_of
+from sfms_robot.learning.arig.trainer import draw, starts_by_event, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
 from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS
@@ -218,6 +220,19 @@ def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_
     assert torch.allclose(after[:, 1:], 0.9 * off[:, :-1], atol=1e-4)
 
 
+def test_a_past_that_goes_elsewhere_glides_there_evenly():
+    """In as many frames in all of a window, 1 to `GLIDE`, and then stays: a glide is a jump in as many parts."""
+    jumps = torch.zeros(200, 40, 2)
+    jumps[:, 5], jumps[:, 9] = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 0.0])
+    glided = _glided(jumps, torch.Generator().manual_seed(0))
+    assert torch.allclose(glided.sum(1), jumps.sum(1), atol=1e-5)
+    took = (glided[..., 1] != 0).sum(1)
+    assert took.min() == 1 and took.max() == GLIDE
+    for one, frames in zip(glided, took.tolist(), strict=True):
+        assert torch.allclose(one[5 : 5 + frames, 1], torch.full((frames,), -2.0 / frames), atol=1e-5)
+        assert not one[:5].any() and not one[5 + frames :, 1].any()
+
+
 def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_once(corpus):
     model = a_student().model
     fit_scales(model, corpus, settings().listener.channels)
@@ -337,6 +352,24 @@ def test_feedback_that_is_seen_has_states_of_its_own():
     nods = found.control[:, 0] > 0
     listening = torch.from_numpy(one.states == STATES.index("listening"))
     assert torch.equal(found.states == NODDING, nods & listening) and bool((nods & listening).any())
+
+
+def test_windows_of_events_have_every_kind_as_often_and_come_of_the_scene_that_was_drawn():
+    one, other = dyad("a", "listening", 0), dyad("b", "speaking", 1)
+    smile, nods = ListenerEvent("smile", 10.0, 1.0, 0.5), tuple(ListenerEvent("nod", at, 0.4, 0.05) for at in range(9))
+    blinks = tuple(ListenerEvent("blink", at + 0.5, 0.2, 0.9) for at in range(11))
+    said = {"listening": [replace(one, events=(*nods, smile, *blinks))], "speaking": [replace(other, events=blinks)]}
+    corpus = gather(said, WINDOW, ARKIT, WIDTHS["mel"], events=True)
+    starts = corpus.starts_by_scene(WINDOW)
+    eventful = starts_by_event(corpus, starts, WINDOW)
+    assert [len(eventful[scene]) for scene in said] == [2, 0]  # blinks do not count
+    generator, both = torch.Generator().manual_seed(0), torch.tensor([1.0, 1.0, 0.0])
+    drawn = draw(starts, both, 400, generator, eventful, 1.0)
+    listening = drawn < HZ * 12
+    assert 0.4 < float(listening.float().mean()) < 0.6
+    smiles = (drawn[listening] + WINDOW > 10 * HZ - 1).float().mean()
+    assert 0.4 < float(smiles) < 0.7
+    assert float((draw(starts, both, 400, generator, eventful, 0.0) + WINDOW > 10 * HZ - 1).float().mean()) < 0.7
 
 
 def test_a_group_of_channels_counts_by_its_weight_not_by_its_number():

@@ -23,7 +23,7 @@ from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.learning import corpus as dyads
 from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, without_gaze
 from sfms_robot.learning.staged_frames import Scratch
-from sfms_robot.listeners.arig import audio_frontend
+from sfms_robot.listeners.arig import audio_frontend, told
 from sfms_robot.listeners.arig.csu import StateUnderstanding
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
@@ -39,6 +39,7 @@ LEAST_STEP: Final = 0.01  # of a frame, in deviations of the motion
 LEAST_SPREAD: Final = 0.25  # of companded innovations: what hardly moves does not weigh more than what moves
 COMPANDED: Final = 4  # innovations above the deviation over this are companded: between what rests and what happens
 LARGEST_RHO: Final = 0.999  # of one frame to the next: a time constant of 40 s
+SIDED: Final = ("roll", "yaw", "y")  # of the head; nobody tells to which side a shake begins, so none is on average
 RARE: Final = 0.02  # of the frames with the same voices: a state so rare there is a label's edge
 
 log = logging.getLogger(__name__)
@@ -157,7 +158,7 @@ def autocorrelation(last: Tensor, now: Tensor) -> Tensor:
 
 
 def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
-    """From standardised motion (M, C) of frames and of the frames after them."""
+    """From standardised motion (M, C) of frames and of the frames after them, less what is told of events."""
     if model.settings.draws != "innovation":
         model.step_std.copy_((now - last).std(0).clamp(min=LEAST_STEP))
         return
@@ -165,6 +166,18 @@ def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
     steps = now - model.expected(last)
     model.step_std.copy_((steps.std(0) / COMPANDED).clamp(min=LEAST_STEP))
     model.spread.copy_((steps / model.step_std).asinh().std(0).clamp(min=LEAST_SPREAD))
+
+
+def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Tensor:
+    """Standardised motion (N, C) less what its events do to a face on average, which is fitted first."""
+    if not model.tells_events:
+        return standard
+    control = corpus.frames.control
+    model.told.copy_(told.fit(control, standard))
+    model.told[:, [name in SIDED for name in model.settings.channels]] = 0.0
+    lengths = list(corpus.lengths)
+    of_dyads = zip(standard.split(lengths), control.split(lengths), strict=True)
+    return torch.cat([motion - told.features(rows) @ model.told for motion, rows in of_dyads])
 
 
 def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
@@ -196,7 +209,7 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) ->
     standard = model.standardise(frames.agent_motion)
     model.motion_low.copy_(standard.amin(0))
     model.motion_high.copy_(standard.amax(0))
-    of_dyads = torch.split(standard, list(corpus.lengths))
+    of_dyads = torch.split(_beside_events(model, standard, corpus), list(corpus.lengths))
     last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(-1), slice(1, None)))
     _fit_steps(model, last, now)
     if isinstance(model.head, Denoiser) and model.settings.diffusion.clamp:

@@ -28,7 +28,9 @@ from sfms_robot.signals import mel
 
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
 COLOURS = 4  # waves over the bands that make up another microphone's colour
-JUMPS = 0.04  # of frames at which the slow part jumps
+JUMPS = 0.04  # of frames at which the slow part goes elsewhere
+FAST = 0.3  # the most that the fast part is, in deviations of steps: more, and no past says how fast it was
+GLIDE = 12  # frames that it takes for that, at most
 COLD = 0.5  # share of windows whose past is exact
 SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
 # Groups of channels, by how their names begin; the mouth has the rest.
@@ -85,7 +87,7 @@ def loss_parts(
     weights = channel_weights(model.settings, group_weights).to(truth.device) if group_weights else None
     found = model.condition(told, previous)
     target = model.standardise(truth[:, 1:])
-    to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]))
+    to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
     motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), draws, generator, weights).mean()
     coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
     known = states[:, 1:] >= 0
@@ -180,17 +182,28 @@ def _kept(model: ArigModel) -> Tensor:
 def _wander(b: int, n: int, kept: Tensor, phase: config.ArigPhase, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of steps.
 
-    The slow part jumps once a second or so, and of it `kept` (C,) is there a frame later.
+    The slow part goes elsewhere once a second or so, at once or gliding, and of it `kept` (C,) is there a frame later.
+    A glide is a motion that goes on for no reason, as a stream's own may: nothing of its speed is in what comes after.
     """
     size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
     size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
     jumps = torch.randn(b, n, len(kept), generator=generator)
-    jumps = jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS)
+    jumps = _glided(jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS), generator)
     fast = torch.randn(b, n, len(kept), generator=generator)
     slow = jumps.clone()
     for frame in range(1, n):
         slow[:, frame] += kept * slow[:, frame - 1]
-    return size * slow, size * fast
+    return size * slow, size.clamp(max=FAST) * fast
+
+
+def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
+    """Jumps (B, N, C), each spread evenly over the frames from it on: 1 to `GLIDE`, drawn for each window."""
+    b, n = jumps.shape[:2]
+    frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator)
+    total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame
+    before = (torch.arange(1, n + 1) - frames).clamp(min=0)
+    ended = total.gather(1, before[..., None].expand(-1, -1, jumps.shape[2]))
+    return (total[:, 1:] - ended) / frames[..., None]
 
 
 def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int = len(STATES)) -> Tensor:

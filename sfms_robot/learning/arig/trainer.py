@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from sfms_robot.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.control import COLUMNS
 
 HELD_OUT_WINDOWS, HELD_OUT_BATCH = 24, 4
 
@@ -64,6 +65,7 @@ def arig_job(
     """The training as the loop takes it, on a model whose scales are set; moves it to `device`."""
     phase = settings.training
     starts = corpus.starts_by_scene(phase.window_frames)
+    eventful = starts_by_event(corpus, starts, phase.window_frames) if phase.event_windows else {}
     for stage in phase.stages:
         weights_of(stage, starts)
     fingerprint = corpus.fingerprint()
@@ -71,7 +73,7 @@ def arig_job(
     corpus, held_out = corpus.to(device), held_out.to(device)
 
     def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
-        chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator)
+        chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator, eventful, phase.event_windows)
         dyad = cut(corpus, chosen.to(device), phase.window_frames)
         told, truth = augment(dyad, student.model, phase, generator)
         return _loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
@@ -103,12 +105,40 @@ def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
     return weights / weights.sum()
 
 
-def draw(starts: Mapping[str, Tensor], weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count,) first frames: a scene by its weight, then any of its windows."""
+def starts_by_event(corpus: ArigCorpus, starts: Mapping[str, Tensor], window: int) -> dict[str, list[Tensor]]:
+    """By scene, of every kind of event but blinks that there is in it, those of the `starts` whose window has one."""
+    control, found = corpus.frames.control, {}
+    if not control.shape[-1]:
+        return {}
+    active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
+    before = torch.zeros(len(control) + 1, len(active), dtype=torch.int32)  # frames with one, before each frame
+    before[1:] = (control[:, active] > 0).cumsum(0)
+    for scene, firsts in starts.items():
+        has = before[firsts + window] > before[firsts]
+        found[scene] = [firsts[one] for one in has.unbind(1) if one.any()]
+    return found
+
+
+def draw(
+    starts: Mapping[str, Tensor],
+    weights: Tensor,
+    count: int,
+    generator: torch.Generator,
+    eventful: Mapping[str, Sequence[Tensor]] = {},  # noqa: B006
+    share: float = 0.0,
+) -> Tensor:
+    """(count,) first frames: a scene by its weight, then any of its windows.
+
+    `share` of them are of one of its `eventful` sets instead, any of these and then any of the set.
+    """
     scenes = torch.multinomial(weights, count, replacement=True, generator=generator)
-    places = torch.rand(count, generator=generator, dtype=torch.float64)
-    firsts = [starts[SCENES[int(scene)]] for scene in scenes]
-    return torch.stack([of[int(place * len(of))] for of, place in zip(firsts, places, strict=True)])
+    places, kinds, busy = torch.rand(3, count, generator=generator, dtype=torch.float64).tolist()
+    found = []
+    for scene, place, kind, lot in zip([SCENES[int(scene)] for scene in scenes], places, kinds, busy, strict=True):
+        sets = eventful.get(scene, ()) if lot < share else ()
+        of = sets[int(kind * len(sets))] if sets else starts[scene]
+        found.append(of[int(place * len(of))])
+    return torch.stack(found)
 
 
 @torch.no_grad()

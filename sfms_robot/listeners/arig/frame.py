@@ -120,12 +120,15 @@ class Draw(Part):
         self.register_buffer("levels", levels, persistent=False)
         self.register_buffer("places", places, persistent=False)
 
-    def forward(self, z: Tensor, noise: Tensor, standard: Tensor, motion_keys: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        self, z: Tensor, noise: Tensor, standard: Tensor, motion_keys: Tensor, rows: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
         """One frame.
 
         Args:
             z: of `Frame`; noise: (N, *model.noise_shape).
             standard: (N, C) standardised motion of the frame before; motion_keys: of `stream.Memory`.
+            rows: (N, 2K) of `Frame`, of a listener with events.
 
         Returns:
             Motion (N, C) in plain units, the same standardised (N, C), as what the sampler drew (N, C), and embedded
@@ -135,10 +138,10 @@ class Draw(Part):
         levels = self.levels
         if levels is None and self.places is not None and isinstance(model.head, Denoiser):
             levels = model.head.time(self.places)
-        made = model.drawn(model.sample(z, noise, levels), standard)
+        made = model.drawn(model.sample(z, noise, levels), standard, rows)
         motion = model.embed_motion(made)
         keys = push(motion_keys, model.progress.temporal.keys(motion))
-        return model.restore(made), made, model.target(made, standard), motion, keys
+        return model.restore(made), made, model.target(made, standard, rows), motion, keys
 
 
 def networks(model: ArigModel, kept: bool = True) -> dict[str, Part]:
@@ -180,6 +183,8 @@ def examples(settings: config.Arig, streams: int) -> Mapping[str, dict[str, Tens
         "standard": torch.zeros(n, channels),
         "motion_keys": motion_keys.clone(),
     }
+    if settings.events:
+        draw["rows"] = torch.zeros(n, CONTROL_ROWS * len(COLUMNS))
     return {"rest": {"still": torch.zeros(1, channels)}, "frame": frame, "draw": draw}
 
 

@@ -23,7 +23,8 @@ Beyond the paper, too:
    the face moves is too fine for the few numbers of z. The mean of what is to be drawn is predicted, and the sampler
    draws what is left: an event that is told shows after few steps of training, whatever the sampler's temperature.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
-   and told to the sampler beside z. Where the eyes look is not drawn: they rest.
+   and told to the sampler beside z. Where the eyes look is not drawn: they rest. Innovations are of what is left beside
+   the motion b to be expected of the events (`told`): x_t = b_t + rho (x_(t-1) - b_(t-1)) + ...
 
 B batch, N frames, C channels of the motion space, A sound features, D width, K numbers of a control row.
 """
@@ -37,6 +38,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
+from sfms_robot.listeners.arig import told
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
 from sfms_robot.listeners.arig.codes import CodeHead
 from sfms_robot.listeners.arig.csu import StateUnderstanding
@@ -49,6 +51,7 @@ from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
 MEAN_WIDTH = 256
+MEAN_DELTA = 4.0  # deviations beyond which an error of the mean counts linearly: above, hardly any event is told
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,7 @@ class ArigModel(nn.Module):
     step_std: Tensor
     rho: Tensor
     spread: Tensor
+    told: Tensor
     is_drawn: Tensor
     sound_mean: Tensor
     sound_std: Tensor
@@ -140,9 +144,12 @@ class ArigModel(nn.Module):
         self.register_buffer("motion_low", torch.full((self.channels,), -8.0))
         self.register_buffer("motion_high", torch.full((self.channels,), 8.0))
         self.register_buffer("step_std", torch.ones(self.channels))
+        self.tells_events = settings.events and settings.draws == "innovation"
         if settings.draws == "innovation":
             self.register_buffer("rho", torch.zeros(self.channels))
             self.register_buffer("spread", torch.ones(self.channels))
+            if self.tells_events:
+                self.register_buffer("told", torch.zeros(told.FEATURES, self.channels))
         is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
         self.register_buffer("is_drawn", is_drawn, persistent=False)
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
@@ -190,33 +197,49 @@ class ArigModel(nn.Module):
         """The inverse of `standardise`."""
         return motion * self.motion_std + self.motion_mean
 
-    def target(self, motion: Tensor, last: Tensor) -> Tensor:
-        """What the sampler is to draw: motion (..., C) after `last` (..., C), both standardised -> (..., C)."""
+    def target(self, motion: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
+        """What the sampler is to draw: motion (..., C) after `last` (..., C), both standardised -> (..., C).
+
+        `rows` (..., 2K): control of both frames.
+        """
         if self.settings.draws == "motion":
             return motion
-        step = (motion - self.expected(last)) / self.step_std
+        step = (motion - self.expected(last, rows)) / self.step_std
         return step.asinh() / self.spread if self.settings.draws == "innovation" else step
 
-    def drawn(self, sample: Tensor, last: Tensor) -> Tensor:
+    def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
         """The inverse of `target`; a step never leads out of the range of the motion, and what is not drawn rests."""
         if self.settings.draws == "motion":
             return self._at_rest(sample)
         step = (sample * self.spread).sinh() if self.settings.draws == "innovation" else sample
-        made = torch.addcmul(self.expected(last), step, self.step_std).clamp(self.motion_low, self.motion_high)
+        made = torch.addcmul(self.expected(last, rows), step, self.step_std).clamp(self.motion_low, self.motion_high)
         return self._at_rest(made)
 
     def _at_rest(self, motion: Tensor) -> Tensor:
         """Standardised motion (..., C) with what is not drawn at its mean, which is 0."""
         return motion.where(self.is_drawn, 0.0) if self.settings.events else motion
 
-    def expected(self, last: Tensor) -> Tensor:
-        """Where a step after `last` (..., C), standardised, begins: there, or a little on its way back to the mean."""
-        return self.rho * last if self.settings.draws == "innovation" else last
+    def expected(self, last: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Where a step after `last` (..., C), standardised, begins: there, or a little on its way back to the mean.
+
+        With events, to what is told of the frame, from what was told of the last: `rows` (..., 2K).
+        """
+        if self.settings.draws != "innovation":
+            return last
+        if not self.tells_events or rows is None:
+            return self.rho * last
+        before, now = (told.features(row) @ self.told for row in rows.chunk(2, dim=-1))
+        return now + self.rho * (last - before)
 
     def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
-        """Of the sampler (N, C), the mean included: z (N, D and beside it), noise and levels of `Denoiser.sample`."""
-        drawn = self.head.sample(z, noise, levels) if isinstance(self.head, Denoiser) else self.head.sample(z, noise)
-        return drawn if self.mean is None else drawn + self.mean(z)
+        """Of the sampler (N, C), the mean included: z (N, D and beside it), noise and levels of `Denoiser.sample`.
+
+        What is left beside the mean has the sampler's range, and so has the sum: nothing moves faster than in the data.
+        """
+        if not isinstance(self.head, Denoiser):
+            return self.head.sample(z, noise)
+        drawn = self.head.sample(z, noise, levels)
+        return drawn if self.mean is None else (drawn + self.mean(z)).clamp(self.head.low, self.head.high)
 
     def sample_loss(
         self,
@@ -233,7 +256,7 @@ class ArigModel(nn.Module):
         return (
             drawn
             if self.mean is None
-            else drawn + weighted_mean(F.smooth_l1_loss(mean, wanted, reduction="none"), weights)
+            else drawn + weighted_mean(F.huber_loss(mean, wanted, reduction="none", delta=MEAN_DELTA), weights)
         )
 
     def beside(self, z: Tensor, events: Tensor | None, sample: Tensor) -> Tensor:
@@ -287,7 +310,8 @@ class ArigModel(nn.Module):
         cis = self.long(summaries.view(b, t, d)).reshape(b * t, d)
         voiced = torch.stack([dyad.voiced[:, 1:, 0], dyad.voiced[:, :-1, 1]], dim=-1)
         feature, logits = self._states(cis, voiced, states)
-        events = self._events(dyad)
+        rows = self.rows(dyad)
+        events = None if rows is None else self.embed_events(rows)
         outline = self.progress.coarse(
             motion.reshape(b * t, d),
             windows(self.progress.coarse.keys(agent), self.settings.sound_frames)[:, 1:].flatten(0, 1),
@@ -300,14 +324,15 @@ class ArigModel(nn.Module):
             feature,
             None if events is None else events.flatten(0, 1),
         )
-        sample = torch.cat([torch.zeros_like(standard[:, :1]), self.target(standard[:, 1:], standard[:, :-1])], dim=1)
+        drawn = self.target(standard[:, 1:], standard[:, :-1], None if rows is None else rows[:, :-1])
+        sample = torch.cat([torch.zeros_like(standard[:, :1]), drawn], dim=1)
         return Condition(self.beside(z.view(b, t, d), events, sample), logits, outline.view(b, t, d))
 
-    def _events(self, dyad: Dyad) -> Tensor | None:
-        """(B, N - 1, D) embedded, or None without events."""
+    def rows(self, dyad: Dyad) -> Tensor | None:
+        """Control (B, N - 1, 2K) of the frames before and of frames 1..N-1, or None without events."""
         if dyad.control is None or not self.settings.events:
             return None
-        return self.embed_events(torch.cat([dyad.control[:, :-1], dyad.control[:, 1:]], dim=-1))
+        return torch.cat([dyad.control[:, :-1], dyad.control[:, 1:]], dim=-1)
 
     def _states(self, cis: Tensor, voiced: Tensor, states: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         """cis (B * T, D), voiced (B, T, 2) -> features (B * T, D), logits (B, T, S)."""
@@ -331,7 +356,7 @@ class ArigModel(nn.Module):
         known = None if states is None else torch.where(states < 0, FIRST, states)
         found = self.condition(dyad, known)
         standard = self.standardise(dyad.agent_motion)
-        target = self.target(standard[:, 1:], standard[:, :-1])
+        target = self.target(standard[:, 1:], standard[:, :-1], self.rows(dyad))
         motion = self.sample_loss(found.z.flatten(0, 1), target.flatten(0, 1), generator=generator)
         motion = motion.view(target.shape[:2])
         if found.states is None or states is None:
@@ -344,4 +369,4 @@ class ArigModel(nn.Module):
         z = self.condition(dyad, states).z
         made = self.sample(z.flatten(0, 1), noise.flatten(0, 1))
         last = self.standardise(dyad.agent_motion[:, :-1])
-        return self.restore(self.drawn(made.view(*z.shape[:2], -1), last))
+        return self.restore(self.drawn(made.view(*z.shape[:2], -1), last, self.rows(dyad)))

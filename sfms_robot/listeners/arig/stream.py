@@ -190,9 +190,9 @@ class ArigListener(RunsOnEngine):
             heard = [*heard] * len(memories)
         z, logits, now = self._conditions(heard, memories, rows)
         noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self._noise_shape) for memory in now])
-        made, standard, sample, motion, keys = self.engine.run(
-            "draw", z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")
-        )
+        inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
+        told = [rows] if self.settings.events else []
+        made, standard, sample, motion, keys = self.engine.run("draw", *inputs, *told)
         sojourns, states = self._states(logits, now, rows, heard)
         out = []
         for index, (speaker, memory) in enumerate(zip(speakers, now, strict=True)):

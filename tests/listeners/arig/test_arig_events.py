@@ -237,3 +237,15 @@ def test_an_hour_of_independent_draws_stays_where_the_data_are():
         places.append(place)
     for part in torch.stack(places).chunk(4):
         assert float(part.std()) == pytest.approx(1.0, abs=0.1) and abs(float(part.mean())) < 0.1
+
+
+def test_nothing_is_drawn_that_is_faster_than_the_data():
+    """Whatever the mean of what is drawn is, and whatever is drawn beside it."""
+    listener = soft(arig_listener(**TOLD))
+    with torch.no_grad():
+        listener.model.head.low.fill_(-1.5)
+        listener.model.head.high.fill_(2.0)
+        listener.model.mean[-1].bias.fill_(9.0)
+        z = torch.randn(7, listener.model.mean[0].in_features)
+        found = listener.model.sample(z, torch.randn(7, *listener.model.noise_shape))
+        assert float(found.max()) == 2.0 and float(found.min()) >= -1.5
