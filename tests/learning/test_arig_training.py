@@ -39,6 +39,7 @@ from sfms_robot.listeners import arig, checkpoint
 from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sojourns import FIRST, NODDING
+from sfms_robot.listeners.arig.told import features
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import LN_PER_DB
 
@@ -405,6 +406,22 @@ def test_the_fitted_autoregression_is_that_of_the_motion():
     assert torch.allclose(autocorrelation(motion[:-1], motion[1:]), torch.full((58,), rho), atol=0.03)
     assert float(autocorrelation(torch.ones(9, 1), torch.ones(9, 1))) == pytest.approx(LARGEST_RHO)
     assert float(autocorrelation(torch.zeros(9, 1), torch.zeros(9, 1))) == pytest.approx(LARGEST_RHO)
+
+
+def test_what_events_do_on_average_is_fitted_on_the_data_and_has_no_side():
+    one = dyad("a", "listening", 0)
+    motion = np.zeros_like(one.listener)
+    bump = np.sin(np.linspace(0, np.pi, 15))
+    for event in one.events:
+        at = round(event.start_s * HZ)
+        motion[at : at + 15, :3] += 0.05 * bump[:, None]
+    corpus = gather({"a": [replace(one, listener=motion)]}, WINDOW, ARKIT, WIDTHS["mel"], True)
+    model = a_student(events=True, draws="innovation").model
+    fit_scales(model, corpus, settings().listener.channels)
+    found = features(corpus.frames.control) @ model.told
+    standard = model.standardise(corpus.frames.agent_motion)
+    assert float(torch.corrcoef(torch.stack([found[:, 1], standard[:, 1]]))[0, 1]) > 0.95
+    assert not found[:, [0, 2, 4]].any()  # roll, yaw, y
 
 
 def test_where_the_head_is_held_says_nothing_of_what_is_drawn_next(corpus):
