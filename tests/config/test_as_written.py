@@ -100,7 +100,7 @@ ARIG = {
     "(1): the past as it was": lambda one: not (one.training.history_noise or one.training.speaking_noise),
     "4.1: sounds and faces as they were": lambda one: (
         not (one.training.drop_audio or one.training.drop_face or one.training.drop_agent)
-        and not (one.training.gain_db or one.training.colour_db or one.training.grain_db)
+        and not (one.training.gain_db or one.training.colour_db or one.training.grain_db or one.training.event_windows)
     ),
     "(4): ancestral sampling, nothing scaled or clamped": lambda one: (
         one.listener.diffusion.sampler == "ddpm"
