@@ -170,7 +170,7 @@ def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
 
 def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Tensor:
     """Standardised motion (N, C) less what its events do to a face on average, which is fitted first."""
-    if not model.tells_events:
+    if not model.is_told:
         return standard
     control = corpus.frames.control
     model.told.copy_(told.fit(control, standard))

@@ -29,8 +29,8 @@ from sfms_robot.signals import mel
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
 COLOURS = 4  # waves over the bands that make up another microphone's colour
 JUMPS = 0.04  # of frames at which the slow part goes elsewhere
-FAST = 0.3  # the most that the fast part is, in deviations of steps: more, and no past says how fast it was
 GLIDE = 12  # frames that it takes for that, at most
+FAST = 0.3  # the most that the fast part is, in deviations of steps: more, and no past says how fast it was
 COLD = 0.5  # share of windows whose past is exact
 SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
 # Groups of channels, by how their names begin; the mouth has the rest.

@@ -144,11 +144,11 @@ class ArigModel(nn.Module):
         self.register_buffer("motion_low", torch.full((self.channels,), -8.0))
         self.register_buffer("motion_high", torch.full((self.channels,), 8.0))
         self.register_buffer("step_std", torch.ones(self.channels))
-        self.tells_events = settings.events and settings.draws == "innovation"
+        self.is_told = settings.events and settings.draws == "innovation"
         if settings.draws == "innovation":
             self.register_buffer("rho", torch.zeros(self.channels))
             self.register_buffer("spread", torch.ones(self.channels))
-            if self.tells_events:
+            if self.is_told:
                 self.register_buffer("told", torch.zeros(told.FEATURES, self.channels))
         is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
         self.register_buffer("is_drawn", is_drawn, persistent=False)
@@ -226,7 +226,7 @@ class ArigModel(nn.Module):
         """
         if self.settings.draws != "innovation":
             return last
-        if not self.tells_events or rows is None:
+        if not self.is_told or rows is None:
             return self.rho * last
         before, now = (told.features(row) @ self.told for row in rows.chunk(2, dim=-1))
         return now + self.rho * (last - before)
