@@ -30,7 +30,6 @@ RETURN = 0.1  # share of the slow part of the noise on the past that one frame t
 COLOURS = 4  # waves over the bands that make up another microphone's colour
 JUMPS = 0.04  # of frames at which the slow part goes elsewhere
 GLIDE = 12  # frames that it takes for that, at most
-FAST = 0.3  # the most that the fast part is, in deviations of steps: more, and no past says how fast it was
 COLD = 0.5  # share of windows whose past is exact
 SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
 # Groups of channels, by how their names begin; the mouth has the rest.
@@ -193,7 +192,7 @@ def _wander(b: int, n: int, kept: Tensor, phase: config.ArigPhase, generator: to
     slow = jumps.clone()
     for frame in range(1, n):
         slow[:, frame] += kept * slow[:, frame - 1]
-    return size * slow, size.clamp(max=FAST) * fast
+    return size * slow, size * fast
 
 
 def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
