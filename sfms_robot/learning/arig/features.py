@@ -170,13 +170,13 @@ def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
 
 def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Tensor:
     """Standardised motion (N, C) less what its events do to a face on average, which is fitted first."""
-    if not model.is_told:
-        return standard
     control = corpus.frames.control
+    if not model.is_told or control is None:
+        return standard
     model.told.copy_(told.fit(control, standard))
     model.told[:, [name in SIDED for name in model.settings.channels]] = 0.0
     lengths = list(corpus.lengths)
-    of_dyads = zip(standard.split(lengths), control.split(lengths), strict=True)
+    of_dyads = zip(torch.split(standard, lengths), torch.split(control, lengths), strict=True)
     return torch.cat([motion - told.features(rows) @ model.told for motion, rows in of_dyads])
 
 

@@ -108,7 +108,7 @@ def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
 def starts_by_event(corpus: ArigCorpus, starts: Mapping[str, Tensor], window: int) -> dict[str, list[Tensor]]:
     """By scene, of every kind of event but blinks that there is in it, those of the `starts` whose window has one."""
     control, found = corpus.frames.control, {}
-    if not control.shape[-1]:
+    if control is None or not control.shape[-1]:
         return {}
     active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
     before = torch.zeros(len(control) + 1, len(active), dtype=torch.int32)  # frames with one, before each frame

@@ -52,9 +52,10 @@ def fit(rows: Tensor, motion: Tensor) -> Tensor:
     """Weights (FEATURES, C) of least squares for motion (N, C) at control rows (N, K), a little drawn to nothing."""
     gram = torch.zeros(FEATURES, FEATURES, dtype=torch.float64)
     moved = torch.zeros(FEATURES, motion.shape[1], dtype=torch.float64)
-    for row, made in zip(rows.split(65536), motion.split(65536), strict=True):
+    for row, made in zip(torch.split(rows, 65536), torch.split(motion, 65536), strict=True):
         of = features(row.float()).double()
         gram += of.T @ of
         moved += of.T @ made.double()
     gram += RIDGE * torch.eye(FEATURES, dtype=torch.float64)
-    return torch.linalg.solve(gram, moved).float()
+    weights: Tensor = torch.linalg.solve(gram, moved).float()
+    return weights
