@@ -25,7 +25,9 @@ def serve(
         None, metavar="[HOST:]PORT", help="Serve figures for Prometheus at /metrics, on loopback (0: any free port)."
     ),
     hop: int | None = typer.Option(None, min=1, help="A plan every so many frames. Default: as a robot would choose."),
-    workers: int | None = typer.Option(None, min=1, max=64, help="Batches stepped side by side. Default: 2."),
+    processes: int | None = typer.Option(
+        None, min=1, max=256, help="That step, each with the listener in its memory. Default: one for each core."
+    ),
     everybody: bool = typer.Option(
         False, "--everybody", help="Admit robots without asking whether they can be answered in time."
     ),
@@ -41,7 +43,7 @@ def serve(
     over = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
-    figures = serve_until(ServeOptions(listener, name, zenoh, metrics, hop, workers, everybody, runs_on), over, _say)
+    figures = serve_until(ServeOptions(listener, name, zenoh, metrics, hop, processes, everybody, runs_on), over, _say)
     if json:
         print(json_module.dumps(figures))
 

@@ -212,13 +212,13 @@ def test_a_slower_machine_admits_fewer_and_delay_grows_with_heads():
 def test_batches_that_take_longer_than_measured_close_the_door():
     server = StreamServer(Counting(hop=1), "counting", slow(1.0))
     stream = joined(server)
-    before = server.statistics()["most_heads"]
+    before = server.figures().most_heads
     for number in range(200):
         server.receive(stream, frame(number), number * FRAME_S)
         batch = server.batch()
         server.finish(batch, server.step(batch), number * FRAME_S, number * FRAME_S + 0.03)
-    assert server.statistics()["most_heads"] < before
-    assert server.statistics()["cost_scale"] > 2
+    assert server.figures().most_heads < before
+    assert server.figures().cost_scale > 2
 
 
 def test_costs_are_measured_batch_by_batch():

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
 PAPER: Final = "sfms-paper"  # ships as a training only
+TRAINED: Final = "trained"
+SEEDED: Final = "seeded, not trained"
 MINUTES: Final = 60
 MINUTE: Final = 60 * FRAME_HZ
 COLUMNS: Final = {
@@ -81,12 +83,8 @@ def _table(rows: Mapping[str, Row]) -> list[dict[str, Any]]:
 
 def _measured(name: str, scratch: Path) -> dict[str, Row]:
     """Rows of one shipped listener, with trained weights where it has them."""
-    shipped = data_dir("configs") / "listeners" / name
-    settings = config.load_listener(shipped / "config.yaml")
-    trained = (shipped / "model.safetensors").is_file()
-    folder = shipped
-    if not trained and isinstance(settings, config.Arig):
-        folder = _seeded(shipped, settings, scratch / "seeded")
+    folder, weights = with_weights(name, scratch)
+    settings = config.load_listener(folder / "config.yaml")
     ways = engines_of(folder, scratch)
     speaker = _speaker()
     streams: dict[str, Stream] = {}
@@ -103,7 +101,7 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
     rows[name] = rows[f"{name} {[*ways][-1]}"] | {
         "eager_fp32_fps": rows[f"{name} {EAGER}"]["fps"],
         "params": _parameters(streams[EAGER].listener),
-        "weights": "trained" if trained else "seeded, not trained",
+        "weights": weights,
     }
     if isinstance(settings, config.Arig):
         early = Stream(chosen.listener, _later(chosen.listener, chosen.listener.start(0), speaker, minutes=1))
@@ -112,7 +110,7 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
             "minute_1_ms": float(np.median(early.frame_ms)),
             f"minute_{MINUTES}_ms": float(np.median(chosen.frame_ms)),
             "in_run": in_run(folder),
-            "samplers": samplers(_how(streams[EAGER].listener), speaker) if trained else None,
+            "samplers": samplers(_how(streams[EAGER].listener), speaker) if weights == TRAINED else None,
         }
     return rows
 
@@ -124,6 +122,15 @@ def _how(listener: Listener) -> Any:
 
 def _parameters(listener: Listener) -> int:
     return sum(each.numel() for each in _how(listener).model.parameters())
+
+
+def with_weights(name: str, scratch: Path) -> tuple[Path, str]:
+    """The folder of a shipped listener, and what weights it has in words; where none ship, seeded ones in `scratch`."""
+    shipped = data_dir("configs") / "listeners" / name
+    settings = config.load_listener(shipped / "config.yaml")
+    if (shipped / "model.safetensors").is_file() or not isinstance(settings, config.Arig):
+        return shipped, TRAINED
+    return _seeded(shipped, settings, scratch / "seeded"), SEEDED
 
 
 def _seeded(shipped: Path, settings: config.Arig, folder: Path) -> Path:
@@ -174,7 +181,7 @@ def _sfms_paper() -> dict[str, Row]:
     take_turns(streams, _speaker())
     rows = {f"{PAPER} {way}": stream.figures(streams[EAGER]) for way, stream in streams.items()}
     params = sum(each.numel() for each in model.parameters())
-    return {way: each | {"params": params, "weights": "seeded, not trained"} for way, each in rows.items()}
+    return {way: each | {"params": params, "weights": SEEDED} for way, each in rows.items()}
 
 
 def _later(listener: Listener, memory: Any, speaker: list[SpeakerFrame], minutes: int = MINUTES) -> Any:

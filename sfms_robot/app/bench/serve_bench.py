@@ -1,28 +1,36 @@
-"""`bench serve`: how many heads one server process answers in time, and what each costs.
+"""`bench serve`: how many heads one server answers in time, and what each costs.
 
 Heads send frames of a recorded person 25 times a second, each from its own place in the recording and at its own phase,
-as bytes; what is measured lies between a frame's coming and its plan's going, as bytes again: parsing, waiting for a
-batch, the batch. The network is not in it (`bench live` and a run's report have that). Nothing is left out of what a
-server does, and the threads that step are those of `serve`.
+as bytes; what is measured lies between a frame's coming and its plan's going, as bytes again: the way to the process
+that steps, parsing, waiting for a batch, the batch, the way back. The network is not in it (`bench live` and a run's
+report have that). Nothing is left out of what a server does, and the processes are those of `serve`. The frames are
+sent from this machine too.
 
-The peer is the same listener asked for one head at a time, which is what a server without batches would do.
+The peer is the same listener asked for one head at a time by one core, which is what a server without batches would do.
 """
 
 from __future__ import annotations
 
+import queue
 import struct
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.app.bench.listener_bench import with_weights
 from sfms_robot.app.bench.measure import Told, machine
-from sfms_robot.app.serve.service import BatchWorkers, ServeOptions, served_listener
+from sfms_robot.app.serve.batch_process import Served
+from sfms_robot.app.serve.worker_pool import WorkerPool
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.remote_messages import (
     Join,
+    Notice,
     SentFrame,
     Welcome,
     frame_message,
@@ -31,64 +39,65 @@ from sfms_robot.listeners.remote_messages import (
     words_message,
 )
 from sfms_robot.listeners.serving.capacity import Capacity
-from sfms_robot.listeners.serving.stream_server import DEADLINE_S, StreamServer
-from sfms_robot.ports import Listener
+from sfms_robot.listeners.serving.stream_server import DEADLINE_S
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.sources.speakers import voice_file
 
-NAMES: Final = ("sfms-small", "arig-small")
+NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
 SPEAKER: Final = "katie"
-WORKERS: Final = 2
 WARM_S: Final = 1.0
 SECONDS: Final = 4.0
 MOST: Final = 512
 NOT_KEPT_UP_MS: Final = 10_000.0  # stands for a server that left frames out
 _PERCENT: Final = 99.0
+_ANSWER_S: Final = 30.0
 
 
 def measure(say: Callable[[str], None]) -> Told:
-    """Blocks for a minute or two."""
-    import torch
-
-    threads = torch.get_num_threads()
-    try:
-        figures = {name: _served(name, say) for name in NAMES}
-    finally:
-        torch.set_num_threads(threads)
+    """Blocks for some minutes."""
+    figures = {name: _served(name, say) for name in NAMES}
     table = [
         {
-            "listener": name, "heads in time": each["median"], "p99 ms": each["p99_ms"], "hop": each["hop"],
-            "one at a time": each["peer_median"], "ratio": each["ratio"], "batch": each["batch_size_p50"],
+            "listener": name, "weights": each["weights"], "heads in time": each["median"], "p99 ms": each["p99_ms"],
+            "hop": each["hop"], "one at a time": each["peer_median"], "ratio": each["ratio"],
+            "batch": each["batch_size"],
             **{f"ms a frame, batch of {size}": each["cost_ms_per_head_and_frame"][size] for size in ("1", "8", "32")},
         }
         for name, each in figures.items()
     ]  # fmt: skip
     figures = {f"serve.{name}": each for name, each in figures.items()}
-    return Told(figures, table, [f"within {DEADLINE_S * 1e3:.0f} ms, p99, {WORKERS} threads on {machine()}"])
+    return Told(figures, table, [f"within {DEADLINE_S * 1e3:.0f} ms, p99, a process for each of {machine()}"])
 
 
 def _served(name: str, say: Callable[[str], None]) -> dict[str, Any]:
-    listener, capacity = served_listener(ServeOptions(name))
-    messages = _frames()
-    curve: list[dict[str, Any]] = []
+    messages, curve = _frames(), list[dict[str, Any]]()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder, weights = with_weights(name, Path(scratch))
+        load = _Load()
+        with closing(WorkerPool(Served(str(folder), "bench", everybody=True), load.sent)) as pool:
 
-    def in_time(heads: int) -> bool:
-        curve.append(_loaded(listener, messages, heads))
-        say(f"{name}: {heads} heads, p99 {curve[-1]['p99_ms']:.0f} ms, batches of {curve[-1]['batch_size_p50']:.0f}")
-        return float(curve[-1]["p99_ms"]) <= DEADLINE_S * 1e3
+            def in_time(heads: int) -> bool:
+                curve.append(_loaded(pool, load, messages, heads))
+                say(
+                    f"{name}: {heads} heads, p99 {curve[-1]['p99_ms']:.0f} ms, batches of {curve[-1]['batch_size']:.1f}"
+                )
+                return float(curve[-1]["p99_ms"]) <= DEADLINE_S * 1e3
 
-    most = _largest(in_time, start=max(1, capacity.most(DEADLINE_S)))
+            most = _largest(in_time, start=max(1, pool.most))
     best = next((each for each in curve if each["heads"] == most), curve[0])
+    capacity = pool.capacities[0]
     alone = _alone(capacity)
     return {
         "median": most,
         "unit": "heads",
+        "weights": weights,
         "p99_ms": best["p99_ms"],
         "p50_ms": best["p50_ms"],
         "deadline_ms": DEADLINE_S * 1e3,
-        "hop": listener.hop,
-        "workers": WORKERS,
-        "batch_size_p50": best["batch_size_p50"],
+        "hop": pool.hop,
+        "processes": len(pool.capacities),
+        "expected": pool.most,
+        "batch_size": best["batch_size"],
         "curve": sorted(curve, key=lambda each: int(each["heads"])),
         "cost_ms_per_head_and_frame": {
             str(size): round(_per_frame_s(capacity, size) * 1e3, 3) for size in capacity.sizes
@@ -122,62 +131,71 @@ def _largest(in_time: Callable[[int], bool], start: int) -> int:
     return low
 
 
-def _loaded(listener: Listener, messages: Sequence[bytes], heads: int) -> dict[str, Any]:
+def _loaded(pool: WorkerPool, load: _Load, messages: Sequence[bytes], heads: int) -> dict[str, Any]:
     """One point of the curve: so many heads for `SECONDS`."""
-    server = StreamServer(listener, "bench")
-    load = _Load()
-    workers = BatchWorkers(server, load.sent, WORKERS)
-    try:
-        streams = [_join(server, index) for index in range(heads)]
-        rng = np.random.default_rng(heads)
-        phases_s = np.sort(rng.uniform(0, FRAME_S, heads))
-        shifts = rng.integers(0, len(messages), heads)
-        began_s, frames = time.monotonic(), round((WARM_S + SECONDS) / FRAME_S)
-        used_s = time.process_time()
-        for number in range(frames):
-            for index, stream in enumerate(streams):
-                due_s = began_s + number * FRAME_S + phases_s[index]
-                ahead_s = due_s - time.monotonic()
-                if ahead_s > 0:
-                    time.sleep(ahead_s)
-                workers.receive(stream, _numbered(messages[(number + shifts[index]) % len(messages)], number))
-        used_s = time.process_time() - used_s
-        told = workers.statistics()
-    finally:
-        workers.close()
+    streams = [_join(pool, index) for index in range(heads)]
+    load.begin()
+    before = pool.statistics()
+    rng = np.random.default_rng(heads)
+    phases_s = np.sort(rng.uniform(0, FRAME_S, heads))
+    shifts = rng.integers(0, len(messages), heads)
+    began_s, frames = time.monotonic(), round((WARM_S + SECONDS) / FRAME_S)
+    for number in range(frames):
+        for index, stream in enumerate(streams):
+            ahead_s = began_s + number * FRAME_S + phases_s[index] - time.monotonic()
+            if ahead_s > 0:
+                time.sleep(ahead_s)
+            pool.receive(stream, _numbered(messages[(number + shifts[index]) % len(messages)], number))
+    told = _since(before, pool.statistics())
+    for stream in streams:
+        pool.receive(stream, words_message(Notice("leave")))
     delays_ms = load.delays_ms(after=round(WARM_S / FRAME_S))
-    if told["skipped_frames"] or not delays_ms:
+    if load.skipped or not delays_ms:
         delays_ms = [NOT_KEPT_UP_MS]
     p50, p99 = np.percentile(delays_ms, [50, _PERCENT])
     return {
         "heads": heads,
         "p50_ms": round(float(p50), 1),
         "p99_ms": round(float(p99), 1),
-        "batch_size_p50": told["batch_size"]["p50"],
-        "cpu_ms_per_head_and_second": round(used_s / heads / (WARM_S + SECONDS) * 1e3, 2),
+        "batch_size": round(told["steps"] / max(told["batches"], 1), 1),
+        "cpu_ms_per_head_and_second": round(told["cpu_s"] / heads / (WARM_S + SECONDS) * 1e3, 2),
     }
 
 
+def _since(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, float]:
+    return {name: now[name] - before[name] for name in ("steps", "batches", "cpu_s")}
+
+
 class _Load:
-    """Takes the plans, and asks each how late it was."""
+    """Takes what the server sends, and asks each plan how late it was."""
 
     def __init__(self) -> None:
-        self.plans: list[bytes] = []
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what came."""
+        self._plans: list[tuple[bytes, float]] = []
+        self.skipped = 0
 
     def sent(self, stream: str, message: bytes) -> None:
-        """From the server's threads."""
+        """From the pool's threads."""
         if message[:1] != b"{":
-            self.plans.append(message)
+            self._plans.append((message, time.monotonic()))
+        else:
+            said = parse_words(message)
+            self.skipped += said.frames if isinstance(said, Notice) else 0
 
     def delays_ms(self, after: int) -> list[float]:
         """Of plans for frames from number `after` on: from the frame's coming to the plan's going."""
-        sent = [parse_plan(message) for message in self.plans]
-        return [(each.sent_s - each.came_s) * 1e3 for each in sent if each.number >= after]
+        sent = [(parse_plan(message), went_s) for message, went_s in self._plans]
+        return [(went_s - each.came_s) * 1e3 for each, went_s in sent if each.number >= after]
 
 
-def _join(server: StreamServer, index: int) -> str:
-    said = parse_words(server.join(words_message(Join(f"bench-{index}", index)), time.monotonic()))
-    assert isinstance(said, Welcome)  # without a capacity everybody is admitted
+def _join(pool: WorkerPool, index: int) -> str:
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    pool.join(words_message(Join(f"bench-{time.monotonic_ns()}-{index}", index)), answers.put)
+    said = parse_words(answers.get(timeout=_ANSWER_S))
+    assert isinstance(said, Welcome)  # everybody is admitted
     return said.stream
 
 

@@ -1,7 +1,6 @@
 """Many heads, one model: streams join, send frames, and are stepped in batches. Opens nothing, waits for nothing.
 
-Whoever owns it (`app.serve`) brings messages and the time, and does three things in turn, the middle one without its
-lock, by as many threads as there are cores:
+Whoever owns it (`app.serve`) brings messages and the time, and does three things in turn:
 
     batch    the frames that are due, earliest deadline first, one of each stream, as many as can be made in time
     step     the listener steps them together
@@ -20,6 +19,7 @@ from __future__ import annotations
 import logging
 import math
 import secrets
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -47,12 +47,12 @@ from sfms_robot.listeners.remote_messages import (
 )
 from sfms_robot.listeners.serving.batches import step_each
 from sfms_robot.listeners.serving.capacity import Capacity
+from sfms_robot.listeners.serving.figures import Figures
 from sfms_robot.ports import Listener
-from sfms_robot.signals.quantiles import Quantiles
 
 DEADLINE_S: Final = 0.080
 SILENT_S: Final = 10.0  # a stream that sends nothing for so long is given up
-RECENT: Final = 2048  # delays that p50 and p99 are of
+RECENT: Final = 2048  # delays and batches that p50 and p99 are of
 MOST_FILLED: Final = MOST_WAITING  # lost frames in a row that become empty ones; more is an outage
 TOLD_AGAIN: Final = 2  # plans that tell an event once more
 _STALE_S: Final = 2.0  # a frame that claims to be older has a clock of its own
@@ -104,7 +104,7 @@ class Batch:
 
 
 class StreamServer:
-    """Not thread-safe, but for `step`. All times are seconds of one clock.
+    """Not thread-safe. All times are seconds of one clock.
 
     Args:
         listener: that is served, under `name`.
@@ -130,13 +130,18 @@ class StreamServer:
         self._streams: dict[str, _Stream] = {}
         self._recent_s: deque[float] = deque(maxlen=RECENT)
         self._most = self._batch_limit()
-        self._batch_sizes = Quantiles()
+        self._batch_sizes: deque[int] = deque(maxlen=RECENT)
         self.plans = self.batches = self.misses = self.skipped = self.lost = self.refused = self.stepped = 0
 
     @property
     def heads(self) -> int:
         """Streams at this moment."""
         return len(self._streams)
+
+    @property
+    def clients(self) -> Mapping[str, str]:
+        """Who each stream is listened to for, by the stream's name."""
+        return {name: stream.client for name, stream in self._streams.items()}
 
     @property
     def waits(self) -> bool:
@@ -261,7 +266,7 @@ class StreamServer:
         return Batch(chosen, [stream.waiting.popleft() for stream in chosen])
 
     def step(self, batch: Batch) -> list[tuple[Plan | None, Any]]:
-        """From any thread, also several at a time."""
+        """What the listener makes of it; may raise whatever that does."""
         return step_each(self._listener, batch.speakers, batch.memories)
 
     def finish(
@@ -281,7 +286,7 @@ class StreamServer:
                 self._planned(now_s - due.came_s)
         self.batches += 1
         self.stepped += len(batch.streams)
-        self._batch_sizes.add(len(batch.streams))
+        self._batch_sizes.append(len(batch.streams))
         self._weigh(sum(plan is not None for plan, _ in answers), len(answers), step_s)
         return messages
 
@@ -315,29 +320,27 @@ class StreamServer:
 
     # --- figures -----------------------------------------------------------------------------------------------------
 
-    def statistics(self) -> Mapping[str, Any]:
-        """`heads`, `room` for more, `plans`, `deadline_misses`, `delay_ms` of the last plans, `batch_size`, ..."""
-        recent = list(self._recent_s)
-        p50, p99 = (np.percentile(recent, [50, 99]) * 1e3).round(3).tolist() if recent else (None, None)
-        most = None if self._capacity is None else self._capacity.most(self._deadline_s)
-        return {
-            "server": self._server,
-            "listener": self._name,
-            "hop": self._listener.hop,
-            "heads": self.heads,
-            "most_heads": most,
-            "plans": self.plans,
-            "deadline_ms": self._deadline_s * 1e3,
-            "deadline_misses": self.misses,
-            "delay_ms": {"p50": p50, "p99": p99},
-            "batches": self.batches,
-            "batch_size": self._batch_sizes.report(p50=50, p99=99),
-            "steps": self.stepped,
-            "skipped_frames": self.skipped,
-            "lost_frames": self.lost,
-            "refused": self.refused,
-            "cost_scale": None if self._capacity is None else round(self._capacity.scale, 3),
-        }
+    def figures(self) -> Figures:
+        """What it has done so far."""
+        return Figures(
+            server=self._server,
+            listener=self._name,
+            hop=self._listener.hop,
+            deadline_s=self._deadline_s,
+            heads=self.heads,
+            most_heads=None if self._capacity is None else self._capacity.most(self._deadline_s),
+            plans=self.plans,
+            misses=self.misses,
+            batches=self.batches,
+            steps=self.stepped,
+            skipped=self.skipped,
+            lost=self.lost,
+            refused=self.refused,
+            delays_s=[*self._recent_s],
+            batch_sizes=[*self._batch_sizes],
+            cost_scale=None if self._capacity is None else self._capacity.scale,
+            cpu_s=time.process_time(),
+        )
 
 
 def _urgency(stream: _Stream) -> float:

@@ -1,0 +1,105 @@
+"""The processes of `serve`: streams dealt among them, each heard as it would be alone; one that dies is replaced."""
+
+import os
+import queue
+import signal
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.serve.batch_process import Served
+from sfms_robot.app.serve.worker_pool import WorkerPool
+from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.frames import FRAME_S, SpeakerFrame
+from sfms_robot.listeners.registry import at_hop, load_listener
+from sfms_robot.listeners.remote_messages import (
+    Join,
+    Notice,
+    Refusal,
+    SentFrame,
+    Welcome,
+    frame_message,
+    parse_plan,
+    parse_words,
+    words_message,
+)
+
+LISTENER = "sfms-small"
+HOP = 3
+LIMIT_S = 240.0
+SERVED = Served(LISTENER, "tested", hop=HOP, everybody=True)
+
+
+def joined(pool, client, seed=0):
+    answers = queue.SimpleQueue()
+    pool.join(words_message(Join(client, seed)), answers.put)
+    said = parse_words(answers.get(timeout=LIMIT_S))
+    assert isinstance(said, Welcome), said
+    return said.stream
+
+
+def voice(seed, frames):
+    """16-bit sound, as it survives the way."""
+    rng = np.random.default_rng(seed)
+    whole = rng.integers(-3000, 3000, (frames, 640)).astype(np.float32) / 32768
+    return [SpeakerFrame((index + 1) * FRAME_S, samples) for index, samples in enumerate(whole)]
+
+
+def alone(seed, frames):
+    listener = at_hop(load_listener(LISTENER, engine="onnx", threads=1), HOP)
+    memory, plans = listener.start(seed), []
+    for frame in frames:
+        plan, memory = listener.step(frame, memory)
+        plans += [] if plan is None else [plan.frames]
+    return plans
+
+
+def test_heads_are_dealt_evenly_and_each_has_the_frames_of_a_single_run():
+    came = queue.SimpleQueue()
+    with closing(WorkerPool(SERVED, lambda stream, message: came.put((stream, message)), processes=2)) as pool:
+        heard = {joined(pool, str(seed), seed): voice(seed, 3 * HOP) for seed in range(4)}
+        assert sorted(len(each.clients) for each in pool._workers) == [2, 2]
+        for index in range(3 * HOP):
+            for stream, frames in heard.items():
+                pool.receive(stream, frame_message(SentFrame(index, frames[index], 0.0)))
+        plans = {stream: [] for stream in heard}
+        while any(len(each) < 3 for each in plans.values()):
+            stream, message = came.get(timeout=LIMIT_S)
+            plans[stream].append(parse_plan(message).plan.frames)
+        told = pool.statistics()
+        assert (told["processes"], told["heads"], told["plans"]) == (2, 4, 12)
+    for seed, (stream, frames) in enumerate(heard.items()):
+        for one, other in zip(plans[stream], alone(seed, frames), strict=True):
+            assert np.abs(one - other).max() < 1e-5
+
+
+def test_a_process_that_dies_is_replaced_and_its_robots_are_told_to_join_again():
+    came = queue.SimpleQueue()
+    with closing(WorkerPool(SERVED, lambda stream, message: came.put((stream, message)), processes=1)) as pool:
+        stream, first = joined(pool, "a"), pool._workers[0]
+        assert joined(pool, "a") == stream
+        os.kill(first._process.pid, signal.SIGKILL)
+        pool._wait(lambda: pool._workers[0] is not first and pool._workers[0].capacity is not None)
+        pool.receive(stream, b"anything")
+        assert came.get(timeout=LIMIT_S) == (stream, words_message(Notice("unknown")))
+        assert joined(pool, "a") != stream
+
+
+def test_what_is_no_question_for_a_stream_is_refused():
+    with closing(WorkerPool(SERVED, lambda *_: None, processes=1)) as pool:
+        answers = queue.SimpleQueue()
+        pool.join(b"{", answers.put)
+        assert isinstance(parse_words(answers.get(timeout=LIMIT_S)), Refusal)
+
+
+@pytest.mark.parametrize(
+    ("served", "error", "said"),
+    [
+        (Served(LISTENER, "tested", hop=99), ConfigError, "--hop 99: listener 'sfms-small' has 1, 2"),
+        (Served("arig-paper", "tested"), ModelError, "arig-paper"),
+    ],
+)
+def test_what_cannot_be_served_is_said_as_it_is_in_one_process(served, error, said):
+    with pytest.raises(error, match=said):
+        WorkerPool(served, lambda *_: None, processes=2)
