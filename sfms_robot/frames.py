@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+Value = TypeVar("Value")
 
 FRAME_HZ: Final = 25
 FRAME_S: Final = 1.0 / FRAME_HZ
@@ -108,6 +109,15 @@ def reorder(values: NDArray[np.floating], order: str) -> Floats:
     columns, places = _PLACES[order]
     out[..., places] = values[..., columns]
     return out
+
+
+def changed(value: Value, **fields: object) -> Value:
+    """`dataclasses.replace` for values that check nothing when they are made, in an eighth of its time: what streams
+    remember is made anew with every frame.
+    """
+    made: Value = object.__new__(type(value))
+    made.__dict__.update(value.__dict__, **fields)
+    return made
 
 
 @dataclass(frozen=True)

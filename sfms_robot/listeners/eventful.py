@@ -22,13 +22,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, Protocol, Self, cast
 
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.events.model import Decision, EventMemory, EventModel
 from sfms_robot.listeners.idle_motion import IdleMotion, IdleStream
 from sfms_robot.signals import gaze_kinematics
@@ -124,13 +124,13 @@ class EventfulListener:
 
     def calmed(self, memory: EventfulMemory, calmness: Calmness) -> EventfulMemory:
         """The same stream, from now on with other rates."""
-        return replace(memory, when=self.when.calmed(memory.when, calmness))
+        return changed(memory, when=self.when.calmed(memory.when, calmness))
 
     def step(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
         decision, told = self._decided(speaker, memory)
         plan, how = self.how.step(_believed(speaker), told.how, self._control(speaker, told))
-        return self._looking(plan, decision, replace(told, how=how))
+        return self._looking(plan, decision, changed(told, how=how))
 
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
@@ -141,7 +141,7 @@ class EventfulListener:
         controls = [self._control(*each) for each in zip(speakers, told, strict=True)]
         moved = self._move_each([*map(_believed, speakers)], [memory.how for memory in told], controls)
         return [
-            self._looking(plan, decision, replace(memory, how=how))
+            self._looking(plan, decision, changed(memory, how=how))
             for (plan, how), (decision, memory) in zip(moved, decided, strict=True)
         ]
 
@@ -163,7 +163,7 @@ class EventfulListener:
         controls = [self._control(speaker, memory) for memory in told]
         plans, hows = self._move_many(_believed(speaker), [memory.how for memory in told], controls)
         found = [
-            self._looking(plan, decision, replace(memory, how=how))
+            self._looking(plan, decision, changed(memory, how=how))
             for plan, (decision, memory), how in zip(plans, decided, hows, strict=True)
         ]
         return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
@@ -183,7 +183,7 @@ class EventfulListener:
         decision, when = self.when.step(speaker, memory.when)
         keep_s = speaker.time_s - self.how.control_frames[0] * FRAME_S
         events = _remembered((*memory.events, *decision.events), keep_s)
-        return decision, replace(memory, when=when, events=events, news=memory.news + decision.events)
+        return decision, changed(memory, when=when, events=events, news=memory.news + decision.events)
 
     def _control(self, speaker: SpeakerFrame, memory: EventfulMemory) -> Floats:
         past, ahead = self.how.control_frames
@@ -195,7 +195,7 @@ class EventfulListener:
         """The plan with eyes, what was decided since the one before, and the memory after it."""
         newest = memory.gaze[min(1, len(memory.gaze) - 1) :]  # one frame has passed
         if plan is None:
-            return None, replace(memory, gaze=newest)
+            return None, changed(memory, gaze=newest)
         targets = [target_at(memory.events, time_s) for time_s in plan.times_s.tolist()]
         head_rad, eyes, states = gaze_kinematics.follow(targets, plan.frames, newest[0])
         frames = plan.frames.copy()
@@ -203,8 +203,8 @@ class EventfulListener:
         frames[:, EYES] = eyes
         if memory.idle is not None:
             frames = memory.idle.added(frames, plan.times_s)
-        told = replace(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
-        return told, replace(memory, news=(), gaze=(newest[0], *states))
+        told = changed(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
+        return told, changed(memory, news=(), gaze=(newest[0], *states))
 
 
 def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
@@ -213,7 +213,7 @@ def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
         return speaker
     pose = np.abs(speaker.face.pose)
     near = bool((pose[:3] <= TURNED_RAD).all() and (pose[3:] <= MOVED_M).all())
-    return speaker if near else replace(speaker, face=None)
+    return speaker if near else changed(speaker, face=None)
 
 
 def frame_of(speaker: SpeakerFrame) -> int:

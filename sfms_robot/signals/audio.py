@@ -146,4 +146,5 @@ def energy_db(samples: Floats) -> float:
     """Mean level of some samples in dB of full scale; -100 for silence and for none."""
     if not len(samples):
         return -100.0
-    return float(10 * np.log10(max(float(np.mean(np.square(samples, dtype=np.float64))), 1e-10)))
+    power = float(np.add.reduce(np.square(samples, dtype=np.float64))) / len(samples)
+    return 10 * math.log10(max(power, 1e-10))

@@ -17,13 +17,13 @@ Lids are not moved here: heads couple them with eyeLookUp and eyeLookDown.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, POSE, Floats
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, POSE, Floats, changed
 
 EYE_PAN_RAD: Final = math.radians(30)  # of an eyeLook channel of 1, sideways
 EYE_TILT_RAD: Final = math.radians(20)
@@ -109,7 +109,8 @@ def step(target_rad: ArrayLike, pose: ArrayLike, state: GazeState) -> tuple[Gaze
     _, tilted, turned, *_ = (float(value) for value in np.asarray(pose, np.float64))
     if not (math.isfinite(yaw) and math.isfinite(pitch) and math.isfinite(tilted) and math.isfinite(turned)):
         raise ValueError(f"gaze target ({yaw:g}, {pitch:g}) with head at yaw {turned:g}, pitch {tilted:g}: not finite")
-    return _step((yaw, pitch), (turned, tilted), state)
+    head, eyes, after = _step((yaw, pitch), (turned, tilted), state)
+    return GazeFrame(np.array(head, np.float32), np.array(eyes, np.float32)), after
 
 
 def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, list[GazeState]]:
@@ -117,18 +118,20 @@ def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[
     targets, heads = np.asarray(targets_rad, np.float64), np.asarray(poses, np.float64)[:, POSE]
     if not (np.isfinite(targets).all() and np.isfinite(heads[:, 1:3]).all()):
         raise ValueError("gaze targets or head poses are not finite")
-    looks, states = [], []
+    turns: list[tuple[float, ...]] = []
+    looks: list[tuple[float, ...]] = []
+    states = []
     for (yaw, pitch), (tilted, turned) in zip(targets.tolist(), heads[:, 1:3].tolist(), strict=True):
-        look, state = _step((yaw, pitch), (turned, tilted), state)
-        looks.append(look)
+        head, eyes, state = _step((yaw, pitch), (turned, tilted), state)
+        turns.append(head)
+        looks.append(eyes)
         states.append(state)
-    head, eyes = np.zeros((len(looks), 3), np.float32), np.zeros((len(looks), len(EYE_CHANNELS)), np.float32)
-    if looks:
-        head[:], eyes[:] = [look.head_rad for look in looks], [look.eyes for look in looks]
-    return head, eyes, states
+    found = np.array(turns, np.float32).reshape(-1, 3), np.array(looks, np.float32).reshape(-1, len(EYE_CHANNELS))
+    return *found, states
 
 
-def _step(target: Pair, body: Pair, state: GazeState) -> tuple[GazeFrame, GazeState]:
+def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...], tuple[float, ...], GazeState]:
+    """The head's part, the eyes, as in a `GazeFrame`, and the state after them."""
     state = _aimed(target, state)
     since_s, left_s = state.since_s + FRAME_S, max(0.0, state.left_s - FRAME_S)
     part = _least_jerk(min(1.0, since_s / state.shift_s))
@@ -143,7 +146,7 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[GazeFrame, GazeSt
     ]
     pan, tilt = wanted[0] - head[0], wanted[1] - head[1]
     pan, tilt = max(-EYE_PAN_RAD, min(pan, EYE_PAN_RAD)), max(-EYE_TILT_RAD, min(tilt, EYE_TILT_RAD))
-    after = replace(
+    after = changed(
         state,
         gaze_rad=(head[0] + pan, head[1] + tilt),
         since_s=since_s,
@@ -151,7 +154,7 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[GazeFrame, GazeSt
         head=(yaw, pitch),
         head_left_s=max(0.0, state.head_left_s - FRAME_S),
     )
-    return GazeFrame(np.array([_ROLL * yaw[0], pitch[0], yaw[0]], np.float32), _eyes(pan, tilt)), after
+    return (_ROLL * yaw[0], pitch[0], yaw[0]), _eyes(pan, tilt), after
 
 
 def _aimed(target: Pair, state: GazeState) -> GazeState:
@@ -159,7 +162,7 @@ def _aimed(target: Pair, state: GazeState) -> GazeState:
     moved = math.dist(target, state.target_rad)
     if moved > 0:
         turn_rad = math.dist(head_share(target, state.share), (state.head[0][0], state.head[1][0]))
-        state = replace(state, target_rad=target, head_left_s=_HEAD_S[0] + _HEAD_S[1] * math.degrees(turn_rad))
+        state = changed(state, target_rad=target, head_left_s=_HEAD_S[0] + _HEAD_S[1] * math.degrees(turn_rad))
     if moved > PURSUIT_RAD or (state.wanders and state.left_s <= 1e-9):
         state = _fixated(state) if state.wanders else state
     elif moved == 0:
@@ -167,7 +170,7 @@ def _aimed(target: Pair, state: GazeState) -> GazeState:
     far = math.dist((target[0] + state.spot_rad[0], target[1] + state.spot_rad[1]), state.gaze_rad)
     first, each, least, most = _SACCADE_S
     shift_s = max(least, min(first + each * math.degrees(far), most))
-    return replace(state, from_rad=state.gaze_rad, shift_s=shift_s, since_s=0.0)
+    return changed(state, from_rad=state.gaze_rad, shift_s=shift_s, since_s=0.0)
 
 
 def _fixated(state: GazeState) -> GazeState:
@@ -177,7 +180,7 @@ def _fixated(state: GazeState) -> GazeState:
     x, y, drift_x, drift_y, long = rng.standard_normal(5).tolist()
     narrow = spread * min(1.0, most / max(spread * math.hypot(x, y), 1e-9))
     median_s, deviation, least_s = _FIXATION_S
-    return replace(
+    return changed(
         state,
         number=state.number + 1,
         spot_rad=(narrow * x, narrow * y),
@@ -214,7 +217,7 @@ def _least_jerk(s: float) -> float:
     return s**3 * (10 + s * (-15 + 6 * s))
 
 
-def _eyes(pan: float, tilt: float) -> Floats:
+def _eyes(pan: float, tilt: float) -> tuple[float, ...]:
     left, right = max(0.0, pan) / EYE_PAN_RAD, max(0.0, -pan) / EYE_PAN_RAD
     down, up = max(0.0, tilt) / EYE_TILT_RAD, max(0.0, -tilt) / EYE_TILT_RAD
-    return np.array([down, right, left, up, down, left, right, up], np.float32)
+    return down, right, left, up, down, left, right, up

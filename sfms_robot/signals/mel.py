@@ -42,13 +42,14 @@ def log_mel(samples: Floats, past: Floats) -> tuple[Floats, Floats]:
     rows = max(0, (len(seen) - WINDOW) // HOP + 1)
     if rows == 0:
         return np.zeros((0, MEL_BINS), dtype=np.float32), seen
-    windows = np.lib.stride_tricks.sliding_window_view(seen, WINDOW)[: rows * HOP : HOP]
+    windows = seen[HOP * np.arange(rows)[:, None] + _WITHIN]
     return _rows(windows), seen[rows * HOP :].copy()
 
 
 def _rows(windows: NDArray[np.float32]) -> Floats:
     """(rows, 400) -> (rows, 128). Each row is added up alone: the result never depends on how many come at once."""
-    power = np.abs(np.fft.rfft(windows * _HANN, FFT)) ** 2
+    spectrum = np.fft.rfft(windows * _HANN, FFT)
+    power = spectrum.real**2 + spectrum.imag**2
     mel = np.add.reduceat(power[:, _BINS] * _WEIGHTS, _FIRST, axis=1)
     return np.asarray(np.log(mel + FLOOR), dtype=np.float32)
 
@@ -68,6 +69,7 @@ def _filters() -> Doubles:
     return np.asarray(np.clip(np.minimum(rise, fall), 0.0, None))
 
 
+_WITHIN: Final = np.arange(WINDOW)
 _HANN: Final = np.hanning(WINDOW + 1)[:-1]
 _FILTERS: Final = _filters()
 _FILTER, _BINS = np.nonzero(_FILTERS)  # where filters are not 0, one after the other

@@ -30,6 +30,9 @@ FEATURES: Final = len(SPEECH_KNOTS_S) + len(SILENCE_KNOTS_S) + len(PHRASE_KNOTS_
 LONGEST: Final = round(
     max(*SPEECH_KNOTS_S, *SILENCE_KNOTS_S, *PHRASE_KNOTS_S) / FRAME_S
 )  # frames: no feature tells more
+_OF_SPEECH: Final = slice(0, len(SPEECH_KNOTS_S))
+_OF_SILENCE: Final = slice(_OF_SPEECH.stop, _OF_SPEECH.stop + len(SILENCE_KNOTS_S))
+_OF_LAST: Final = slice(_OF_SILENCE.stop, FEATURES)
 _SOFT_S: Final = 0.2  # the grid is logarithmic from here up
 
 
@@ -89,12 +92,17 @@ def step_level(level_db: float, state: State) -> tuple[Floats, State]:
     return _row(*(min(count, LONGEST) for count in (phase.speech, phase.silence, phase.last))), State(ear, phase)
 
 
-@lru_cache(maxsize=4096)
 def _row(speech: int, silence: int, last: int) -> Floats:
-    """`features` (21,) of counts of frames, not to be changed."""
-    out: Floats = features(np.array([SpeechPhase(speech, silence, last).times_s]))[0]
-    out.flags.writeable = False
-    return out
+    """`features` (21,) of counts of frames up to `LONGEST`."""
+    rows = _every_row()
+    parts = (rows[speech, _OF_SPEECH], rows[silence, _OF_SILENCE], rows[last, _OF_LAST])
+    return np.concatenate(parts)
+
+
+@lru_cache(maxsize=1)
+def _every_row() -> Floats:
+    """(LONGEST + 1, 21): `features` of each count, of all three times alike."""
+    return features(FRAME_S * np.repeat(np.arange(LONGEST + 1.0)[:, None], 3, axis=1))
 
 
 def of_audio(audio: Floats) -> Floats:

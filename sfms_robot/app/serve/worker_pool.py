@@ -16,6 +16,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from sfms_robot.app.serve.batch_process import Served
@@ -64,13 +65,12 @@ class WorkerPool:
         self._figures: Sequence[Figures] = ()
         self.hop = 0
         self.problem: RobotError | None = None
-        self._workers = [_Worker(served, self._told) for _ in range(processes or cores())]
+        self._workers = [_Worker(served, self._told)]
         try:
-            self._wait(lambda: all(each.would_hop for each in self._workers))
-            with self._changed:
-                self.hop = min(each.would_hop for each in self._workers)
-            for each in self._workers:
-                each.put(self.hop)
+            self._wait(lambda: self.hop > 0)
+            self._served = replace(served, hop=self.hop)
+            more = [_Worker(self._served, self._told) for _ in range(1, processes or cores())]
+            self._workers += more
             self._wait(lambda: all(each.capacity for each in self._workers))
         except BaseException:
             self.close()
@@ -143,9 +143,8 @@ class WorkerPool:
             elif kind == "figures":
                 worker.told, worker.figures = value
             elif kind == "loaded":
-                worker.would_hop = value
-                if self.hop:
-                    worker.put(self.hop)
+                self.hop = self.hop or value  # of the first: it measured while nothing else was at work
+                worker.put(self.hop)
             elif kind == "ready":
                 worker.capacity = value
             elif kind == "error":
@@ -171,14 +170,13 @@ class _Worker:
     """One process, and the two threads that talk to it.
 
     Attributes:
-        would_hop: 0 until it is loaded; capacity: None until it serves.
+        capacity: None until it serves.
         clients: whose streams it holds, by stream.
         asked: who asked it for a stream and has no answer yet, by number.
         figures: the last that it told, by the number `told`.
     """
 
     def __init__(self, served: Served, told: Callable[[_Worker, str, Any], None]) -> None:
-        self.would_hop = 0
         self.capacity: Capacity | None = None
         self.clients: Mapping[str, str] = {}
         self.asked: dict[int, tuple[str | None, Answer]] = {}

@@ -14,7 +14,7 @@ its samples are those the robot says in the 40 ms after `time_s`. Given on time,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_S, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.listeners.arig.audio_frontend import AudioState
 from sfms_robot.listeners.arig.rotary import rotary
@@ -198,7 +198,7 @@ class ArigListener(RunsOnEngine):
         for index, (speaker, memory) in enumerate(zip(speakers, now, strict=True)):
             frames, jaw_rad = self.space.decode(made[index, None])
             plan = Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad)
-            after = replace(
+            after = changed(
                 memory,
                 motion=motion[index],
                 standard=standard[index],
@@ -222,7 +222,7 @@ class ArigListener(RunsOnEngine):
             if frames % self.settings.chunk_frames == 0:
                 context = np.concatenate([context[:, :, 1:], made[index][:, :, None]], axis=2)
             after.append(
-                replace(
+                changed(
                     memory,
                     frames=frames,
                     user_voice=one.user_voice,

@@ -9,12 +9,12 @@ opens and closes: somebody who talks and beams at once is taken for laughing.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, FaceFrame
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, FaceFrame, changed
 
 NOD_RAD: Final = math.radians(2.0)  # a swing there, within a second, and most of it back
 BACK: Final = 0.6
@@ -68,14 +68,14 @@ class FaceState:
 def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceState]:
     """One frame of 40 ms. Without a face, or with one that holds what is not finite, nothing is seen."""
     if face is None or not (np.isfinite(face.pose).all() and np.isfinite(face.blendshapes).all()):
-        return Signs(), replace(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
+        return Signs(), changed(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
     motion = face.motion
     nods, state = _nod(float(motion[_PITCH]), state)
     smiles, beams, state = _smile(_within(float(motion[_CORNERS].mean())), state)
     jaw = _within(float(motion[_JAW]))
     opening = state.opening + _MOTION * (abs(jaw - state.jaw) - state.opening)
     moves = opening > OPENING
-    return Signs(nods, smiles, beams and moves, moves), replace(state, frame=state.frame + 1, jaw=jaw, opening=opening)
+    return Signs(nods, smiles, beams and moves, moves), changed(state, frame=state.frame + 1, jaw=jaw, opening=opening)
 
 
 def _within(value: float) -> float:
@@ -89,7 +89,7 @@ def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
     recent = tuple(at for at in state.nodded if state.frame - at < 10 / FRAME_S)
     new = (not recent or state.frame - recent[-1] >= NODS_APART) and (_swung(pitch) or _swung([-p for p in pitch]))
     nodded = (*recent, state.frame) if new else recent
-    return new and len(recent) < MOST_NODS, replace(state, pitch_rad=pitch, nodded=nodded)
+    return new and len(recent) < MOST_NODS, changed(state, pitch_rad=pitch, nodded=nodded)
 
 
 def _swung(values: tuple[float, ...] | list[float]) -> bool:
@@ -106,4 +106,4 @@ def _smile(level: float, state: FaceState) -> tuple[bool, bool, FaceState]:
     over = level - neutral
     held = state.held + 1 if over > SMILE * (0.6 if state.held >= HELD_FRAMES else 1.0) else 0
     smiles = held >= HELD_FRAMES
-    return smiles, smiles and over > BEAM, replace(state, neutral=neutral, held=held)
+    return smiles, smiles and over > BEAM, changed(state, neutral=neutral, held=held)

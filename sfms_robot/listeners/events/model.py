@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
-from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame, changed
 from sfms_robot.listeners.events import chance
 from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
 from sfms_robot.listeners.events.hazards import FILE, STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
@@ -108,7 +108,7 @@ class EventModel:
     def calmed(self, memory: EventMemory, calmness: Calmness) -> EventMemory:
         """The same stream, from now on at other rates."""
         return EventMemory(
-            replace(memory.sensed, addressed=calmness.addressed), replace(memory.decided, calmness=calmness)
+            changed(memory.sensed, addressed=calmness.addressed), changed(memory.decided, calmness=calmness)
         )
 
     def step(
@@ -143,10 +143,10 @@ class EventModel:
             if draws[at] < probability and not any(event.kind in _EXCLUDES[kind] for event in events):
                 event = self.shaped(kind, sensed.frame, memory.seed)
                 events.append(
-                    replace(event, probability=probability, draw=float(draws[at]), evidence=self.bank.told(told, kind))
+                    changed(event, probability=probability, draw=float(draws[at]), evidence=self.bank.told(told, kind))
                 )
         kept = remembered((*memory.done, *events), now_s) if events else memory.done
-        return Decision(tuple(events), hazards), replace(memory, done=kept, hazards_hz=hazards)
+        return Decision(tuple(events), hazards), changed(memory, done=kept, hazards_hz=hazards)
 
     def _log_odds(
         self, sensed: Sensed, history: Sequence[ListenerEvent], now_s: float, calmness: Calmness

@@ -9,10 +9,10 @@ second of it, smoothed, has clearly crossed the middle.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from sfms_robot.frames import FRAME_S, Doubles, Floats, SpeakerFrame
+from sfms_robot.frames import FRAME_S, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.listeners.events.evidence import Hearing, Instant, hear, hearing
 from sfms_robot.listeners.events.face_signs import FaceState, read_signs
 from sfms_robot.signals import voice_activity
@@ -72,7 +72,7 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
     instant = Instant(speaks, (math.nan, looked), signs.laughs, signs.nods, signs.smiles)
     heard, remembered = hear(instant, memory.hearing)
     frame = round(speaker.time_s / FRAME_S) - 1
-    return Sensed(frame, heard), replace(watching, ear=ear, deaf=deaf, own=own, face=face, hearing=remembered)
+    return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, own=own, face=face, hearing=remembered)
 
 
 def _sounds(own_voice: Floats | None) -> bool:
@@ -88,14 +88,14 @@ def _looked(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMem
         if unseen is None:
             return 1.0, memory
         lost = unseen > LOST_FRAMES
-        gone = replace(memory, unseen=unseen, attention=None if lost else memory.attention,
+        gone = changed(memory, unseen=unseen, attention=None if lost else memory.attention,
                        looked=math.nan if lost else memory.looked)  # fmt: skip
         return gone.looked, gone
     given = speaker.attention
     if given is None or not math.isfinite(given):
         if given is None and not memory.tells:
-            return 1.0, replace(memory, unseen=0)
-        return math.nan, replace(memory, unseen=0, attention=None, looked=math.nan)
+            return 1.0, changed(memory, unseen=0)
+        return math.nan, changed(memory, unseen=0, attention=None, looked=math.nan)
     before = memory.attention
     given = min(max(given, 0.0), 1.0)
     level = given if before is None else given + (before - given) * _KEPT
@@ -104,4 +104,4 @@ def _looked(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMem
         looked = 1.0
     elif level < NOT_LOOKED:
         looked = 0.0
-    return looked, replace(memory, unseen=0, attention=level, looked=looked, tells=True)
+    return looked, changed(memory, unseen=0, attention=level, looked=looked, tells=True)

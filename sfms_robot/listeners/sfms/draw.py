@@ -66,7 +66,7 @@ class Sampler:
         alone = [group.nucleus_in_silence or own for group, own in zip(groups, nucleus, strict=True)]
         self._nucleus_in_silence = np.array(alone, np.float32)
         self._guidance = np.array([group.guidance for group in groups], np.float32)[:, None]
-        self._place = places([group.codes + 1 for group in groups])
+        self._classes = [group.codes + 1 for group in groups]
 
     def draw(self, seen: Seen, seeds: Sequence[int], frames: Sequence[int]) -> Tokens:
         """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b has `seeds[b]` and draws for frames up
@@ -107,7 +107,7 @@ class Sampler:
         self, flat: Floats, last: LastKeyframes, frame: int, guidance: Floats, nucleus: Floats, chance: Doubles
     ) -> Tokens:
         """Tokens (B, G) of `frame` from the logits (B, N, classes of all groups) of the network `next`."""
-        logits = by_group(flat, self._place)  # (B, N, G, V)
+        logits = by_group(flat, self._classes)  # (B, N, G, V)
         known: Floats = guided(logits[:, 0], logits[:, 1], guidance) if logits.shape[1] > 1 else logits[:, 0]
         too_soon = self._reach.too_soon(last.tokens[..., 0], frame - last.at[..., 0])
         possible = np.where(too_soon, np.float32(-np.inf), known)
@@ -121,17 +121,14 @@ class Sampler:
         return np.where(seen.heard[:, -1], seen.phase[:, -1] @ SILENCE_LATELY, np.float32(1))
 
 
-def places(classes: Sequence[int]) -> NDArray[np.int64]:
-    """(G, V): where each class of a group is among all classes of all groups; one behind the last if there is none."""
-    ends = np.cumsum(classes)
-    at = np.arange(max(classes))
-    return np.where(at < np.array(classes)[:, None], (ends - classes)[:, None] + at, ends[-1])
-
-
-def by_group(flat: Floats, place: NDArray[np.int64]) -> Floats:
-    """Logits (..., all classes of all groups) -> (..., G, V), -inf for classes that a group lacks."""
-    lacking = np.full((*flat.shape[:-1], 1), -np.inf, np.float32)
-    return np.concatenate([flat, lacking], axis=-1)[..., place]
+def by_group(flat: Floats, classes: Sequence[int]) -> Floats:
+    """Logits (..., all classes of all groups), `classes` of each -> (..., G, V); -inf for those that a group lacks."""
+    out = np.full((*flat.shape[:-1], len(classes), max(classes)), -np.inf, np.float32)
+    first = 0
+    for group, count in enumerate(classes):
+        out[..., group, :count] = flat[..., first : first + count]
+        first += count
+    return out
 
 
 def guided(heard: Floats, unheard: Floats, guidance: Floats) -> Floats:

@@ -204,9 +204,11 @@ class SfmsListener(RunsOnEngine):
             tokens[due], path[due] = self.plan(seen, path[due], [memory.seed for memory in planned], newest)
             control[due] = told[due]
             shown = self.shown(path[due])
-            for at, (row, memory) in enumerate(zip(due, planned, strict=True)):
-                motion = self.with_sway(shown[at], memory.sway, memory.frames + 1)
-                plans[row] = self._plan(times_s[row], motion)
+            moved = [
+                self.with_sway(one, memory.sway, memory.frames + 1) for one, memory in zip(shown, planned, strict=True)
+            ]
+            for row, plan in zip(due, self._plans([times_s[row] for row in due], np.stack(moved)), strict=True):
+                plans[row] = plan
         after = [
             Memory(memory.seed, memory.frames + 1, heard[row], tokens[row], control[row], path[row], memory.sway)
             for row, memory in enumerate(memories)
@@ -243,10 +245,16 @@ class SfmsListener(RunsOnEngine):
         after = np.concatenate([path[..., 3:, :], beyond], axis=-2)
         return np.asarray(own + self._smoothing * ((before + after) / 2 - own))
 
-    def _plan(self, made_at_s: float, shown: Floats) -> Plan:
-        times_s = np.asarray(made_at_s + FRAME_S * np.arange(1, self.horizon + 1), dtype=np.float64)
-        motion, jaw_rad = self.space.decode(shown)
-        return Plan(made_at_s, times_s, motion, jaw_rad)
+    def _plans(self, made_at_s: Sequence[float], shown: Floats) -> list[Plan]:
+        """Motion (B, H, C) in the model's space, of plans made at those times."""
+        motion, jaw_rad = self.space.decode(shown.reshape(-1, shown.shape[-1]))
+        motion = motion.reshape(*shown.shape[:2], -1)
+        jaws = [None] * len(shown) if jaw_rad is None else [*jaw_rad.reshape(*shown.shape[:2], -1)]
+        ahead_s: Doubles = FRAME_S * np.arange(1, self.horizon + 1, dtype=np.float64)
+        return [
+            Plan(at_s, np.add(at_s, ahead_s), frames, jaw)
+            for at_s, frames, jaw in zip(made_at_s, motion, jaws, strict=True)
+        ]
 
     def plan(self, seen: Seen, path: Floats, seeds: Sequence[int], newest: Sequence[int]) -> tuple[Tokens, Floats]:
         """New plans of B streams: tokens (B, P + H, G), path (B, 2 + H, C). `path` is the old one, as played so far.
