@@ -99,6 +99,7 @@ class Page {
     this.hello = hello;
     this.notice('');
     this.panels?.release();
+    find('halt').hidden = hello.replay;
     find('what').textContent = `${hello.head} · ${hello.listener}${hello.port === 'sim' ? ' · emulated servos' : ` · ${hello.port}`}`;
     document.title = `${hello.head} · sfms-robot`;
     this.timeline.jointNames = hello.joints.map(({ name }) => name);
@@ -207,6 +208,7 @@ class Page {
   }
 
   #halt() {
+    if (this.hello?.replay) return; // nothing moves
     if (!this.connection.send('halt')) this.notice('NOT HALTED: there is no connection. Use the switch of the robot.', 10000);
   }
 

@@ -10,6 +10,7 @@ const SHOW_S = 1.0, AGAIN_MS = 400, EXPRESSION_S = 2.5;
 const RATES = { nod: 'nods', smile: 'smiles', gaze_shift: 'looks away', blink: 'blinks', mm_hm: '“mm-hm”', laugh: 'laughs', brow_raise: 'raises brows', shake: 'shakes', tilt: 'tilts' };
 const MOST_PER_MINUTE = { blink: 40, gaze_shift: 30 };
 const PEOPLE = { nod: 2.2, smile: 1, gaze_shift: 7, blink: 17, mm_hm: 2, laugh: 1, brow_raise: 1, shake: 0.3, tilt: 0.3 };
+const OF_A_RECORDING = ['servos']; // nobody is there to be told anything
 const GROUPS = [['Head', 0, 6], ['Brows and cheeks', 6, 14], ['Eyes', 14, 28], ['Jaw', 28, 32], ['Mouth', 32, 55], ['Nose and tongue', 55, 58]];
 
 /** Fills #controls anew for the run that `hello` tells of. Returns {held(controls), release(), servos}. */
@@ -29,7 +30,8 @@ export function buildPanels(hello, connection, visitor, replays, chooseJoint) {
     servos: ['Servos', [servos.element], false],
     recording: ['Record and replay', recordingPanel(hello, connection, replays), false],
   };
-  const panels = Object.entries(parts).map(([name, [title, children, shown]]) => {
+  const there = Object.entries(parts).filter(([name]) => !hello.replay || OF_A_RECORDING.includes(name));
+  const panels = there.map(([name, [title, children, shown]]) => {
     const element = panel(title, first ? shown && innerWidth > 860 : open.has(name), ...children);
     element.dataset.name = name;
     return element;

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from chromium import Page, ServedRun, missing
 
+from sfms_robot.app.session import RunOptions
+from sfms_robot.app.session import run as record
 from sfms_robot.face.human import load_human
 
 pytestmark = [
@@ -216,6 +218,15 @@ def test_replay_goes_where_the_scrubber_is_put(page):
     assert page.ask("page.replay.frames.find(({t}) => t > arguments[0])?.t ?? Infinity", shown) > at_s
     page.driver.find_element("id", "live").click()
     page.until(f"page.replay === null && page.timeline.frames.at(-1)?.t > {at_s}")
+
+
+def test_a_recording_has_nothing_to_halt_and_nobody_to_tell(browser, tmp_path):
+    record(RunOptions(head="op3_head", duration_s=2.0, fast=True, seed=1, record=tmp_path / "run"))
+    with ServedRun("replay", str(tmp_path / "run")) as served:
+        browser.open(served.url)
+        browser.until("page.replay && !document.getElementById('replay').hidden")
+        shown = "[...document.querySelectorAll('#controls > details')].map((each) => each.dataset.name)"
+        assert browser.ask("document.getElementById('halt').hidden") and browser.ask(shown) == ["servos"]
 
 
 def test_every_control_has_a_name_that_can_be_read_out(page):
