@@ -10,6 +10,7 @@ from tiny_arig_training import dyad
 
 from sfms_robot.app.evaluate.naturalness import asked_for, figures, notes, of_training
 from sfms_robot.corpora import clips
+from sfms_robot.evaluation import two_sample
 from sfms_robot.evaluation.manners import manners
 from sfms_robot.evaluation.robustness import RANGES, Speaker, cases
 from sfms_robot.evaluation.two_sample import FOLDS, REGIONS
@@ -47,7 +48,8 @@ def one_line(ended, *said: str) -> None:
 
 
 @pytest.mark.slow
-def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tmp_path):
+def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tmp_path, monkeypatch):
+    monkeypatch.setattr(two_sample, "STEPS", 6)  # the document is looked at here, not how well the nets tell apart
     data = people(tmp_path / "dyads", ("train", "test"))
     found = command_line("evaluate", "naturalness", "--data", data, "--drift", 30, "--json").told
     assert found["listener"] == "sfms-small" and found["split"] == "test" and found["dyads"] == LEAST
