@@ -7,11 +7,13 @@ Ctrl-C in a terminal is the parent's alone, since the head must reach rest first
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
-from typing import IO
+from typing import IO, Any
 
 
 def start_child(call: str, quiet: bool = False) -> subprocess.Popen[bytes]:
@@ -53,3 +55,15 @@ def take_pipes() -> tuple[IO[bytes], IO[bytes]]:
     outgoing, incoming = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")
     os.dup2(2, 1)
     return incoming, outgoing
+
+
+def messages(pipe: IO[bytes]) -> Iterator[Any]:
+    """What the other end pickles into a pipe, until that end is gone; one that was cut short is left out. Blocks."""
+    with suppress(EOFError, OSError, pickle.UnpicklingError):
+        while True:
+            yield pickle.load(pipe)
+
+
+def cores() -> int:
+    """That this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -45,7 +45,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from sfms_robot.child_process import end_child, start_child, take_pipes
+from sfms_robot.child_process import end_child, messages, start_child, take_pipes
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.hop import HopChoice, Latencies, choose_hop
 from sfms_robot.errors import ModelError, RobotError
@@ -352,13 +352,11 @@ class _Child:
         pipe = self._process.stdout
         assert pipe is not None
         with pipe:
-            try:
-                while True:
-                    self._messages.put(pickle.load(pipe))
-            except (EOFError, OSError, pickle.UnpicklingError):
-                code = self._process.wait()
-                self._messages.put(("error", f"the listener process died (exit code {code})", 0.0))
-                self.ended = True
+            for message in messages(pipe):
+                self._messages.put(message)
+            code = self._process.wait()
+        self._messages.put(("error", f"the listener process died (exit code {code})", 0.0))
+        self.ended = True
 
 
 def threads() -> int:
@@ -441,17 +439,14 @@ def plan_times_s(
 
 def _receive(frames: IO[bytes], inbox: Inbox, hops: queue.SimpleQueue[int]) -> None:
     """Frames into the inbox. The end of the pipe is the end of this process, whatever it computes."""
-    try:
-        while True:
-            item = pickle.load(frames)
-            if isinstance(item, int):
-                hops.put(item)
-            elif isinstance(item, Calmness):
-                inbox.calmness = item
-            else:
-                inbox.put(item)
-    except (EOFError, OSError, pickle.UnpicklingError):
-        os._exit(0)
+    for item in messages(frames):
+        if isinstance(item, int):
+            hops.put(item)
+        elif isinstance(item, Calmness):
+            inbox.calmness = item
+        else:
+            inbox.put(item)
+    os._exit(0)
 
 
 def listen(

@@ -31,7 +31,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import suppress
 from typing import IO, Any, Final
 
-from sfms_robot.child_process import end_child, start_child, take_pipes
+from sfms_robot.child_process import end_child, messages, start_child, take_pipes
 from sfms_robot.errors import PortError, RobotError
 
 SILENT_S: Final = 3.0
@@ -222,17 +222,16 @@ class _Child:
                     value = self._untold.pop() if self._untold else b""
 
     def _read(self, pipe: IO[bytes]) -> None:
-        kind = "value"
         with pipe:
-            try:
-                while kind == "value":
-                    kind, sent_s, value = pickle.load(pipe)
-                    if kind in ("value", "finished"):
-                        self.heard_s = sent_s
-                    if kind != "value" or value is not None:
-                        self._put(kind, value)
-                    self.arrived.set()
-            except (EOFError, OSError, pickle.UnpicklingError):
+            for kind, sent_s, value in messages(pipe):
+                if kind in ("value", "finished"):
+                    self.heard_s = sent_s
+                if kind != "value" or value is not None:
+                    self._put(kind, value)
+                self.arrived.set()
+                if kind != "value":
+                    break
+            else:
                 self._put("broke", f"its process died (exit code {self.process.wait()})")
                 self.arrived.set()
         self.process.wait()
@@ -254,11 +253,9 @@ class _Told:
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        try:
-            while True:
-                self.value = pickle.load(self._pipe)
-        except (EOFError, OSError, pickle.UnpicklingError):
-            os._exit(0)
+        for value in messages(self._pipe):
+            self.value = value
+        os._exit(0)
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.child_process import cores
 from sfms_robot.errors import ConfigError
 
 HEAD = "face28"
@@ -51,10 +52,8 @@ class Told:
 
 def machine() -> str:
     """The computer that is measured, in a line: cores that this process may use, processor, system, Python."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return (
-        f"{cores} cores of {_processor()}, {platform.system()} {platform.release()}, Python {platform.python_version()}"
-    )
+    system = f"{platform.system()} {platform.release()}"
+    return f"{cores()} cores of {_processor()}, {system}, Python {platform.python_version()}"
 
 
 def _processor() -> str:

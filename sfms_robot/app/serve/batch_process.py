@@ -30,7 +30,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import IO, Any, Final
 
-from sfms_robot.child_process import take_pipes
+from sfms_robot.child_process import messages, take_pipes
 from sfms_robot.config.hop import Latencies, choose_hop
 from sfms_robot.errors import ConfigError, RobotError
 from sfms_robot.listeners.engine import EngineName
@@ -98,11 +98,9 @@ def main() -> None:
 
 def _receive(incoming: IO[bytes], inbox: Inbox) -> None:
     """The end of the pipe is the end of this process, whatever it computes."""
-    try:
-        while True:
-            inbox.put(pickle.load(incoming))
-    except (EOFError, OSError, pickle.UnpicklingError):
-        os._exit(0)
+    for items in messages(incoming):
+        inbox.put(items)
+    os._exit(0)
 
 
 def _loaded(served: Served) -> Listener:

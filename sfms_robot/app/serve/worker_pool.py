@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import os
 import pickle
 import queue
 import subprocess
@@ -20,7 +19,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from sfms_robot.app.serve.batch_process import Served
-from sfms_robot.child_process import end_child, start_child
+from sfms_robot.child_process import cores, end_child, messages, start_child
 from sfms_robot.errors import ModelError, PacketError, RobotError
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
 from sfms_robot.listeners.serving.capacity import Capacity
@@ -34,11 +33,6 @@ Send = Callable[[str, bytes], None]
 Answer = Callable[[bytes], None]
 
 log = logging.getLogger(__name__)
-
-
-def cores() -> int:
-    """That this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class WorkerPool:
@@ -221,11 +215,10 @@ class _Worker:
         pipe = self._process.stdout
         assert pipe is not None
         with pipe:
-            try:
-                while True:
-                    self._say(self, *pickle.load(pipe))
-            except (EOFError, OSError, pickle.UnpicklingError):
-                self._say(self, "ended", self._process.wait())
+            for message in messages(pipe):
+                self._say(self, *message)
+            code = self._process.wait()
+        self._say(self, "ended", code)
 
 
 def _client(message: bytes) -> str | None:

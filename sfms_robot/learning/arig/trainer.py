@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -124,7 +125,7 @@ def draw(
     weights: Tensor,
     count: int,
     generator: torch.Generator,
-    eventful: Mapping[str, Sequence[Tensor]] = {},  # noqa: B006
+    eventful: Mapping[str, Sequence[Tensor]] = MappingProxyType({}),
     share: float = 0.0,
 ) -> Tensor:
     """(count,) first frames: a scene by its weight, then any of its windows.
