@@ -30,6 +30,17 @@ _EPS_S: Final = 1e-9
 
 
 @dataclass(frozen=True)
+class Probe:
+    """What a listener measured of itself: frames of a plan, hops that it can be run with, and what a plan takes."""
+
+    horizon: int
+    hop: int
+    hops: tuple[int, ...]
+    step_p50_s: float
+    step_p99_s: float
+
+
+@dataclass(frozen=True)
 class Latencies:
     """What is measured of a run before its hop is chosen, in seconds.
 

@@ -8,14 +8,11 @@ The child says of every frame that it is done. One that is silent for `HUNG_S` i
 when it died, it is started anew and listens from then on, while the head goes on by itself. Too many of those in a
 minute and it stays down.
 
-A machine that cannot keep up must not answer what was said seconds ago: when more than half a second is waiting, the
-listener goes on at the newest frame. What it did not hear is counted, and said once.
+What a slow machine did not hear (`inbox`) is counted, and said once.
 
-A listener that is loaded is not yet fast: it builds its graphs while the head eases in, tries whether more than one
-thread is faster, and measures what a plan takes on this machine. By that, and by how late the source has been for half
-a second, its hop is chosen. What it did not hear meanwhile it hears then, as fast as it can. Every ten seconds the
-choice is held against what has been measured since: a hop that does not fit any more gives way to a shorter one, and
-never to a longer one, so that it settles.
+By what a plan takes on this machine, which the child measures (`process_child`), and by how late the source has been
+for half a second, its hop is chosen. Every ten seconds the choice is held against what has been measured since: a hop
+that does not fit any more gives way to a shorter one, and never to a longer one, so that it settles.
 
     parent -> child    pickle: (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
                        int: the hop, which it waits for and which may change; whenever somebody asks for it, another
@@ -33,54 +30,34 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import pickle
 import queue
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import IO, Any, Final
+from dataclasses import replace
+from typing import Any, Final
 
-import numpy as np
-
-from sfms_robot.child_process import end_child, messages, start_child, take_pipes
+from sfms_robot.child_process import end_child, messages, start_child
 from sfms_robot.config.calmness import Calmness
-from sfms_robot.config.hop import HopChoice, Latencies, choose_hop
-from sfms_robot.errors import ModelError, RobotError
-from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
+from sfms_robot.config.hop import HopChoice, Latencies, Probe, choose_hop
+from sfms_robot.errors import ModelError
+from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.inbox import MOST_WAITING
 from sfms_robot.listeners.lateness import Lateness
-from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
 
-MOST_WAITING: Final = FRAME_HZ // 2  # frames
-CATCH_UP: Final = 0.5  # frames that must be waiting less after each, while it catches up: twice the person's pace
-NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
 START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
 CLOSE_LIMIT_S: Final = 0.2
 HUNG_S: Final = 1.0
 RESTART_S: Final = 3.0
 RESTARTS: Final = 5  # in a minute; more than that is no accident
-PROBE_S: Final = 0.5
-PROBE_PLANS: Final = 12
 REVIEW_S: Final = 10.0
 SETTLED_FRAMES: Final = FRAME_HZ // 2  # after so many a source has measured how late it is
 _MINUTE_S: Final = 60.0
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Probe:
-    """What a listener measured of itself: frames of a plan, hops that it can be run with, and what a plan takes."""
-
-    horizon: int
-    hop: int
-    hops: tuple[int, ...]
-    step_p50_s: float
-    step_p99_s: float
 
 
 class ListenerProcess:
@@ -277,7 +254,7 @@ class _Child:
     """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
 
     def __init__(self, name: str, seed: int, calmness: Calmness | None, engine: EngineName) -> None:
-        self._process = start_child("sfms_robot.listeners.process:main")
+        self._process = start_child("sfms_robot.listeners.process_child:main")
         self._frames: deque[Any] = deque([(name, seed, calmness, engine)])
         self._urgent: deque[int | Calmness] = deque()
         self._changed = threading.Condition()
@@ -357,163 +334,3 @@ class _Child:
             code = self._process.wait()
         self._messages.put(("error", f"the listener process died (exit code {code})", 0.0))
         self.ended = True
-
-
-def threads() -> int:
-    """That the child may use: one core is the servo loop's."""
-    return max(1, (os.cpu_count() or 2) - 1)
-
-
-# --- the child ------------------------------------------------------------------------------------------------------
-
-
-def main() -> None:
-    """Load what the first message names, then listen until the pipe ends."""
-    frames, plans = take_pipes()
-    inbox, hops = Inbox(), queue.SimpleQueue[int]()
-    try:
-        name, seed, calmness, engine = pickle.load(frames)
-    except (EOFError, pickle.UnpicklingError):
-        return  # the parent ended before it said what to load
-    threading.Thread(target=_receive, args=(frames, inbox, hops), daemon=True).start()
-    if hasattr(os, "nice"):
-        os.nice(NICE)
-    try:
-        from sfms_robot.listeners.registry import at_hop, build_graphs, engine_name, hops_of, load_listener
-
-        listener = load_listener(name, graphs=False, calmness=calmness, engine=engine, threads=1)
-        _say(plans, "loaded", engine_name(listener))
-        build_graphs(listener)
-        choices = hops_of(listener)
-        if use_threads(at_hop(listener, min(choices)), threads()):
-            _say(plans, "loaded", engine_name(listener))
-        p50_s, p99_s = plan_times_s(at_hop(listener, min(choices)))
-        _say(plans, "probed", Probe(listener.horizon, listener.hop, tuple(choices), p50_s, p99_s))
-    except RobotError as error:
-        _say(plans, "error", str(error))
-        return
-    listen(at_hop(listener, hops.get()), seed, inbox, plans, hops)
-
-
-def use_threads(listener: Listener, most: int) -> bool:
-    """Let a listener's networks use one thread or `most`, whichever makes plans faster here; whether that is `most`.
-
-    Blocks for half of `PROBE_S` each where there is a choice.
-    """
-    from sfms_robot.listeners.registry import engine_name, set_threads
-
-    if most == 1 or engine_name(listener) is None:
-        return False
-
-    planned_s = {}
-    for count in (1, most):
-        set_threads(listener, count)
-        planned_s[count], _ = plan_times_s(listener, PROBE_S / 2)
-    if planned_s[1] <= planned_s[most]:
-        set_threads(listener, 1)
-    return planned_s[most] < planned_s[1]
-
-
-def plan_times_s(
-    listener: Listener, limit_s: float = PROBE_S, wait: Callable[[float], object] = time.sleep
-) -> tuple[float, float]:
-    """Median and 99th percentile of what a plan takes, on silence; a step without one counts where no plan was made.
-
-    At the pace of a run: between two frames caches cool, and a plan takes half as long again. Blocks for `limit_s`, or
-    `PROBE_PLANS` plans, and one step more.
-    """
-    silence = np.zeros(FRAME_SAMPLES, np.float32)
-    memory = listener.start(0)
-    planned_s: list[float] = []
-    other_s: list[float] = []
-    began_s = time.perf_counter()
-    while len(planned_s) < PROBE_PLANS and (not other_s + planned_s or time.perf_counter() - began_s < limit_s):
-        step_s = time.perf_counter()
-        plan, memory = listener.step(SpeakerFrame((len(planned_s) + len(other_s) + 1) * FRAME_S, silence), memory)
-        taken_s = time.perf_counter() - step_s
-        (other_s if plan is None else planned_s).append(taken_s)
-        wait(max(0.0, FRAME_S - taken_s))
-    p50_s, p99_s = np.percentile(planned_s or other_s, [50, 99])
-    return float(p50_s), float(p99_s)
-
-
-def _receive(frames: IO[bytes], inbox: Inbox, hops: queue.SimpleQueue[int]) -> None:
-    """Frames into the inbox. The end of the pipe is the end of this process, whatever it computes."""
-    for item in messages(frames):
-        if isinstance(item, int):
-            hops.put(item)
-        elif isinstance(item, Calmness):
-            inbox.calmness = item
-        else:
-            inbox.put(item)
-    os._exit(0)
-
-
-def listen(
-    listener: Listener, seed: int, inbox: Inbox, plans: IO[bytes], hops: queue.SimpleQueue[int] | None = None
-) -> None:
-    """One step per frame until None comes; tells when it is ready, what it answers, and what it left out."""
-    from sfms_robot.listeners.registry import at_hop
-
-    memory = listener.start(seed)
-    _say(plans, "ready")
-    while (frame := inbox.next()) is not None:
-        if inbox.skipped:
-            _say(plans, "skipped", None, inbox.skipped)
-        memory = calmed(listener, memory, inbox)
-        while hops is not None and not hops.empty():
-            listener = at_hop(listener, hops.get())
-        began_s = time.perf_counter()
-        plan, memory = listener.step(frame, memory)
-        taken_ms = (time.perf_counter() - began_s) * 1e3
-        _say(plans, "done" if plan is None else "plan", plan, taken_ms)
-
-
-def _say(plans: IO[bytes], kind: str, value: Any = None, number: float = 0.0) -> None:
-    pickle.dump((kind, value, number), plans, protocol=5)
-    plans.flush()
-
-
-def calmed(listener: Listener, memory: Any, inbox: Inbox) -> Any:
-    """The memory after what was asked for since the last frame; a listener that decides nothing takes no notice."""
-    calmness, inbox.calmness = inbox.calmness, None
-    change = getattr(listener, "calmed", None)
-    return memory if calmness is None or change is None else change(memory, calmness)
-
-
-class Inbox:
-    """Frames in the order in which they came, until None does; the newest alone when too many are waiting.
-
-    Those that came before the first one was asked for do not count as too many, as long as they become fewer at the
-    pace of somebody who catches up.
-
-    Attributes:
-        skipped: frames left out before the last one given.
-        calmness: asked for since `calmed` looked; None: none.
-    """
-
-    def __init__(self, most: int = MOST_WAITING) -> None:
-        self._queue: queue.SimpleQueue[SpeakerFrame | None] = queue.SimpleQueue()
-        self._most = most
-        self._allowed: float | None = None  # to wait, while it catches up with those of before
-        self._waiting: deque[SpeakerFrame | None] = deque()
-        self.skipped = 0
-        self.calmness: Calmness | None = None
-
-    def put(self, frame: SpeakerFrame | None) -> None:
-        self._queue.put(frame)
-
-    def next(self) -> SpeakerFrame | None:
-        """Blocks until there is one. None, the end, is neither left out nor waits for what came before it."""
-        if not self._waiting:
-            self._waiting.append(self._queue.get())
-        while not self._queue.empty():
-            self._waiting.append(self._queue.get())
-        if None in self._waiting:
-            return None
-        waiting = len(self._waiting)
-        self._allowed = waiting + self._most if self._allowed is None else self._allowed - CATCH_UP
-        self.skipped = waiting - 1 if waiting > max(self._most, self._allowed) else 0
-        for _ in range(self.skipped):
-            self._waiting.popleft()
-        return self._waiting.popleft()

@@ -15,17 +15,9 @@ from stranger_process import ends
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
 from sfms_robot.listeners import process
-from sfms_robot.listeners.process import (
-    CATCH_UP,
-    MOST_WAITING,
-    RESTARTS,
-    REVIEW_S,
-    SETTLED_FRAMES,
-    Inbox,
-    ListenerProcess,
-    listen,
-    plan_times_s,
-)
+from sfms_robot.listeners.inbox import CATCH_UP, MOST_WAITING, Inbox
+from sfms_robot.listeners.process import RESTARTS, REVIEW_S, SETTLED_FRAMES, ListenerProcess
+from sfms_robot.listeners.process_child import listen, plan_times_s
 
 SILENCE = np.zeros(640, np.float32)
 
@@ -275,6 +267,6 @@ def test_the_child_ends_when_its_parent_is_killed():
 
 
 def test_a_child_whose_parent_goes_before_it_says_what_to_load_ends_without_a_word():
-    command = [sys.executable, "-c", "from sfms_robot.listeners.process import main; main()"]
+    command = [sys.executable, "-c", "from sfms_robot.listeners.process_child import main; main()"]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -9,7 +9,7 @@ from remote_rig import SILENCE, Counting, Network, Robot, Server
 from tiny_sfms import speech, tiny_listener
 
 from sfms_robot.frames import FRAME_S, SpeakerFrame
-from sfms_robot.listeners.process import MOST_WAITING
+from sfms_robot.listeners.inbox import MOST_WAITING
 from sfms_robot.listeners.remote_messages import (
     Interface,
     Join,

@@ -34,7 +34,7 @@ from sfms_robot.child_process import messages, take_pipes
 from sfms_robot.config.hop import Latencies, choose_hop
 from sfms_robot.errors import ConfigError, RobotError
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.process import plan_times_s
+from sfms_robot.listeners.process_child import plan_times_s
 from sfms_robot.listeners.serving.capacity import measure_capacity
 from sfms_robot.listeners.serving.stream_server import StreamServer
 from sfms_robot.ports import Listener

@@ -31,7 +31,7 @@ from sfms_robot.config.base import parse
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.errors import PacketError, RobotError
 from sfms_robot.frames import FRAME_S, ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.listeners.process import MOST_WAITING
+from sfms_robot.listeners.inbox import MOST_WAITING
 from sfms_robot.listeners.remote_messages import (
     Interface,
     Join,
