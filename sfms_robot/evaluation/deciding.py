@@ -1,4 +1,4 @@
-"""The part of a listener that decides when something happens, played alone: no motion, so whole meetings in minutes.
+"""The part of a listener that decides when something happens, played alone: no motion, so whole meetings in seconds.
 
 Two ways. Left to itself it decides, and goes by what it decided. Given a person's own history it decides nothing: only
 its hazards are asked, at every instant, as if it had done so far what he did. These are what is ranked against what he
@@ -7,42 +7,35 @@ did next: nods drawn from good hazards by a few seeds rank his hardly better tha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sfms_robot.config import Calmness
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
-from sfms_robot.listeners.events.evidence import remembered
-from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.events.sensing import Sensed, sense
+from sfms_robot.listeners.events.chance import of_instant
+from sfms_robot.listeners.events.evidence import Ints, heard_in
+from sfms_robot.listeners.events.hazards import STEP_FRAMES
+from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, DecideMemory, EventModel
+from sfms_robot.listeners.events.sensing import Sensed, scene_in
+from sfms_robot.listeners.events.whole import hazards_in, most_in, steps_in
 
 
-def sensed(model: EventModel, speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) -> list[Sensed]:
-    """What the frames say of the person: of all streams alike."""
-    memory, found = model.start(0, calmness).sensed, []
-    for frame in speaker:
-        one, memory = sense(frame, memory)
-        found.append(one)
-    return found
+def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) -> tuple[Doubles, Doubles]:
+    """(N, len(HEARD)) what the frames say of the person, of all streams alike: given the own voice, and without it."""
+    scene = scene_in(speaker, (calmness or Calmness()).addressed)
+    alone = scene.speaks.copy()
+    alone[:, 0] = False
+    return heard_in(scene), heard_in(replace(scene, speaks=alone))
 
 
 def forced_hazards(
-    model: EventModel, heard: Sequence[Sensed], history: Sequence[ListenerEvent], calmness: Calmness | None = None
+    model: EventModel, heard: Doubles, history: Sequence[ListenerEvent], calmness: Calmness | None = None
 ) -> dict[str, Doubles]:
     """By kind (N,) events a second after each frame, given what of `history` (in order) has begun by its end."""
-    memory = model.start(0, calmness).decided
-    hazards_hz = {kind: np.zeros(len(heard)) for kind in EVENT_KINDS}
-    begun, own = 0, tuple[ListenerEvent, ...]()
-    for index, one in enumerate(heard):
-        now_s = (index + 1) * FRAME_S
-        while begun < len(history) and history[begun].start_s <= now_s:
-            own = remembered((*own, history[begun]), now_s)
-            begun += 1
-        decision, memory = model.decide(one, memory, own)
-        for kind, hazard_hz in decision.hazards_hz.items():
-            hazards_hz[kind][index] = hazard_hz
-    return hazards_hz
+    return hazards_in(model, heard, history, calmness or Calmness())
 
 
 def delayed(hazards_hz: dict[str, Doubles]) -> dict[str, Doubles]:
@@ -51,17 +44,36 @@ def delayed(hazards_hz: dict[str, Doubles]) -> dict[str, Doubles]:
 
 
 def decisions(
-    model: EventModel, heard: Sequence[Sensed], seeds: Sequence[int], calmness: Calmness | None = None
+    model: EventModel, heard: Doubles, seeds: Sequence[int], calmness: Calmness | None = None
 ) -> list[tuple[ListenerEvent, ...]]:
-    """What is decided for each seed, left to itself."""
-    streams = []
-    for seed in seeds:
-        memory, found = model.start(seed, calmness).decided, list[ListenerEvent]()
-        for one in heard:
-            decision, memory = model.decide(one, memory)
-            found += decision.events
-        streams.append(tuple(found))
-    return streams
+    """What is decided for each seed, left to itself: as frame by frame, but steps where nothing can happen left out."""
+    steps = steps_in(len(heard))
+    most = most_in(model, heard[steps], calmness or Calmness())
+    return [_decided(model, heard, seed, calmness, steps, most) for seed in seeds]
+
+
+def _decided(
+    model: EventModel, heard: Doubles, seed: int, calmness: Calmness | None, steps: Ints, most: Doubles
+) -> tuple[ListenerEvent, ...]:
+    draws = np.array([of_instant(seed, frame) for frame in steps.tolist()]).reshape(-1, len(EVENT_KINDS))
+    frames = [*steps[(draws[:, model.draws] < most).any(axis=1)].tolist(), len(heard)]
+    memory, found = model.start(seed, calmness).decided, list[ListenerEvent]()
+    at, look_back = 0, math.inf  # the frame from which on a look aside is over
+    while (frame := min(frames[at], look_back)) < len(heard):
+        decision, memory = model.decide(Sensed(int(frame), heard[int(frame)]), memory)
+        found += decision.events
+        at += frame == frames[at]
+        look_back = max(frame + STEP_FRAMES, _over(memory))
+    return tuple(found)
+
+
+def _over(memory: DecideMemory) -> float:
+    """The step at which the newest look is over if it goes aside; never, if it does not."""
+    look = next((event for event in reversed(memory.done) if event.kind == "gaze_shift"), None)
+    if look is None or look.target_rad == AT_PERSON:
+        return math.inf
+    step = math.ceil((look.end_s / FRAME_S - 1 - LEAD_FRAMES - 1e-6 - (STEP_FRAMES - 1)) / STEP_FRAMES)
+    return step * STEP_FRAMES + STEP_FRAMES - 1
 
 
 def spans_of(events: Sequence[ListenerEvent], kind: str) -> Doubles:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfms_robot.config import Calmness
 from sfms_robot.evaluation import timing
 from sfms_robot.evaluation.deciding import decisions, delayed, forced_hazards, sensed, spans_of
 from sfms_robot.evaluation.listener_meetings import ListenerMeeting, shifted
@@ -10,6 +11,7 @@ from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.listeners.events.hazards import EventTables
 from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.events.sensing import Sensed
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.events import runs
 from sfms_robot.sources.speakers import shipped_speaker
@@ -57,7 +59,7 @@ def meeting(talk, nods_s):
 def contingency(decides, speaker, one):
     """AUC matched, and matched minus shifted."""
     matched, other = (
-        forced_hazards(decides, sensed(decides, frames), one.history)["nod"] for frames in (speaker, shifted(speaker))
+        forced_hazards(decides, sensed(frames)[1], one.history)["nod"] for frames in (speaker, shifted(speaker))
     )
     found = timing.contingent("", "x", matched, [other], one)
     return found["x"][0] / found["x"][1], found["x_matched_minus_shifted"][0] / found["x"][1]
@@ -77,7 +79,7 @@ def test_shifting_leaves_hazards_of_own_history_as_they_were(talk, speaker):
 
 def test_what_has_not_begun_changes_no_hazard(talk, speaker):
     one, decides = meeting(talk, np.arange(2.0, 300.0, 5.0)), model(**HISTORY)
-    heard = sensed(decides, speaker[:3000])
+    heard = sensed(speaker[:3000])[1]
     whole = forced_hazards(decides, heard, one.history)["nod"]
     begun = forced_hazards(decides, heard, [event for event in one.history if event.start_s < 60.0])["nod"]
     np.testing.assert_array_equal(whole[: 60 * FRAME_HZ - 1], begun[: 60 * FRAME_HZ - 1])
@@ -86,12 +88,34 @@ def test_what_has_not_begun_changes_no_hazard(talk, speaker):
 
 def test_a_seed_decides_the_same_alone_and_beside_others(speaker):
     decides = model(-3.0, **PHASE)
-    heard = sensed(decides, speaker[:3000])
+    heard = sensed(speaker[:3000])[1]
     together = decisions(decides, heard, [1, 2, 3])
     assert together == [decisions(decides, heard, [seed])[0] for seed in (1, 2, 3)]
     assert together[0] != together[1]
     nods = spans_of(together[0], "nod")
     assert len(nods) > 3 and (np.diff(nods[:, 0]) > 0).all() and not len(spans_of(together[0], "blink"))
+
+
+def test_what_is_decided_is_what_deciding_every_frame_decides(speaker):
+    when = EventModel.load()
+    _, heard = sensed(speaker[:6000])
+    memory, every = when.start(7).decided, []
+    for index, row in enumerate(heard):
+        decision, memory = when.decide(Sensed(index, row), memory)
+        every += decision.events
+    assert decisions(when, heard, [7]) == [tuple(every)]
+    assert {"nod", "blink", "gaze_shift"} <= {event.kind for event in every}
+
+
+@pytest.mark.parametrize("asked", [Calmness(nod=0, blink=60), Calmness(nod=40, addressed="never")])
+def test_the_same_at_other_rates(speaker, asked):
+    when = EventModel.load()
+    _, heard = sensed(speaker[:4000], asked)
+    memory, every = when.start(3, asked).decided, []
+    for index, row in enumerate(heard):
+        decision, memory = when.decide(Sensed(index, row), memory)
+        every += decision.events
+    assert decisions(when, heard, [3], asked) == [tuple(every)]
 
 
 def test_delayed_hazards_know_a_frame_less():
@@ -106,7 +130,7 @@ def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
     recording.close()
     frames = len(voice) // FRAME_SAMPLES
     when = EventModel.load()
-    heard = sensed(when, speaker_frames(voice[: frames * FRAME_SAMPLES], np.full((frames, 58), np.nan, np.float32)))
+    _, heard = sensed(speaker_frames(voice[: frames * FRAME_SAMPLES], np.full((frames, 58), np.nan, np.float32)))
     counts = np.array([len(spans_of(events, "nod")) for events in decisions(when, heard, range(100))])
     assert 3 <= counts.mean() / (frames * FRAME_S / 60) <= 7, "addressed: as many a minute as people's"
     assert 1.28 <= counts.var(ddof=1) / counts.mean() <= 1.82

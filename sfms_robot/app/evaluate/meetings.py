@@ -33,7 +33,7 @@ from sfms_robot.evaluation.detection import SIZES, Calibration, Sightings, added
 from sfms_robot.evaluation.listener_meetings import ListenerMeeting, listener_meeting, part, shifted, without_own_voice
 from sfms_robot.evaluation.reference_hazard import ReferenceHazard
 from sfms_robot.evaluation.rollout import rollout
-from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, Doubles, Floats
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
@@ -182,7 +182,7 @@ def _play(task: _Task) -> _Played:
     options, (voices, laughter, motions) = task.options, _material(task.options.split, task.options.data)
     rng = np.random.default_rng([options.seed, task.number])
     one = listener_meeting(task.person, voices, laughter, motions, rng)
-    listener, alone = _listener(task.where, options.hop, options.engine), without_own_voice(one.speaker)
+    listener = _listener(task.where, options.hop, options.engine)
     first, frames = middle(one.frames, 0.0 if isinstance(listener, EventModel) else options.minutes)
     played = np.zeros(one.frames, bool)
     played[first : first + frames] = True
@@ -192,12 +192,12 @@ def _play(task: _Task) -> _Played:
         sums |= timing.hazard_sums("r2_", one, *task.reference.scores(task.person, one.frames))
     seeds = range(1000 * (options.seed + task.number), 1000 * (options.seed + task.number) + options.seeds)
     if isinstance(listener, EventfulListener):
-        sums |= _by_events(listener.when, listener.calmness, one, alone, seeds)
+        sums |= _by_events(listener.when, listener.calmness, one, seeds)
     if isinstance(listener, EventModel):
-        sums |= _by_events(listener, Calmness(), one, alone, seeds)
+        sums |= _by_events(listener, Calmness(), one, seeds)
     sightings: Mapping[str, Sightings] = {}
     if frames and not isinstance(listener, EventModel):
-        rolled = rollout(listener, part(alone, first, frames), seeds)
+        rolled = rollout(listener, without_own_voice(part(one.speaker, first, frames)), seeds)
         sums |= timing.motion_sums(one, rolled.motion, first, task.calibration)
         streams = zip(rolled.events, rolled.motion, strict=True)
         sightings = added_up(asked_and_seen(events, motion, task.calibration.lag_s) for events, motion in streams)
@@ -210,19 +210,14 @@ def middle(frames: int, minutes: float) -> tuple[int, int]:
     return (frames - wanted) // 2, wanted
 
 
-def _by_events(
-    model: EventModel,
-    calmness: Calmness,
-    one: ListenerMeeting,
-    alone: Sequence[SpeakerFrame],
-    seeds: Sequence[int],
-) -> Sums:
+def _by_events(model: EventModel, calmness: Calmness, one: ListenerMeeting, seeds: Sequence[int]) -> Sums:
     """How its hazards, given his own history, rank what he did; and what it decides, left to itself."""
     history = one.history
-    heard = sensed(model, alone, calmness)
-    speaking = delayed(forced_hazards(model, sensed(model, one.speaker, calmness), history, calmness))
+    with_voice, heard = sensed(one.speaker, calmness)
+    _, elsewhere = sensed(shifted(one.speaker), calmness)
+    speaking = delayed(forced_hazards(model, with_voice, history, calmness))
     silent = forced_hazards(model, heard, history, calmness)
-    other = forced_hazards(model, sensed(model, shifted(alone), calmness), history, calmness)
+    other = forced_hazards(model, elsewhere, history, calmness)
     sums = timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
     for kind in timing.ANNOTATED:
         sums[f"{kind}_hazard_auc"] = timing.ranked(speaking[kind], one, kind)

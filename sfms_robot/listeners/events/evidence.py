@@ -237,8 +237,14 @@ def done_in(
 
     `aside` (K,): which of the gaze shifts go away from the person.
     """
-    now_s = np.asarray((np.arange(frames) + 1) * FRAME_S, np.float64)
-    columns: dict[str, Doubles | float] = {name: np.full(frames, np.inf) for name in DONE}
+    return done_at(spans_s, np.asarray((np.arange(frames) + 1) * FRAME_S, np.float64), log_rate, aside)
+
+
+def done_at(
+    spans_s: Mapping[str, Doubles], now_s: Doubles, log_rate: Doubles | float, aside: Bools | None = None
+) -> Doubles:
+    """`done_in` at instants (M,): (M, len(DONE))."""
+    columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
     for kind in _SINCE_END:
         columns[f"{kind}_end_s"] = _since_newest(spans_s.get(kind), now_s, ends=True)
     for name, kind in _SINCE_BEGIN.items():
@@ -253,7 +259,7 @@ def done_in(
     away = np.zeros(len(shifts), bool) if aside is None else aside
     at_person = (newest < 0) | ~np.r_[away, False][newest]
     columns["at_person_s"] = np.where(at_person, columns["shift_s"], np.nan)
-    return np.stack([np.broadcast_to(np.asarray(columns[name], np.float64), (frames,)) for name in DONE], axis=1)
+    return np.stack([np.broadcast_to(np.asarray(columns[name], np.float64), now_s.shape) for name in DONE], axis=1)
 
 
 def _since_newest(spans: Doubles | None, now_s: Doubles, ends: bool = False) -> Doubles:

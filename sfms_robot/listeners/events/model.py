@@ -44,7 +44,7 @@ GROUPS: Final = (
 ALWAYS: Final = frozenset(("blink", "gaze_shift"))  # the others only while listening
 SWINGING: Final = frozenset(("nod", "shake"))
 ANGLES: Final = frozenset(("nod", "shake", "tilt", "gaze_shift"))  # sizes are degrees
-_EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
+EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
     kind: frozenset().union(*(group for group in GROUPS if kind in group)) for kind in EVENT_KINDS
 }
 
@@ -92,7 +92,7 @@ class EventModel:
     def __init__(self, tables: EventTables) -> None:
         self.tables = tables
         self.bank = HazardBank(tables.hazards)
-        self._draw = [EVENT_KINDS.index(kind) for kind in self.bank.kinds]
+        self.draws = [EVENT_KINDS.index(kind) for kind in self.bank.kinds]
         self._never: Mapping[str, float] = dict.fromkeys(EVENT_KINDS, 0.0)
 
     @classmethod
@@ -133,14 +133,14 @@ class EventModel:
         history = memory.done if own is None else begun_before(own, now_s)
         odds, told = self._log_odds(sensed, history, now_s, memory.calmness)
         may = _may_happen(sensed, history, now_s)
-        draws = chance.of_instant(memory.seed, sensed.frame)[self._draw]
+        draws = chance.of_instant(memory.seed, sensed.frame)[self.draws]
         hazards, events = dict(self._never), list(self._look_back(sensed.frame, history, now_s))
         for at, kind in enumerate(self.bank.kinds):
             if kind not in may or memory.calmness.per_minute(kind) == 0:
                 continue
             probability = 1.0 / (1.0 + math.exp(-odds[at]))
             hazards[kind] = probability / STEP_S
-            if draws[at] < probability and not any(event.kind in _EXCLUDES[kind] for event in events):
+            if draws[at] < probability and not any(event.kind in EXCLUDES[kind] for event in events):
                 event = self.shaped(kind, sensed.frame, memory.seed)
                 events.append(
                     changed(event, probability=probability, draw=float(draws[at]), evidence=self.bank.told(told, kind))
@@ -157,11 +157,19 @@ class EventModel:
         evidence = np.concatenate([sensed.heard, done(history, now_s, math.log(nods))])
         told = self.bank.contributions(evidence)
         odds = self.bank.log_odds(told).tolist()
-        for at, kind in enumerate(self.bank.kinds):
-            asked = calmness.per_minute(kind)
-            if asked and "log_rate" not in learned[kind].weights:
-                odds[at] += math.log(asked / learned[kind].per_minute)
+        for at, more in enumerate(self.asked_odds(calmness)):
+            odds[at] += more
         return odds, told
+
+    def asked_odds(self, calmness: Calmness) -> list[float]:
+        """What the rates asked for add to the log-odds of each kind that does not have them among its evidence."""
+        learned = self.tables.hazards
+        return [
+            math.log(asked / learned[kind].per_minute)
+            if (asked := calmness.per_minute(kind)) and "log_rate" not in learned[kind].weights
+            else 0.0
+            for kind in self.bank.kinds
+        ]
 
     def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
         """The look back at the person, once looking away is over."""
@@ -207,4 +215,4 @@ def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) 
     shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
     if shift is not None and (shift.target_rad != AT_PERSON or shift.start_s > now_s):
         under_way.add("gaze_shift")
-    return frozenset(kind for kind in EVENT_KINDS if (listening or kind in ALWAYS) and not _EXCLUDES[kind] & under_way)
+    return frozenset(kind for kind in EVENT_KINDS if (listening or kind in ALWAYS) and not EXCLUDES[kind] & under_way)

@@ -9,11 +9,14 @@ second of it, smoothed, has clearly crossed the middle.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+import numpy as np
+
 from sfms_robot.frames import FRAME_S, Doubles, Floats, SpeakerFrame, changed
-from sfms_robot.listeners.events.evidence import Hearing, Instant, hear, hearing
+from sfms_robot.listeners.events.evidence import Bools, Hearing, Instant, Scene, hear, hearing
 from sfms_robot.listeners.events.face_signs import FaceState, read_signs
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
@@ -73,6 +76,29 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
     heard, remembered = hear(instant, memory.hearing)
     frame = round(speaker.time_s / FRAME_S) - 1
     return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, own=own, face=face, hearing=remembered)
+
+
+def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
+    """What `sense` takes from each frame of a recording; `evidence.heard_in` makes its rows of that."""
+    memory = SenseMemory(addressed)
+    deaf, ear, face = True, memory.ear, memory.face
+    speaks, looks, signs = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan), []
+    speaks[:, 0] = _own_in(speaker)
+    for index, frame in enumerate(speaker):
+        deaf = deaf and not len(frame.audio)
+        ear = ear if deaf else voice_activity.step(energy_db(frame.audio), ear)
+        sign, face = read_signs(frame.face, face)
+        looks[index, 1], memory = _looked(frame, memory)
+        speaks[index, 1] = sign.mouth_moves if deaf else ear.active
+        signs.append((sign.laughs, sign.nods, sign.smiles))
+    return Scene(speaks, looks, *np.array(signs, bool).reshape(-1, 3).T)
+
+
+def _own_in(speaker: Sequence[SpeakerFrame]) -> Bools:
+    """(N,) own voice, and the gaps between its words."""
+    sounds = np.array([_sounds(frame.agent_audio) for frame in speaker], bool)
+    index = np.arange(len(sounds))
+    return np.asarray(index - np.maximum.accumulate(np.where(sounds, index, -(10**6))) <= OWN_GAP_FRAMES)
 
 
 def _sounds(own_voice: Floats | None) -> bool:
