@@ -9,6 +9,7 @@ from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Clip, Dataset
 from sfms_robot.errors import ConfigError
+from sfms_robot.evaluation import metrics
 from sfms_robot.evaluation.paper.listener_clips import collect, shared_space, spread
 from sfms_robot.evaluation.paper.listener_tables import TABLE_1, TABLE_2, Clips, cut, table
 from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
@@ -91,6 +92,19 @@ def test_mime_of_a_speaker_who_copies_the_listener_is_the_truth():
     assert rows["Mime"]["FRDist"] == pytest.approx(0, abs=1e-4) and rows["Mime"]["FRSyn"] == 0
     assert rows["Mime"]["FRCorr per sample"] == pytest.approx(1, abs=1e-6)
     assert rows["Mime"]["FRCorr"] == pytest.approx(2, abs=1e-6)  # the challenge's sum over the samples
+
+
+def test_what_clips_say_one_by_one_is_what_the_metrics_say_of_them_together():
+    rng = np.random.default_rng(3)
+    truth, speaker, train = rng.normal(0, 1, (3, 4, 60, 58))
+    made = rng.normal(0, 1, (4, 2, 60, 58)).cumsum(axis=2)
+    made[1, 0] = 0.5  # no lag can be told of what never moves
+    found = table(2, Clips("arkit58", truth, speaker, train, [*"aabc"]), {"ours": made}, 2)["rows"][5]
+    assert found["FRCorr"] == pytest.approx(metrics.frc(made, truth, np.eye(4)))
+    assert found["FRDist"] == pytest.approx(metrics.reactface_frd(made, truth, np.eye(4)))
+    assert found["FRDiv"] == pytest.approx(metrics.frdiv(made)) and found["FRVar"] == pytest.approx(metrics.frvar(made))
+    assert found["FRSyn"] == pytest.approx(metrics.frsyn(made, speaker, "skip", "all"))
+    assert set(found["interval"]) == {*TABLE_2, "FRCorr per sample"}
 
 
 def test_clips_are_cut_one_behind_the_other():

@@ -25,6 +25,7 @@ from sfms_robot.evaluation.metrics.react_metrics import (
     frvar,
     reactface_frc,
     reactface_frd,
+    synchrony_lags,
 )
 from sfms_robot.signals.learning2listen import faceverse_rotation, l2l_bilateral, l2l_mean_std
 
@@ -50,5 +51,6 @@ __all__ = [
     "rpcc_flat",
     "shannon_index",
     "sts",
+    "synchrony_lags",
     "variance",
 ]

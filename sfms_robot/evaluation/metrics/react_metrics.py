@@ -180,14 +180,25 @@ def frsyn(
     leaves constant channels out, and clips that have no other. "first" uses sample 0 only, as the challenge's parallel
     version does. reference + first reproduces the challenge's number, skip + all is the one to trust.
     """
+    known = synchrony_lags(pred, speaker, nan_policy, samples)
+    known = known[np.isfinite(known)]
+    return float(np.mean(known)) if len(known) else float("nan")
+
+
+def synchrony_lags(
+    pred: ArrayLike,
+    speaker: ArrayLike,
+    nan_policy: Literal["reference", "skip"] = "reference",
+    samples: Literal["first", "all"] = "first",
+) -> Doubles:
+    """(N, K) or (N, 1): the |lag| of every prediction that `frsyn` is the mean of; NaN where there is none."""
     if nan_policy not in ("reference", "skip") or samples not in ("first", "all"):
         raise ValueError(f"nan_policy {nan_policy!r} (reference, skip), samples {samples!r} (first, all)")
     predictions = _samples(pred)
     speakers = _clips(speaker, predictions, "speaker")
     chosen = predictions[:, :1] if samples == "first" else predictions
-    lags = [_best_lag(one, person, nan_policy) for clip, person in zip(chosen, speakers, strict=True) for one in clip]
-    known = [abs(lag) for lag in lags if lag is not None]
-    return float(np.mean(known)) if known else float("nan")
+    lags = [[_best_lag(one, person, nan_policy) for one in clip] for clip, person in zip(chosen, speakers, strict=True)]
+    return np.abs(np.array(lags, np.float64))
 
 
 def _best_lag(pred: Doubles, speaker: Doubles, nan_policy: str) -> int | None:

@@ -56,6 +56,9 @@ PAPER_2: Final = {  # FRCorr, FRDist, FRDiv, FRVar, FRDvs, FRSyn
 }
 
 
+Score = Callable[[Chosen], dict[str, Any]]  # figures of some of the clips
+
+
 @dataclass(frozen=True)
 class Clips:
     """Clips of one length in one motion space.
@@ -90,14 +93,15 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
 
     A row of ours has `source` "here" and names the feature space of its numbers; one of the paper's has "paper".
     """
-    score, paper = (_table_1(clips), _paper_1()) if number == 1 else (_table_2(clips), _paper_2())
+    score_of, paper = (_table_1(clips), _paper_1()) if number == 1 else (_table_2(clips), _paper_2())
     given = Heuristic(clips.train, clips.speaker, clips.space, samples, seed)
     every = np.arange(len(clips.truth))
     guesses = {"Ground truth": clips.truth[:, None], **{name: predict(given) for name, predict in HEURISTICS.items()}}
     rows = []
     for name, motion in {**guesses, **answers}.items():
-        over = intervals(partial(score, motion), clips.people) if name in answers else {}
-        rows.append({"name": name, "source": "here", **score(motion, every), "interval": over})
+        score = score_of(motion)
+        over = intervals(score, clips.people) if name in answers else {}
+        rows.append({"name": name, "source": "here", **score(every), "interval": over})
     return {
         "table": number,
         "space": clips.space,
@@ -132,7 +136,7 @@ def _features(number: int, space: str) -> str:
     return f"{space}, raw coefficients; appropriate is the own listener alone"
 
 
-def _table_1(clips: Clips) -> Callable[[Doubles, Chosen], dict[str, Any]]:
+def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
     """Every metric is the mean over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
     scaled = _scale(clips)
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
@@ -159,7 +163,7 @@ def _table_1(clips: Clips) -> Callable[[Doubles, Chosen], dict[str, Any]]:
             row |= {f"{part} {name}": value for name, value in zip(TABLE_1, _means(values), strict=True)}
         return row
 
-    return score
+    return lambda pred: partial(score, pred)
 
 
 def _scale(clips: Clips) -> Callable[[Doubles], Doubles]:
@@ -181,22 +185,35 @@ def _rpcc(truth: Doubles, guess: Doubles, person: Doubles) -> float:
     return float("nan") if np.ptp(guess) == 0 else metrics.rpcc_flat(truth, guess, person)
 
 
-def _table_2(clips: Clips) -> Callable[[Doubles, Chosen], dict[str, Any]]:
-    """FRCorr is the challenge's sum over the samples, with the mean beside it; FRSyn skips constant channels."""
+def _table_2(clips: Clips) -> Callable[[Doubles], Score]:
+    """FRCorr is the challenge's sum over the samples, with the mean beside it; FRSyn skips constant channels.
 
-    def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
-        made, own, appropriate = pred[chosen], clips.truth[chosen], np.eye(len(chosen))
-        values = (
-            metrics.frc(made, own, appropriate),
-            metrics.reactface_frd(made, own, appropriate),
-            metrics.frdiv(made),
-            metrics.frvar(made),
-            metrics.frdvs(made),
-            metrics.frsyn(made, clips.speaker[chosen], nan_policy="skip", samples="all"),
-        )
-        return dict(zip(TABLE_2, values, strict=True)) | {"FRCorr per sample": values[0] / pred.shape[1]}
+    All but FRDvs are means over the clips; what each clip says is worked out once, whichever clips are chosen.
+    """
 
-    return score
+    def score_of(pred: Doubles) -> Score:
+        own = [
+            (
+                metrics.frc(made, true, np.eye(1)),
+                metrics.reactface_frd(made, true, np.eye(1)),
+                metrics.frdiv(made),
+                metrics.frvar(made),
+            )
+            for made, true in zip(pred[:, None], clips.truth[:, None], strict=True)
+        ]
+        by_clip = np.array(own, np.float64)
+        lags = metrics.synchrony_lags(pred, clips.speaker, nan_policy="skip", samples="all")
+
+        def score(chosen: Chosen) -> dict[str, Any]:
+            correlation, distance, diverse, varied = by_clip[chosen].mean(axis=0).tolist()
+            known = lags[chosen][np.isfinite(lags[chosen])]
+            synchrony = float(known.mean()) if len(known) else float("nan")
+            values = (correlation, distance, diverse, varied, metrics.frdvs(pred[chosen]), synchrony)
+            return dict(zip(TABLE_2, values, strict=True)) | {"FRCorr per sample": correlation / pred.shape[1]}
+
+        return score
+
+    return score_of
 
 
 def _means(values: Sequence[Sequence[float]]) -> list[float]:
