@@ -182,7 +182,8 @@ def _with_integers(model: Any, layers: Iterable[str]) -> Any:
                 _replace(graph, node, node.inputs[0], rounded, scale, node.inputs[2] if len(node.inputs) > 2 else None)
             elif node.op_type == "Transpose":
                 for product, _ in list(node.outputs[0].uses()):
-                    _replace(graph, product, product.inputs[0], rounded, scale, None)
+                    last, bias = _biased(graph, product)
+                    _replace(graph, last, product.inputs[0], rounded, scale, bias)
             else:
                 raise ModelError(f"{layer}: used by {node.op_type}, which has no product in 8 bits")
     RemoveUnusedNodesPass()(model)
@@ -201,6 +202,17 @@ def _placeholder(name: str, shape: list[int], kind: Any) -> Any:
         "model.safetensors", None, None, kind, shape=onnx_ir.Shape(shape), name=name
     )
     return value
+
+
+def _biased(graph: Any, product: Any) -> tuple[Any, Any]:
+    """The last node of a product with what is added to it, and its bias; itself and None without."""
+    uses = list(product.outputs[0].uses())
+    if len(uses) == 1 and uses[0][0].op_type == "Add":
+        node, index = uses[0]
+        bias = node.inputs[1 - index]
+        if bias.name in graph.initializers and len(bias.shape) == 1:
+            return node, bias
+    return product, None
 
 
 def _replace(graph: Any, node: Any, x: Any, rounded: Any, scale: Any, bias: Any) -> None:

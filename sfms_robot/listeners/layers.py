@@ -35,6 +35,14 @@ def exported_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor
     return out
 
 
+def exported_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+    """LayerNorm of x (..., D), then `scale` and `shift`, which broadcast to x, as one operator: for graphs alone."""
+    out: Tensor = torch.onnx.ops.symbolic(
+        "LayerNormalization", (x, scale, shift), {"axis": -1, "epsilon": 1e-5}, dtype=x.dtype, shape=x.shape, version=17
+    )
+    return out
+
+
 class Attention(nn.Module):
     """Multi-head attention of `x` (B, T, D) over `memory` (B, S, D)."""
 

@@ -39,7 +39,7 @@ class Denoiser(nn.Module):
     low: Tensor
     high: Tensor
     alpha_bar: Tensor
-    temperature: Tensor
+    spreads: Tensor
     places: Tensor
 
     def __init__(self, names: Sequence[str], condition: int, settings: config.Diffusion) -> None:
@@ -53,7 +53,6 @@ class Denoiser(nn.Module):
         first, last = torch.tensor([settings.temperature_of(name) for name in names]).unbind(-1)
         late = torch.linspace(0, 1, max(1, settings.steps - 1))[:, None]
         temperature = first + late * (last - first)  # (K - 1, C)
-        self.register_buffer("temperature", temperature, persistent=False)
         self.register_buffer("places", sinusoidal(settings.train_steps, width), persistent=False)
         self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))
         self.condition = Linear(condition, width)
@@ -64,6 +63,9 @@ class Denoiser(nn.Module):
         self.leave = Linear(width, channels)
         self.levels = torch.linspace(0, settings.train_steps - 1, settings.steps).round().long().tolist()
         self.table = steps_of(self.levels, settings)
+        spread = torch.tensor([step.spread for step in self.table[:-1]])[:, None]
+        spreads = torch.cat([torch.ones(1, channels), spread * temperature[: len(spread)]])  # (K, C)
+        self.register_buffer("spreads", spreads, persistent=False)
 
     def level(self, t: Tensor) -> Tensor:
         """Noise levels (K,) -> embeddings (K, W): fixed once the weights are."""
@@ -113,17 +115,19 @@ class Denoiser(nn.Module):
             raise ValueError(f"noise for {k} steps, the sampler takes {len(self.levels)}")
         if levels is None:
             levels = self.level(torch.tensor(self.levels, device=z.device))
-        # The modulation of every step in one product: (K, N, W) conditions, of a single sample (K, W).
-        told = self.condition(z) + levels[:, None] if n > 1 else self.condition(z) + levels
-        parts = [each.chunk(self.modulation.parts, -1) for each in self.modulation.linear(F.silu(told)).unbind(0)]
-        x, added = noise[:, 0], (noise[:, 1:] * self.temperature).unbind(1)
+        # The modulation of every step in one product, the noisiest last; a single sample's are vectors.
+        told = self.modulation.linear(F.silu(self.condition(z)[:, None] + levels)).flatten(1)
+        kinds = self.modulation.parts
+        parts = (told if n > 1 else told[0]).chunk(k * kinds, dim=-1)
+        x, *added = (noise * self.spreads).flatten(1).chunk(k, dim=-1)
         low, high, weights = self.low, self.high, self._weights()
         for index, step in enumerate(self.table):
-            found = _denoise(x, parts[k - 1 - index], weights)
+            level = kinds * (k - 1 - index)
+            found = _denoise(x, parts[level : level + kinds], weights)
             clean = found.mul_(step.denoise[1]).add_(x, alpha=step.denoise[0]).clamp_(low, high)
             x = clean.mul_(step.motion).add_(x, alpha=step.stay)
             if step.spread:
-                x.add_(added[index], alpha=step.spread)
+                x.add_(added[index])
         return x
 
 
@@ -144,7 +148,7 @@ class Step:
     Attributes:
         denoise: M_0 = denoise[0] M_t + denoise[1] eps.
         motion, stay: M_s = motion M_0 + stay M_t, which is ddim as well.
-        spread: sigma_t, times the noise that is added (and the temperature).
+        spread: sigma_t, times the noise that is added (and the temperature); 0 of the last.
     """
 
     denoise: tuple[float, float]

@@ -95,22 +95,22 @@ class Integrated(Part):
         self.wide = Linear(width, 3 * width + hidden)
         self.narrow = Linear(width + hidden, width)
 
-    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """x (N, 2c, D), condition (N, D), SiLU applied -> (N, 2c, D)."""
+    def forward(self, x: Tensor, condition: Tensor, wanted: int) -> Tensor:
+        """x (N, 2c, D), condition (N, D), SiLU applied -> the first so many tokens (N, wanted, D)."""
         shift, scale, gate = self.modulation.of_tokens(condition)
         wide = self.wide(modulated(x, shift, scale))
-        qkv, up = wide.narrow(-1, 0, self.asked), wide.narrow(-1, self.asked, self.hidden)
-        both = torch.cat([_attend(qkv, self.heads), F.gelu(up)], dim=-1)
-        return torch.addcmul(x, gate, self.narrow(both))
+        qkv, up = wide.narrow(-1, 0, self.asked), wide.narrow(-1, self.asked, self.hidden)[:, :wanted]
+        both = torch.cat([_attend(qkv, self.heads, wanted), F.gelu(up)], dim=-1)
+        return torch.addcmul(x[:, :wanted], gate, self.narrow(both))
 
 
-def _attend(qkv: Tensor, heads: int) -> Tensor:
-    """Full self-attention of (N, S, 3D) -> (N, S, D)."""
+def _attend(qkv: Tensor, heads: int, wanted: int | None = None) -> Tensor:
+    """Full self-attention of (N, S, 3D) -> the first `wanted` of S tokens, or all (N, wanted, D)."""
     if torch.compiler.is_exporting():
         q, k, v = qkv.chunk(3, dim=-1)
-        return exported_attention(q, k, v, heads)
+        return exported_attention(q[:, :wanted], k, v, heads)
     q, k, v = split_heads(qkv, 3 * heads).chunk(3, dim=1)
-    return join_heads(attend(q, k, v))
+    return join_heads(attend(q[:, :, :wanted], k, v))
 
 
 class ShortRange(Part):
@@ -142,8 +142,8 @@ class ShortRange(Part):
             agent, user = block(agent, user, of_agent, of_user)
         # Which sound modulates the two tracks as one is left open: both do.
         x, condition = torch.cat([agent, user], dim=1), F.silu(agent_sound + user_sound)
-        for block in self.integrated:
-            x = block(x, condition)
+        for left, block in enumerate(self.integrated, 1 - len(self.integrated)):
+            x = block(x, condition, 2 * c if left else c)
         out: Tensor = self.compress(self.norm(x[:, :c]).flatten(1))
         return out
 

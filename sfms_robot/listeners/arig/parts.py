@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.listeners.layers import exported_attention
+from sfms_robot.listeners.layers import exported_attention, exported_norm
 
 
 class Part(nn.Module):
@@ -91,6 +91,8 @@ class Modulation(Part):
 
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     """LayerNorm of x (..., D) without weights of its own, then scale and shift, which broadcast to x."""
+    if torch.compiler.is_exporting():
+        return exported_norm(x, scale, shift)
     if shift.dim() == 1:  # one for all: LayerNorm applies it itself
         return torch.layer_norm(x, x.shape[-1:], scale, shift)
     return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
