@@ -11,7 +11,6 @@ from enum import IntEnum
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.frames import Doubles, Floats
 
@@ -27,28 +26,22 @@ class Use(IntEnum):
     STATE = 19
 
 
-def philox(seed: int, frame: int, use: int, part: int = 0) -> np.random.Philox:
-    """The generator of one use in one frame; `part` of it: any number."""
-    # The lowest word of the counter rises with every four numbers; the rest says what they are for.
-    counter = np.array([0, frame % 2**64, use, part], np.uint64)
-    return np.random.Philox(key=seed % 2**64, counter=counter)
-
-
 class _Again(threading.local):
     """A generator of each thread's, set anew for every use: to make one takes five times as long."""
 
     def __init__(self) -> None:
-        self._generator = np.random.Philox(key=0)
-        self._state: Any = self._generator.state
+        self._philox = np.random.Philox(key=0)
+        self._generator = np.random.Generator(self._philox)
+        self._state: Any = self._philox.state
 
-    def words(self, seed: int, frame: int, use: int, part: int, count: int) -> NDArray[np.uint64]:
-        """The first of `philox` of the same."""
+    def of(self, seed: int, frame: int, use: int, part: int = 0) -> np.random.Generator:
+        """That of one use in one frame; `part` of it: any number."""
+        # The lowest word of the counter rises with every four numbers; the rest says what they are for.
         counter = self._state["state"]["counter"]
         counter[0], counter[1], counter[2], counter[3] = 0, frame % 2**64, use, part
         self._state["state"]["key"][0] = seed % 2**64
-        self._generator.state = self._state
-        words: NDArray[np.uint64] = self._generator.random_raw(count)
-        return words
+        self._philox.state = self._state
+        return self._generator
 
 
 _AGAIN: Final = _Again()
@@ -56,10 +49,10 @@ _AGAIN: Final = _Again()
 
 def uniforms(seed: int, frame: int, use: int, count: int, part: int = 0) -> Doubles:
     """(count,) in 0..1."""
-    words = _AGAIN.words(seed, frame, use, part, count)
+    words = _AGAIN.of(seed, frame, use, part).bit_generator.random_raw(count)
     return np.asarray((words >> np.uint64(11)) * TO_UNIT, np.float64)
 
 
 def normals(seed: int, frame: int, use: int, *shape: int) -> Floats:
     """Standard normal numbers of a shape."""
-    return np.random.Generator(philox(seed, frame, use)).standard_normal(shape, np.float32)
+    return _AGAIN.of(seed, frame, use).standard_normal(shape, np.float32)

@@ -70,7 +70,8 @@ def of_mel(rows: Floats) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _finite(samples: Floats) -> Floats:
-    return np.where(np.isfinite(samples), samples, np.float32(0))
+    finite = np.isfinite(samples)
+    return samples if finite.all() else np.where(finite, samples, np.float32(0))
 
 
 def fit_frame(samples: Floats | None) -> Floats | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from sfms_robot.frames import Doubles, Floats
@@ -20,6 +22,12 @@ def rotary(chunks: Doubles, size: int) -> Floats:
 
     Computed in double precision: after days of running the angles still differ by what the chunks do.
     """
-    angles = chunks[:, None] * rates(size)
-    signs = np.where(np.arange(size) < size // 2, -1.0, 1.0)
+    turns, signs = _planes(size)
+    angles = chunks[:, None] * turns
     return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _planes(size: int) -> tuple[Doubles, Doubles]:
+    """`rates`, and signs of the sines; not to be changed."""
+    return rates(size), np.where(np.arange(size) < size // 2, -1.0, 1.0)
