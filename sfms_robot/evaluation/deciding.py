@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
-from sfms_robot.listeners.events.chance import of_instant
+from sfms_robot.frames import FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.listeners.events.chance import of_instants
 from sfms_robot.listeners.events.evidence import Ints, heard_in
 from sfms_robot.listeners.events.hazards import STEP_FRAMES
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, DecideMemory, EventModel
@@ -55,8 +55,8 @@ def decisions(
 def _decided(
     model: EventModel, heard: Doubles, seed: int, calmness: Calmness | None, steps: Ints, most: Doubles
 ) -> tuple[ListenerEvent, ...]:
-    draws = np.array([of_instant(seed, frame) for frame in steps.tolist()]).reshape(-1, len(EVENT_KINDS))
-    frames = [*steps[(draws[:, model.draws] < most).any(axis=1)].tolist(), len(heard)]
+    draws = of_instants(seed, steps)[:, model.draws]
+    frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
     memory, found = model.start(seed, calmness).decided, list[ListenerEvent]()
     at, look_back = 0, math.inf  # the frame from which on a look aside is over
     while (frame := min(frames[at], look_back)) < len(heard):

@@ -8,7 +8,7 @@ minute of the others in the place of each.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,7 @@ from sfms_robot.corpora.compose.recorded import heard
 from sfms_robot.corpora.compose.speaking import sent
 from sfms_robot.corpora.compose.voices import Voice, laugh, lay, mouth_over
 from sfms_robot.evaluation.rollout import speaker_frames
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, SpeakerFrame, changed
 from sfms_robot.signals import events
 from sfms_robot.signals.events import Bools
 
@@ -252,7 +252,7 @@ def part(speaker: Sequence[SpeakerFrame], first: int, frames: int) -> list[Speak
 
 def without_own_voice(speaker: Sequence[SpeakerFrame]) -> list[SpeakerFrame]:
     """As a head hears it that never speaks."""
-    return [replace(frame, agent_audio=None) for frame in speaker]
+    return [changed(frame, agent_audio=None) for frame in speaker]
 
 
 def shifted(speaker: Sequence[SpeakerFrame], by_s: float = SHIFT_S) -> list[SpeakerFrame]:
@@ -260,10 +260,10 @@ def shifted(speaker: Sequence[SpeakerFrame], by_s: float = SHIFT_S) -> list[Spea
     by = round(by_s * FRAME_HZ) % len(speaker)
     before = [*speaker[len(speaker) - by :], *speaker[: len(speaker) - by]]
     return [
-        replace(_at(frame.time_s, other), agent_audio=frame.agent_audio)
+        changed(_at(frame.time_s, other), agent_audio=frame.agent_audio)
         for frame, other in zip(speaker, before, strict=True)
     ]
 
 
 def _at(time_s: float, frame: SpeakerFrame) -> SpeakerFrame:
-    return replace(frame, time_s=time_s, face=frame.face and replace(frame.face, time_s=time_s))
+    return changed(frame, time_s=time_s, face=frame.face and changed(frame.face, time_s=time_s))

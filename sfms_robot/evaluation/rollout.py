@@ -66,6 +66,7 @@ def speaker_frames(
     knows. No sound at all is no microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
+    shown = np.asarray(np.isfinite(face).all(axis=1))
     frames = []
     for index, row in enumerate(face):
         time_s = (index + 1) * FRAME_S
@@ -73,7 +74,7 @@ def speaker_frames(
         said = None if agent_audio is None else agent_audio[following]
         if said is not None and len(said) < FRAME_SAMPLES:
             said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
-        seen = FaceFrame.of(time_s, row) if np.isfinite(row).all() else None
+        seen = FaceFrame.of(time_s, row) if shown[index] else None
         looks = None if attention is None else float(attention[index])
         if looks is not None and seen is None and not np.isnan(looks):
             looks = None
@@ -84,6 +85,11 @@ def speaker_frames(
 def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
     """Both tracks of a dyad as a source gives them."""
     return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)
+
+
+def whole_clips(speaker: Sequence[SpeakerFrame], frames: int) -> Sequence[SpeakerFrame]:
+    """As much as is whole clips of so many frames."""
+    return speaker[: len(speaker) // frames * frames]
 
 
 @runtime_checkable
@@ -141,15 +147,20 @@ def _step(
 
 
 def rollouts(
-    listener: Listener, dyads: Sequence[Dyad], seed: int, each: Callable[[], object] = lambda: None
+    listener: Listener,
+    dyads: Sequence[Dyad],
+    seed: int,
+    each: Callable[[], object] = lambda: None,
+    clip_frames: int = 1,
 ) -> list[Rollout]:
     """One stream through every dyad from its beginning, each with a seed of its own; `each()` after every one.
 
-    A listener that is told of events is told those of the dyad's own listener.
+    A listener that is told of events is told those of the dyad's own listener. `clip_frames`: see `whole_clips`.
     """
     found = []
     for number, dyad in enumerate(dyads):
-        found.append(rollout(listener, frames_of_dyad(dyad), [seed + number], dyad.events or ()))
+        heard = whole_clips(frames_of_dyad(dyad), clip_frames)
+        found.append(rollout(listener, heard, [seed + number], dyad.events or ()))
         each()
     return found
 

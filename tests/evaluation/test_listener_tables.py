@@ -12,7 +12,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import metrics
 from sfms_robot.evaluation.paper.listener_clips import collect, shared_space, spread
 from sfms_robot.evaluation.paper.listener_tables import TABLE_1, TABLE_2, Clips, cut, table
-from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
+from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
 from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
 from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
@@ -105,6 +105,14 @@ def test_what_clips_say_one_by_one_is_what_the_metrics_say_of_them_together():
     assert found["FRDiv"] == pytest.approx(metrics.frdiv(made)) and found["FRVar"] == pytest.approx(metrics.frvar(made))
     assert found["FRSyn"] == pytest.approx(metrics.frsyn(made, speaker, "skip", "all"))
     assert set(found["interval"]) == {*TABLE_2, "FRCorr per sample"}
+
+
+def test_what_is_no_whole_clip_is_not_played():
+    one, model = dyad("a", 45), listener()
+    heard = frames_of_dyad(one)
+    assert [len(whole_clips(heard, frames)) for frames in (1, 10, 45, 50)] == [45, 40, 45, 0]
+    whole, clips = (rollouts(model, [one], 3, clip_frames=frames)[0].motion for frames in (1, 10))
+    np.testing.assert_array_equal(clips, whole[:, :40])
 
 
 def test_clips_are_cut_one_behind_the_other():

@@ -149,7 +149,7 @@ def arig_table(
     speaker = cut([dyad.speaker for dyad in held_out], tables.CLIP_FRAMES)
     answers = {}
     for label, folder in folders.items():
-        played = _played(label, load_listener(folder), {scene: held_out}, seed)[scene]
+        played = _played(label, load_listener(folder), {scene: held_out}, seed, tables.CLIP_FRAMES)[scene]
         answers[label] = cut([one.motion[0] for one in played], tables.CLIP_FRAMES)
     people = people_of(held_out, [len(dyad.listener) for dyad in held_out], tables.CLIP_FRAMES)
     rows = (
@@ -191,9 +191,9 @@ def _train(settings: config.Training | config.ArigTraining, options: TrainOption
 
 
 def _played(
-    name: str, listener: Listener, held_out: Mapping[str, Sequence[Dyad]], seed: int
+    name: str, listener: Listener, held_out: Mapping[str, Sequence[Dyad]], seed: int, clip_frames: int = 1
 ) -> dict[str, list[Rollout]]:
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task(name, total=sum(len(each) for each in held_out.values()))
         advance = partial(progress.advance, task)
-        return {scene: rollouts(listener, dyads, seed, advance) for scene, dyads in held_out.items()}
+        return {scene: rollouts(listener, dyads, seed, advance, clip_frames) for scene, dyads in held_out.items()}

@@ -119,7 +119,7 @@ def listener_table(
     from sfms_robot.evaluation.paper.listener_tables import table
     from sfms_robot.listeners.sfms.stream import SfmsListener
 
-    listeners = {name: load_at_hop(find("listeners", name, "config.yaml"), hop) for name in names}
+    listeners = {name: load_at_hop(find("listeners", name, "config.yaml"), hop, "auto") for name in names}
     if models is not None:
         listeners |= {
             name: load_at_hop(folder, None) for name, folder in as_written("sfms", data, models, steps, order).items()

@@ -14,7 +14,7 @@ from sfms_robot.corpora.collection import Dataset, usable
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation.paper.listener_tables import FRAMES, NEEDED_FRAMES, Clips, cut
 from sfms_robot.evaluation.paper.over_people import people_of
-from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
+from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, whole_clips
 from sfms_robot.frames import FRAME_HZ, Doubles
 from sfms_robot.learning.corpus import in_space
 from sfms_robot.learning.sfms.features import frames_of
@@ -86,14 +86,14 @@ def collect(
     for name, listener in listeners.items():
         motions = []
         for dyad in held_out:
-            motions.append(_answered(listener, space, dyad, seeds))
+            motions.append(_answered(listener, space, dyad, seeds, frames))
             each()
         answered[name] = cut(motions, frames)
     return clips, answered
 
 
-def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int]) -> Doubles:
-    """(S, N, D) in the space."""
+def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int], frames: int) -> Doubles:
+    """(S, N, D) in the space; what is no whole clip of so many frames may be left out."""
     if isinstance(listener, SfmsListener):
         return np.asarray(offline_rollout(listener, dyad, seeds).motion)
     if dyad.space != "arkit58":
@@ -104,4 +104,5 @@ def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequenc
         raise ConfigError(
             f"dyad {dyad.name} has {dyad.fps:g} frames a second: such a listener is streamed at {FRAME_HZ}"
         )
-    return np.stack([space.encode(one) for one in rollout(listener, frames_of_dyad(dyad), seeds).motion])
+    heard = whole_clips(frames_of_dyad(dyad), frames)
+    return np.stack([space.encode(one) for one in rollout(listener, heard, seeds).motion])
