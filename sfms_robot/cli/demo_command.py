@@ -13,7 +13,7 @@ import typer
 from sfms_robot.cli import names
 
 # Of the ten seeds that `--seeds 10` tries, the first of the two that nod most.
-DEFAULT_SEED = 1
+DEFAULT_SEED = 0
 
 
 def demo(

@@ -31,7 +31,7 @@ class Table(StrEnum):
 
 
 class Part(StrEnum):
-    """Of the meetings (`corpora.splits`)."""
+    """Of meetings and voices (`corpora.splits`)."""
 
     train = "train"
     validation = "validation"
@@ -183,7 +183,8 @@ def robustness(
     data: Path | None = typer.Option(
         None, metavar="DIR", help="Folder with more voices (speech_audio, conversation_audio, ...); the bundled ones."
     ),
-    speakers: int | None = typer.Option(None, min=1, help="At most this many; everybody kept for test."),
+    split: Part = typer.Option(Part.test, help="Whose voices: test for what is reported, validation to choose by."),
+    speakers: int | None = typer.Option(None, min=1, help="At most this many; everybody of the part."),
     minutes: float = typer.Option(1.0, min=0.1, help="Of each, in each way."),
     seeds: int = typer.Option(8, min=1, help="How often each is played."),
     seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling, and of what is spoilt."),
@@ -194,7 +195,8 @@ def robustness(
     from sfms_robot.app.evaluate.unseen_speakers import evaluate_robustness
     from sfms_robot.cli.show_learning import print_robustness, show
 
-    show(evaluate_robustness(listener, data, speakers, minutes, seeds, seed, jobs), json, print_robustness)
+    found = evaluate_robustness(listener, data, split.value, speakers, minutes, seeds, seed, jobs)
+    show(found, json, print_robustness)
 
 
 @app.command()

@@ -2,7 +2,8 @@
 
 A speaker looks at the head all the time. Each is played as a voice, as a face, and as both, as recorded and spoilt in
 one way at a time; every stream of a listener differs by its seed alone. What is counted is what is seen in its motion,
-and what it has decided.
+and what it has decided; of what comes only to somebody who speaks, a minute is one in which he does, or did two
+seconds ago. Where nothing tells that he speaks (no microphone, a mouth that hangs) nothing has to answer him.
 """
 
 from __future__ import annotations
@@ -18,8 +19,19 @@ from scipy.signal import oaconvolve
 
 from sfms_robot.evaluation.detection import seen
 from sfms_robot.evaluation.rollout import Rollout, speaker_frames
-from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES, POSE, SHAPES, Floats, SpeakerFrame
-from sfms_robot.signals.events import MOTION_EVENTS
+from sfms_robot.frames import (
+    AUDIO_HZ,
+    CHANNEL_INDEX,
+    FRAME_HZ,
+    FRAME_S,
+    FRAME_SAMPLES,
+    POSE,
+    SHAPES,
+    Floats,
+    SpeakerFrame,
+)
+from sfms_robot.listeners.events.model import ALWAYS
+from sfms_robot.signals.events import MOTION_EVENTS, listening_mask, voice_activity
 
 Inputs = Literal["voice", "face", "both"]
 Spoil = Callable[[Floats, np.random.Generator], Floats]
@@ -48,18 +60,24 @@ class Condition:
     Attributes:
         voice, face: what becomes of the samples and of the motion.
         attention: number of frames -> (frames,) in place of looking at the head all the time.
+        mouth_moves: it is still to be seen that he speaks.
     """
 
     name: str
     voice: Spoil | None = None
     face: Spoil | None = None
     attention: Callable[[int], Floats] | None = None
+    mouth_moves: bool = True
 
     def concerns(self, inputs: Inputs) -> bool:
         """It changes something of what is heard and seen, or is what the others are compared with."""
         of_voice, of_face = self.voice is not None, self.face is not None or self.attention is not None
         nothing = not of_voice and not of_face
         return nothing or (of_voice and inputs != "face") or (of_face and inputs != "voice")
+
+    def tells_speech(self, inputs: Inputs) -> bool:
+        """Whether a listener can know that somebody speaks."""
+        return inputs != "face" or self.mouth_moves
 
 
 def noise(voice: Floats, rng: np.random.Generator) -> Floats:
@@ -140,7 +158,9 @@ CONDITIONS: Final = (
     PLAIN,
     *(Condition(spoil.__name__.replace("_", " "), voice=spoil) for spoil in (noise, quiet, loud, room, telephone)),
     *(
-        Condition(f"face {spoil.__name__.replace('_', ' ')}", face=spoil)
+        Condition(
+            f"face {spoil.__name__.replace('_', ' ')}", face=spoil, mouth_moves=spoil not in (constant, saturated)
+        )
         for spoil in (jitter, lost, constant, saturated, upside_down)
     ),
     FLICKER,
@@ -180,23 +200,36 @@ def counted(played: Rollout) -> dict[str, list[int]]:
     return {kind: [len(seen(motion, kind)) for motion in played.motion] for kind in MOTION_EVENTS} | decided
 
 
-def rates(counts: Mapping[str, Sequence[int]], minutes: float) -> dict[str, float | None]:
-    """Of counts over streams: their mean a minute, and their variance over their mean (None of one, or of nothing)."""
+def listened_minutes(speaker: Speaker, minutes: float) -> float:
+    """Of `minutes` of the speaker those in which he speaks, or did two seconds ago; by his voice as recorded."""
+    voice = np.resize(speaker.voice, round(60 * minutes * FRAME_HZ) * FRAME_SAMPLES)
+    return float(listening_mask(voice_activity(voice), FRAME_HZ).sum()) / FRAME_HZ / 60
+
+
+def rates(
+    counts: Mapping[str, Sequence[int]], minutes: float, listened: float | None = None
+) -> dict[str, float | None]:
+    """Of counts over streams: their mean a minute, and their variance over their mean (None of one, or of nothing).
+
+    A minute of what comes only while listening is one of the `listened` (all, if not said).
+    """
     figures: dict[str, float | None] = {}
     for kind, numbers in counts.items():
         mean = float(np.mean(numbers))
-        figures[f"{kind}s_per_minute"] = round(mean / minutes, 3)
+        always = listened is None or kind.removeprefix("decided_") in ALWAYS
+        time = minutes if always else max(listened or 0.0, FRAME_S / 60)
+        figures[f"{kind}s_per_minute"] = round(mean / time, 3)
         told = mean > 0 and len(numbers) > 1
         figures[f"{kind}s_variance_over_mean"] = round(float(np.var(numbers, ddof=1)) / mean, 3) if told else None
     return figures
 
 
-def outside(row: Mapping[str, Any]) -> list[str]:
-    """Which figures of a row are not people's."""
+def outside(row: Mapping[str, Any], tells_speech: bool = True) -> list[str]:
+    """Which figures of a row are not people's; nobody answers whom nothing tells to speak."""
     return [
         f"{kind}s_per_minute"
         for kind, (least, most) in RANGES.items()
-        if not least <= row[f"{kind}s_per_minute"] <= most
+        if not (least if tells_speech or kind in ALWAYS else 0.0) <= row[f"{kind}s_per_minute"] <= most
     ]
 
 

@@ -124,14 +124,14 @@ def test_delayed_hazards_know_a_frame_less():
 
 @pytest.mark.slow
 def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
-    """A hundred seeds hear the person of the demo for 48 s. Counts of people vary by 1.28 to 1.82 of their mean."""
+    """Three hundred seeds hear the person of the demo for 48 s. Counts of people vary by 1.28 to 1.82 of their mean."""
     recording = AudioFile(shipped_speaker("facegood_1114_3_16").audio)
     voice = recording.read(recording.length)
     recording.close()
     frames = len(voice) // FRAME_SAMPLES
     when = EventModel.load()
     _, heard = sensed(speaker_frames(voice[: frames * FRAME_SAMPLES], np.full((frames, 58), np.nan, np.float32)))
-    counts = np.array([len(spans_of(events, "nod")) for events in decisions(when, heard, range(100))])
+    counts = np.array([len(spans_of(events, "nod")) for events in decisions(when, heard, range(300))])
     assert 3 <= counts.mean() / (frames * FRAME_S / 60) <= 7, "addressed: as many a minute as people's"
     assert 1.28 <= counts.var(ddof=1) / counts.mean() <= 1.82
-    assert 3 <= (counts == 0).sum() <= 15
+    assert 0.03 <= (counts == 0).mean() <= 0.15

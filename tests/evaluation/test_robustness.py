@@ -11,6 +11,7 @@ from sfms_robot.evaluation.robustness import (
     cases,
     counted,
     heard_and_seen,
+    listened_minutes,
     outside,
     rates,
     room,
@@ -100,6 +101,18 @@ def test_rates_and_their_scatter():
     assert found["smiles_per_minute"] == 0 and found["smiles_variance_over_mean"] is None
 
 
+def test_a_minute_of_nods_is_one_of_listening():
+    found = rates({"nod": [4, 4], "decided_nod": [2, 2], "blink": [8, 8]}, minutes=2.0, listened=0.5)
+    assert [found[f"{kind}s_per_minute"] for kind in ("nod", "decided_nod", "blink")] == [8.0, 4.0, 4.0]
+
+
+def test_who_is_silent_is_listened_to_for_two_seconds_more():
+    talk = np.random.default_rng(0).normal(0, 0.1, 10 * AUDIO_HZ).astype(np.float32)
+    hiss = np.random.default_rng(1).normal(0, 1e-5, 20 * AUDIO_HZ).astype(np.float32)
+    listened = listened_minutes(Speaker("someone", np.r_[talk, hiss], None), 0.5)
+    assert listened == pytest.approx(12 / 60, abs=0.5 / 60)
+
+
 def test_counts_by_lot_scatter_by_their_mean():
     counts = np.random.default_rng(1).poisson(5, 4000).tolist()
     assert rates({"nod": counts}, 1.0)["nods_variance_over_mean"] == pytest.approx(1, abs=0.1)
@@ -108,3 +121,14 @@ def test_counts_by_lot_scatter_by_their_mean():
 def test_what_people_do_not_do_is_named():
     row = {"nods_per_minute": 21.0, "blinks_per_minute": 15.0, "smiles_per_minute": 0.0}
     assert outside(row) == ["nods_per_minute", "smiles_per_minute"]
+
+
+def test_nobody_has_to_answer_whom_nothing_tells_to_speak():
+    row = {"nods_per_minute": 0.0, "blinks_per_minute": 15.0, "smiles_per_minute": 0.0}
+    assert outside(row) and not outside(row, tells_speech=False)
+    assert outside(row | {"blinks_per_minute": 0.0, "nods_per_minute": 9.0}, tells_speech=False) == [
+        "nods_per_minute",
+        "blinks_per_minute",
+    ]
+    mute = {(inputs, how.name) for inputs, how in cases(SPEAKER) if not how.tells_speech(inputs)}
+    assert mute == {("face", "face constant"), ("face", "face saturated")}

@@ -17,7 +17,7 @@ from sfms_robot.corpora.compose.acting import speaker_motion
 from sfms_robot.corpora.compose.motions import Motions
 from sfms_robot.corpora.compose.motions import load as load_motions
 from sfms_robot.corpora.compose.voices import Voice, find_voices, mouth_over
-from sfms_robot.corpora.splits import split_of_voice
+from sfms_robot.corpora.splits import Split, split_of_voice
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import robustness
@@ -35,11 +35,12 @@ class _Task:
     """One speaker in one way.
 
     Attributes:
-        voices: folders of WAV files; `speaker`: place of his among the voices kept for test.
+        voices: folders of WAV files; `speaker`: place of his among the voices of `split`.
     """
 
     folder: Path
     voices: tuple[Path, ...]
+    split: Split
     speaker: int
     inputs: Inputs
     condition: int
@@ -49,24 +50,34 @@ class _Task:
 
 
 def evaluate_robustness(
-    name: str, data: Path | None, speakers: int | None, minutes: float, seeds: int, seed: int, jobs: int | None
+    name: str,
+    data: Path | None,
+    split: Split,
+    speakers: int | None,
+    minutes: float,
+    seeds: int,
+    seed: int,
+    jobs: int | None,
 ) -> dict[str, Any]:
     """Events a minute of every speaker in every way, and how they scatter over seeds; beside people's.
 
-    Raises ConfigError or ModelError.
+    Raises ConfigError or ModelError, and for voices that were trained on.
     """
+    if split == "train":
+        raise ConfigError("--split train: listeners were trained on these voices; validation and test are others")
     folder = find("listeners", name, "config.yaml")
     load_listener(folder)  # what is wrong with it is said here, not by a process
     voices = voice_folders(data)
-    everybody = unseen(voices)[:speakers]
+    everybody = unseen(voices, split)[:speakers]
     tasks = [
-        _Task(folder, voices, place, inputs, CONDITIONS.index(condition), minutes, seeds, seed)
+        _Task(folder, voices, split, place, inputs, CONDITIONS.index(condition), minutes, seeds, seed)
         for place, speaker in enumerate(everybody)
         for inputs, condition in robustness.cases(speaker)
     ]
     rows = done_in_processes(_play, tasks, jobs, "speakers heard")
     return {
         "listener": name,
+        "split": split,
         "speakers": [speaker.name for speaker in everybody],
         "minutes": minutes,
         "seeds": seeds,
@@ -76,7 +87,7 @@ def evaluate_robustness(
         "outside": [
             {**{key: row[key] for key in ("speaker", "inputs", "condition")}, "figures": wrong}
             for row in rows
-            if (wrong := robustness.outside(row))
+            if (wrong := robustness.outside(row, row["tells_speech"]))
         ],
         "rows": rows,
     }
@@ -91,12 +102,12 @@ def voice_folders(data: Path | None) -> tuple[Path, ...]:
 
 
 @cache
-def unseen(voices: tuple[Path, ...]) -> tuple[Speaker, ...]:
-    """Everybody in the folders whose voice is kept for test, by name. Raises ConfigError when there is nobody."""
-    motions = load_motions(data_dir("sim") / "listeners" / "motions.npz")["test"]
-    kept = {voice.name: voice for voice in find_voices(voices) if split_of_voice(voice.name) == "test"}
+def unseen(voices: tuple[Path, ...], split: Split = "test") -> tuple[Speaker, ...]:
+    """Everybody in the folders whose voice is of `split`, by name. Raises ConfigError when there is nobody."""
+    motions = load_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
+    kept = {voice.name: voice for voice in find_voices(voices) if split_of_voice(voice.name) == split}
     if not kept:
-        raise ConfigError(f"{', '.join(map(str, voices))}: no voice that is kept for test")
+        raise ConfigError(f"{', '.join(map(str, voices))}: no voice that is kept for {split}")
     return tuple(_speaker(kept[name], motions, number) for number, name in enumerate(sorted(kept)))
 
 
@@ -111,7 +122,7 @@ def _speaker(voice: Voice, motions: Motions, number: int) -> Speaker:
 
 
 def _play(task: _Task) -> dict[str, Any]:
-    speaker, condition = unseen(task.voices)[task.speaker], CONDITIONS[task.condition]
+    speaker, condition = unseen(task.voices, task.split)[task.speaker], CONDITIONS[task.condition]
     rng = np.random.default_rng([task.seed, task.speaker, task.condition])
     frames = robustness.heard_and_seen(speaker, task.inputs, condition, task.minutes, rng)
     played = rollout(_listener(task.folder), frames, range(task.seed, task.seed + task.seeds))
@@ -120,7 +131,8 @@ def _play(task: _Task) -> dict[str, Any]:
         "speaker": speaker.name,
         "inputs": task.inputs,
         "condition": condition.name,
-        **robustness.rates(counts, len(frames) / FRAME_HZ / 60),
+        "tells_speech": condition.tells_speech(task.inputs),
+        **robustness.rates(counts, len(frames) / FRAME_HZ / 60, robustness.listened_minutes(speaker, task.minutes)),
     }
 
 

@@ -1,8 +1,8 @@
 """What a listener takes from the other's face as it comes: they nod, they smile, they laugh, their mouth moves.
 
 Trackers lie: a face may be upside down, stuck, saturated or all noise. So everything is judged against the face's own
-last second or running neutral, which a constant becomes; turns count modulo a whole one; and a head that nods more
-than people can is taken for noise until it calms down. What is taken for a laugh is a broad smile over a mouth that
+last second or running neutral, which a constant becomes; turns count modulo a whole one; and what stands out from how
+the head swings anyway, by talking or by noise, is a nod. What is taken for a laugh is a broad smile over a mouth that
 opens and closes: somebody who talks and beams at once is taken for laughing.
 """
 
@@ -20,7 +20,7 @@ NOD_RAD: Final = math.radians(2.0)  # a swing there, within a second, and most o
 BACK: Final = 0.6
 WINDOW: Final = 25  # frames
 NODS_APART: Final = 30  # frames; more than a window, so that no swing counts twice
-MOST_NODS: Final = 6  # in ten seconds: more is noise
+STANDS_OUT: Final = 4.0  # times as far as the head swung over the last seconds, on average
 SMILE: Final = 0.25  # over the neutral
 BEAM: Final = 0.35
 HELD_FRAMES: Final = 6
@@ -29,6 +29,7 @@ _SMOOTH: Final = 0.5  # share of a new value
 _NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: somebody who always beams is neutral within a minute
 _NEUTRAL_FALL: Final = 0.1
 _MOTION: Final = 0.12
+_SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
 _CORNERS: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
 _JAW: Final = CHANNEL_INDEX["jawOpen"]
 _PITCH: Final = CHANNEL_INDEX["pitch"]
@@ -51,14 +52,15 @@ class FaceState:
     Attributes:
         frame: how many have been asked for.
         pitch_rad: smoothed, unwrapped, of the last second.
-        nodded: frames of the swings of late.
+        nodded: frame of the newest nod; sway_rad: mean swing of the last seconds.
         neutral, held: of the smile: its neutral, and for how many frames it has been up.
         jaw, opening: jawOpen, and how much it changes per frame.
     """
 
     frame: int = 0
     pitch_rad: tuple[float, ...] = ()
-    nodded: tuple[int, ...] = ()
+    nodded: int = -NODS_APART
+    sway_rad: float = 0.0
     neutral: float | None = None
     held: int = 0
     jaw: float = 0.0
@@ -86,17 +88,18 @@ def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
     before = state.pitch_rad
     smoothed = before[-1] + _SMOOTH * math.remainder(pitch_rad - before[-1], 2 * math.pi) if before else pitch_rad
     pitch = (*before, smoothed)[-WINDOW:]
-    recent = tuple(at for at in state.nodded if state.frame - at < 10 / FRAME_S)
-    new = (not recent or state.frame - recent[-1] >= NODS_APART) and (_swung(pitch) or _swung([-p for p in pitch]))
-    nodded = (*recent, state.frame) if new else recent
-    return new and len(recent) < MOST_NODS, changed(state, pitch_rad=pitch, nodded=nodded)
+    swing = max(_swing(pitch), _swing([-p for p in pitch]))
+    stands_out = swing >= max(NOD_RAD, STANDS_OUT * state.sway_rad)
+    new = stands_out and state.frame - state.nodded >= NODS_APART
+    sway = state.sway_rad + _SWAY * (swing - state.sway_rad)
+    return new, changed(state, pitch_rad=pitch, nodded=state.frame if new else state.nodded, sway_rad=sway)
 
 
-def _swung(values: tuple[float, ...] | list[float]) -> bool:
-    """Up by a nod, and now most of the way back."""
+def _swing(values: tuple[float, ...] | list[float]) -> float:
+    """How far up it went, if by now it is most of the way back; else 0."""
     top = max(values)
     risen = top - min(values[: values.index(top) + 1])
-    return risen >= NOD_RAD and top - values[-1] >= BACK * risen
+    return risen if top - values[-1] >= BACK * risen else 0.0
 
 
 def _smile(level: float, state: FaceState) -> tuple[bool, bool, FaceState]:

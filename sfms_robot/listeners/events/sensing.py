@@ -1,9 +1,10 @@
-"""A person's frame as evidence: the ear hears who speaks, the face says who looks, nods, smiles and laughs.
+"""A person's frame as evidence: the ear hears who speaks, the face says who looks, nods, smiles and laughs. A head that
+talks moves all the time, by more than many a nod: nods are those of somebody silent.
 
 Each input may be missing. No microphone: a mouth that moves is a voice. No face: nobody nods or laughs. Nobody who
 tells whether the head is looked at: it is, for one person talks to one head; an attention of NaN says that nobody
 knows, and so does a face that has told it before and is lost. Attention flickers; looked-at changes only when a quarter
-second of it, smoothed, has clearly crossed the middle.
+second of it, smoothed, has clearly crossed the middle, and one that never does leaves it as it would be untold.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from sfms_robot.frames import FRAME_S, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.listeners.events.evidence import Bools, Hearing, Instant, Scene, hear, hearing
 from sfms_robot.listeners.events.face_signs import FaceState, read_signs
-from sfms_robot.signals import voice_activity
+from sfms_robot.signals import phase, voice_activity
 from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.voice_activity import Ear
 
@@ -71,8 +72,9 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
     signs, face = read_signs(speaker.face, memory.face)
     own = 0 if _sounds(speaker.agent_audio) else memory.own + 1
     looked, watching = _looked(speaker, memory)
-    speaks = (own <= OWN_GAP_FRAMES, signs.mouth_moves if deaf else ear.active)
-    instant = Instant(speaks, (math.nan, looked), signs.laughs, signs.nods, signs.smiles)
+    talks = signs.mouth_moves if deaf else ear.active
+    nods = signs.nods and not talks and not memory.hearing.voices.speech
+    instant = Instant((own <= OWN_GAP_FRAMES, talks), (math.nan, looked), signs.laughs, nods, signs.smiles)
     heard, remembered = hear(instant, memory.hearing)
     frame = round(speaker.time_s / FRAME_S) - 1
     return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, own=own, face=face, hearing=remembered)
@@ -91,7 +93,9 @@ def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") ->
         looks[index, 1], memory = _looked(frame, memory)
         speaks[index, 1] = sign.mouth_moves if deaf else ear.active
         signs.append((sign.laughs, sign.nods, sign.smiles))
-    return Scene(speaks, looks, *np.array(signs, bool).reshape(-1, 3).T)
+    laughs, nods, smiles = np.array(signs, bool).reshape(-1, 3).T
+    silent = phase.times(speaks[:, 1])[:, 0] == 0
+    return Scene(speaks, looks, laughs, nods & silent & np.r_[True, silent][:-1], smiles)
 
 
 def _own_in(speaker: Sequence[SpeakerFrame]) -> Bools:
@@ -122,10 +126,10 @@ def _looked(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMem
         if given is None and not memory.tells:
             return 1.0, changed(memory, unseen=0)
         return math.nan, changed(memory, unseen=0, attention=None, looked=math.nan)
-    before = memory.attention
+    before = 1.0 if memory.attention is None else memory.attention
     given = min(max(given, 0.0), 1.0)
-    level = given if before is None else given + (before - given) * _KEPT
-    looked = float(level > 0.5) if math.isnan(memory.looked) else memory.looked
+    level = given + (before - given) * _KEPT
+    looked = 1.0 if math.isnan(memory.looked) else memory.looked
     if level > LOOKED:
         looked = 1.0
     elif level < NOT_LOOKED:

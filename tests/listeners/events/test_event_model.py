@@ -216,6 +216,21 @@ def test_flickering_attention_is_ridden_out():
         assert len(of("nod", listen(conversation(attention=attention))[0])) <= MOST_NODS * MINUTES
 
 
+def test_attention_that_only_flickers_is_taken_for_none():
+    frames = [attention % 2 for attention in range(FRAMES)]
+    flickers, untold = (listen(conversation(attention=given), own=())[1] for given in (frames, None))
+    np.testing.assert_array_equal(flickers, untold)
+
+
+def test_a_head_that_moves_as_it_talks_does_not_nod_and_one_that_is_silent_does():
+    times = np.arange(FRAMES) * FRAME_S
+    face, moving = np.zeros((2, FRAMES, MOTION_DIM), np.float32)
+    moving[:, 1] = np.radians(6) * np.sin(np.pi * np.minimum(times % 4.0, 0.5) / 0.5) ** 2  # every four seconds
+    for voice, least, most in ((sound(np.ones(FRAMES, bool)), 0.0, 0.0), (VOICE, 0.02, np.inf)):
+        moved, still = (listen(conversation(voice, face=one), own=())[1] for one in (moving, face))
+        assert least <= np.abs(moved - still).max() <= most
+
+
 def faces():
     rng = np.random.default_rng(4)
     still = np.zeros((FRAMES, MOTION_DIM), np.float32)

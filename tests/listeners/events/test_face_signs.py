@@ -55,6 +55,13 @@ def test_a_look_down_is_no_nod():
     assert not seen(motion)[0].any()
 
 
+def test_a_head_that_swings_all_the_time_nods_where_it_stands_out():
+    motion, times = nodding([30.0], deg=12.0, hz=1.5), np.arange(FRAMES) * FRAME_S
+    motion[:, PITCH] += np.radians(1.5) * np.sin(2 * np.pi * 0.9 * times)
+    found = np.flatnonzero(seen(motion)[0]) * FRAME_S
+    assert found[found > 5] == pytest.approx([30.6], abs=0.4)
+
+
 def test_noise_is_not_nodding():
     motion = np.random.default_rng(1).normal(0, 0.3, (FRAMES, MOTION_DIM)).astype(np.float32)
     assert seen(motion)[0].sum() <= 6
