@@ -21,6 +21,7 @@ look at the person; memory holds what is still under way, no more.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, Self, cast
@@ -128,7 +129,7 @@ class EventfulListener:
 
     def step(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
-        decision, told = self._decided(speaker, memory)
+        ((decision, told),) = self._decided([speaker], [memory])
         plan, how = self.how.step(_believed(speaker), told.how, self._control(speaker, told))
         return self._looking(plan, decision, changed(told, how=how))
 
@@ -136,7 +137,7 @@ class EventfulListener:
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
     ) -> list[tuple[Plan | None, EventfulMemory]]:
         """See `ports.BatchListener`; a motion model that steps one stream at a time is asked for each."""
-        decided = [self._decided(*each) for each in zip(speakers, memories, strict=True)]
+        decided = self._decided(speakers, memories)
         told = [memory for _, memory in decided]
         controls = [self._control(*each) for each in zip(speakers, told, strict=True)]
         moved = self._move_each([*map(_believed, speakers)], [memory.how for memory in told], controls)
@@ -146,7 +147,7 @@ class EventfulListener:
         ]
 
     def _move_each(
-        self, speakers: Sequence[SpeakerFrame], hows: Sequence[Any], controls: Sequence[Floats]
+        self, speakers: Sequence[SpeakerFrame], hows: Sequence[Any], controls: Sequence[Floats | None]
     ) -> Sequence[tuple[Plan | None, Any]]:
         together = getattr(self.how, "step_each", None)
         if together is None:
@@ -158,7 +159,7 @@ class EventfulListener:
         self, speaker: SpeakerFrame, memories: Sequence[EventfulMemory]
     ) -> tuple[list[Plan], list[EventfulMemory]]:
         """`step` of streams that began together and heard the same speaker ever since; no plans between hops."""
-        decided = [self._decided(speaker, memory) for memory in memories]
+        decided = self._decided([speaker] * len(memories), memories)
         told = [memory for _, memory in decided]
         controls = [self._control(speaker, memory) for memory in told]
         plans, hows = self._move_many(_believed(speaker), [memory.how for memory in told], controls)
@@ -169,7 +170,7 @@ class EventfulListener:
         return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
 
     def _move_many(
-        self, speaker: SpeakerFrame, hows: Sequence[Any], controls: Sequence[Floats]
+        self, speaker: SpeakerFrame, hows: Sequence[Any], controls: Sequence[Floats | None]
     ) -> tuple[Sequence[Plan | None], Sequence[Any]]:
         together = getattr(self.how, "step_many", None)
         if together is None:
@@ -178,14 +179,23 @@ class EventfulListener:
         plans, after = together(speaker, hows, controls)
         return plans or [None] * len(hows), after
 
-    def _decided(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Decision, EventfulMemory]:
-        """What this frame decides, and the memory that knows of it."""
-        decision, when = self.when.step(speaker, memory.when)
-        keep_s = speaker.time_s - self.how.control_frames[0] * FRAME_S
-        events = _remembered((*memory.events, *decision.events), keep_s)
-        return decision, changed(memory, when=when, events=events, news=memory.news + decision.events)
+    def _decided(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
+    ) -> list[tuple[Decision, EventfulMemory]]:
+        """What a frame decides, of each stream, and the memory that knows of it."""
+        past_s = self.how.control_frames[0] * FRAME_S
+        found = []
+        decided = self.when.step_each(speakers, [memory.when for memory in memories])
+        for speaker, memory, (decision, when) in zip(speakers, memories, decided, strict=True):
+            events = _remembered((*memory.events, *decision.events), speaker.time_s - past_s)
+            found.append((decision, changed(memory, when=when, events=events, news=memory.news + decision.events)))
+        return found
 
-    def _control(self, speaker: SpeakerFrame, memory: EventfulMemory) -> Floats:
+    def _control(self, speaker: SpeakerFrame, memory: EventfulMemory) -> Floats | None:
+        """What the motion model is told; None with a frame that brings no plan, for one that can tell."""
+        is_due: Callable[[Any], bool] | None = getattr(self.how, "is_due", None)
+        if is_due is not None and not is_due(memory.how):
+            return None
         past, ahead = self.how.control_frames
         return control_track(memory.events, frame_of(speaker) + 1 - past, past + ahead)
 
@@ -196,7 +206,8 @@ class EventfulListener:
         newest = memory.gaze[min(1, len(memory.gaze) - 1) :]  # one frame has passed
         if plan is None:
             return None, changed(memory, gaze=newest)
-        targets = [target_at(memory.events, time_s) for time_s in plan.times_s.tolist()]
+        shifts = [event for event in memory.events if event.target_rad is not None]
+        targets = [target_at(shifts, time_s) for time_s in plan.times_s.tolist()]
         head_rad, eyes, states = gaze_kinematics.follow(targets, plan.frames, newest[0])
         frames = plan.frames.copy()
         frames[:, :3] += head_rad
@@ -211,8 +222,8 @@ def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
     """The frame without its face where that is turned or moved further than a person before a camera is."""
     if speaker.face is None:
         return speaker
-    pose = np.abs(speaker.face.pose)
-    near = bool((pose[:3] <= TURNED_RAD).all() and (pose[3:] <= MOVED_M).all())
+    pose = [abs(value) for value in speaker.face.pose.tolist()]
+    near = max(pose[:3]) <= TURNED_RAD and max(pose[3:]) <= MOVED_M and not any(map(math.isnan, pose))
     return speaker if near else changed(speaker, face=None)
 
 
@@ -229,6 +240,8 @@ def target_at(events: Sequence[ListenerEvent], time_s: float) -> Doubles:
 
 def _remembered(events: tuple[ListenerEvent, ...], keep_s: float) -> tuple[ListenerEvent, ...]:
     """Events that are not over by `keep_s`, in the order of their decision, and the last gaze shift begun by then."""
+    if not events:
+        return events
     shifts = [event for event in events if event.target_rad is not None and event.start_s <= keep_s]
     return tuple(
         event

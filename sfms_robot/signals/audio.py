@@ -146,5 +146,14 @@ def energy_db(samples: Floats) -> float:
     """Mean level of some samples in dB of full scale; -100 for silence and for none."""
     if not len(samples):
         return -100.0
-    power = float(np.add.reduce(np.square(samples, dtype=np.float64))) / len(samples)
-    return 10 * math.log10(max(power, 1e-10))
+    return _db(float(np.add.reduce(np.square(samples, dtype=np.float64))), len(samples))
+
+
+def energies_db(pieces: Floats) -> list[float]:
+    """`energy_db` of each of (N, n) samples."""
+    sums: list[float] = np.add.reduce(np.square(pieces, dtype=np.float64), axis=1).tolist()
+    return [_db(each, pieces.shape[1]) for each in sums]
+
+
+def _db(energy: float, samples: int) -> float:
+    return 10 * math.log10(max(energy / samples, 1e-10))

@@ -35,20 +35,21 @@ def control_track(events: Sequence[ListenerEvent], first: int, frames: int) -> F
     Of two events of one kind at one time the later one is told. Kinds without columns are left out.
     """
     out = np.zeros((frames, len(COLUMNS)), np.float32)
+    begin_s, over_s = (first + 1) * FRAME_S, (first + frames) * FRAME_S
+    told = [one for one in events if one.kind in KINDS and one.end_s > begin_s and one.start_s <= over_s + 1e-9]
+    if not told:
+        return out
     times_s = (first + 1 + np.arange(frames)) * FRAME_S
-    for event in sorted(events, key=lambda one: one.start_s):
-        if event.kind not in KINDS:
-            continue
+    for event in sorted(told, key=lambda one: one.start_s):
         since_s = times_s - event.start_s
         rows = np.flatnonzero((since_s >= -1e-9) & (since_s < event.duration_s - 1e-9))
         if len(rows):
-            _tell(out, rows, np.maximum(since_s[rows], 0.0), event)
+            within = slice(int(rows[0]), int(rows[-1]) + 1)
+            _tell(out, within, np.maximum(since_s[within], 0.0), event)
     return out
 
 
-def _tell(
-    out: Floats, rows: np.typing.NDArray[np.intp], since_s: np.typing.NDArray[np.float64], event: ListenerEvent
-) -> None:
+def _tell(out: Floats, rows: slice, since_s: np.typing.NDArray[np.float64], event: ListenerEvent) -> None:
     over = np.minimum(since_s / event.duration_s, 1.0)
     size = min(abs(event.size) / FULL_SIZE.get(event.kind, 1.0), BOUND)
     at = _EACH * KINDS.index(event.kind)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -136,15 +137,12 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...]
     since_s, left_s = state.since_s + FRAME_S, max(0.0, state.left_s - FRAME_S)
     part = _least_jerk(min(1.0, since_s / state.shift_s))
     goal = head_share(target, state.share)
-    yaw, pitch = (
-        _towards(axis, wanted, state.head_left_s, FRAME_S) for axis, wanted in zip(state.head, goal, strict=True)
-    )
+    yaw = _towards(state.head[0], goal[0], state.head_left_s, FRAME_S)
+    pitch = _towards(state.head[1], goal[1], state.head_left_s, FRAME_S)
     head = (yaw[0] + body[0], pitch[0] + body[1])
-    wanted = [
-        begun + part * (aim + spot + drift * since_s - begun)
-        for begun, aim, spot, drift in zip(state.from_rad, target, state.spot_rad, state.drift_rad_s, strict=True)
-    ]
-    pan, tilt = wanted[0] - head[0], wanted[1] - head[1]
+    begun, spot, drift = state.from_rad, state.spot_rad, state.drift_rad_s
+    pan = begun[0] + part * (target[0] + spot[0] + drift[0] * since_s - begun[0]) - head[0]
+    tilt = begun[1] + part * (target[1] + spot[1] + drift[1] * since_s - begun[1]) - head[1]
     pan, tilt = max(-EYE_PAN_RAD, min(pan, EYE_PAN_RAD)), max(-EYE_TILT_RAD, min(tilt, EYE_TILT_RAD))
     after = changed(
         state,
@@ -159,7 +157,7 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...]
 
 def _aimed(target: Pair, state: GazeState) -> GazeState:
     """The state with the shift that begins now, if one does: to another target, or to the next spot on this one."""
-    moved = math.dist(target, state.target_rad)
+    moved = 0.0 if target == state.target_rad else math.dist(target, state.target_rad)
     if moved > 0:
         turn_rad = math.dist(head_share(target, state.share), (state.head[0][0], state.head[1][0]))
         state = changed(state, target_rad=target, head_left_s=_HEAD_S[0] + _HEAD_S[1] * math.degrees(turn_rad))
@@ -175,9 +173,8 @@ def _aimed(target: Pair, state: GazeState) -> GazeState:
 
 def _fixated(state: GazeState) -> GazeState:
     """The next fixation: its spot, its drift and its length hang on the seed and its number alone."""
-    rng = np.random.default_rng((state.seed, state.number))
     spread, most = _SPOT_RAD
-    x, y, drift_x, drift_y, long = rng.standard_normal(5).tolist()
+    x, y, drift_x, drift_y, long = _drawn(state.seed, state.number)
     narrow = spread * min(1.0, most / max(spread * math.hypot(x, y), 1e-9))
     median_s, deviation, least_s = _FIXATION_S
     return changed(
@@ -187,6 +184,12 @@ def _fixated(state: GazeState) -> GazeState:
         drift_rad_s=(_DRIFT_RAD_S * drift_x, _DRIFT_RAD_S * drift_y),
         left_s=max(least_s, median_s * math.exp(deviation * long)),
     )
+
+
+@lru_cache(maxsize=1024)  # plans overlap: most fixations are asked for by several
+def _drawn(seed: int, number: int) -> tuple[float, ...]:
+    """What one fixation of a stream hangs on."""
+    return tuple(np.random.default_rng((seed, number)).standard_normal(5).tolist())
 
 
 def head_share(target_rad: Pair, share: float) -> Pair:

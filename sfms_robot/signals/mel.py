@@ -7,6 +7,7 @@ finished row can do without: 240 of them after whole frames. The recording start
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -38,12 +39,19 @@ def log_mel(samples: Floats, past: Floats) -> tuple[Floats, Floats]:
     Returns:
         (rows, 128) natural log of mel power, and the samples to hand in next time (240 to 399 of them).
     """
-    seen = np.concatenate([past, samples]).astype(np.float32)
-    rows = max(0, (len(seen) - WINDOW) // HOP + 1)
-    if rows == 0:
-        return np.zeros((0, MEL_BINS), dtype=np.float32), seen
-    windows = seen[HOP * np.arange(rows)[:, None] + _WITHIN]
-    return _rows(windows), seen[rows * HOP :].copy()
+    rows, (after,) = log_mel_each([samples], [past])
+    return rows, after
+
+
+def log_mel_each(samples: Sequence[Floats], pasts: Sequence[Floats]) -> tuple[Floats, list[Floats]]:
+    """`log_mel` of several streams: their rows, one stream behind the other, and the past of each."""
+    windows, after = [], []
+    for new, past in zip(samples, pasts, strict=True):
+        seen = np.concatenate([past, new]).astype(np.float32)
+        rows = max(0, (len(seen) - WINDOW) // HOP + 1)
+        windows.append(np.ndarray((rows, WINDOW), np.float32, seen, strides=(HOP * seen.itemsize, seen.itemsize)))
+        after.append(seen[rows * HOP :].copy())
+    return _rows(windows[0] if len(windows) == 1 else np.concatenate(windows)), after
 
 
 def _rows(windows: NDArray[np.float32]) -> Floats:

@@ -82,21 +82,31 @@ def start() -> State:
 
 def step(samples: Floats, state: State) -> tuple[Floats, State]:
     """Samples of one frame (640,), or none when there is no microphone -> features (21,), and the next state."""
-    return step_level(energy_db(samples), state)
+    rows, (after,) = step_each([[energy_db(samples)]], [state])
+    return rows[0], after
 
 
-def step_level(level_db: float, state: State) -> tuple[Floats, State]:
-    """The same from the level of the frame (`voice_activity.levels_db`, `mel_levels_db`)."""
-    ear = voice_activity.step(level_db, state.ear)
-    phase = state.phase.after(ear.active)
-    return _row(*(min(count, LONGEST) for count in (phase.speech, phase.silence, phase.last))), State(ear, phase)
+def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[State]) -> tuple[Floats, list[State]]:
+    """Levels of the frames of several streams, any number each -> features (N, 21) of all N frames, one stream behind
+    the other, and the state of each.
+    """
+    counts: list[tuple[int, int, int]] = []
+    after = []
+    for own, state in zip(levels_db, states, strict=True):
+        ear, phase = state.ear, state.phase
+        for level_db in own:
+            ear = voice_activity.step(level_db, ear)
+            phase = phase.after(ear.active)
+            counts.append((min(phase.speech, LONGEST), min(phase.silence, LONGEST), min(phase.last, LONGEST)))
+        after.append(State(ear, phase))
+    return _features_of(counts), after
 
 
-def _row(speech: int, silence: int, last: int) -> Floats:
-    """`features` (21,) of counts of frames up to `LONGEST`."""
-    rows = _every_row()
-    parts = (rows[speech, _OF_SPEECH], rows[silence, _OF_SILENCE], rows[last, _OF_LAST])
-    return np.concatenate(parts)
+def _features_of(counts: Sequence[tuple[int, int, int]]) -> Floats:
+    """`features` (N, 21) of counts of frames up to `LONGEST`."""
+    rows, places = _every_row(), np.array(counts, np.intp).reshape(-1, 3)
+    parts = zip(places.T, (_OF_SPEECH, _OF_SILENCE, _OF_LAST), strict=True)
+    return np.concatenate([rows[place, columns] for place, columns in parts], axis=1)
 
 
 @lru_cache(maxsize=1)

@@ -52,7 +52,7 @@ def corpus_of(one: SfmsListener, *dyads: Dyad) -> SfmsCorpus:
 @pytest.mark.parametrize("changes", [{}, {"phase": False}, {"audio": "mfcc78"}])
 @pytest.mark.parametrize("start", [0, 1, 9])
 def test_the_context_of_a_window_is_what_a_stream_remembers_there(changes, start):
-    one = listener(**changes)
+    one = listener(hop=1, **changes)  # memory is as of the newest plan
     corpus = corpus_of(one, dyad(60), dyad(60))
     fit_sound_scales(one.model, corpus)
     memory = one.start(1)

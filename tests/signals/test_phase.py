@@ -75,7 +75,7 @@ def test_mel_levels_and_sample_levels_of_noise_are_equal():
 def test_silence_and_nonsense_are_not_speech(level):
     state = phase.start()
     for _ in range(50):
-        row, state = phase.step_level(level, state)
+        (row,), (state,) = phase.step_each([[level]], [state])
         assert np.isfinite(row).all()
     assert state.phase == SpeechPhase(0, 50, 0)
 

@@ -151,7 +151,7 @@ class HazardBank:
     def log_odds(self, contributions: Doubles) -> Doubles:
         """(..., T) -> (..., H), always finite."""
         total = self._intercepts + np.add.reduceat(contributions, self._knots.kind, axis=-1)
-        return np.asarray(np.clip(np.nan_to_num(total), -_BOUND, _BOUND), np.float64)
+        return np.asarray(np.minimum(np.maximum(np.where(np.isnan(total), 0.0, total), -_BOUND), _BOUND), np.float64)
 
     def told(self, contributions: Doubles, kind: str, most: int = 4) -> dict[str, float]:
         """The largest terms of one kind, by evidence, of contributions (T,)."""

@@ -127,11 +127,39 @@ class EventModel:
         self, sensed: Sensed, memory: DecideMemory, own: Sequence[ListenerEvent] | None = None
     ) -> tuple[Decision, DecideMemory]:
         """The second half of `step`. A gaze shift away is followed by one back when its time is over."""
-        if sensed.frame % STEP_FRAMES != STEP_FRAMES - 1:
+        if not _asks(sensed):
             return Decision((), memory.hazards_hz or self._never), memory
         now_s = (sensed.frame + 1) * FRAME_S
         history = memory.done if own is None else begun_before(own, now_s)
-        odds, told = self._log_odds(sensed, history, now_s, memory.calmness)
+        told = self.bank.contributions(self._evidence(sensed, history, memory.calmness))
+        return self._drawn(sensed, memory, history, self.bank.log_odds(told), told)
+
+    def step_each(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventMemory]
+    ) -> list[tuple[Decision, EventMemory]]:
+        """`step` of several streams: their hazards are asked together."""
+        sensed = [sense(speaker, memory.sensed) for speaker, memory in zip(speakers, memories, strict=True)]
+        found = [(Decision((), memory.decided.hazards_hz or self._never), memory.decided) for memory in memories]
+        asking = [row for row, (one, _) in enumerate(sensed) if _asks(one)]
+        if asking:
+            own = [memories[row].decided for row in asking]
+            evidence = [
+                self._evidence(sensed[row][0], one.done, one.calmness) for row, one in zip(asking, own, strict=True)
+            ]
+            told = self.bank.contributions(np.array(evidence))
+            for row, one, odds, terms in zip(asking, own, self.bank.log_odds(told), told, strict=True):
+                found[row] = self._drawn(sensed[row][0], one, one.done, odds, terms)
+        return [
+            (decision, EventMemory(heard, decided))
+            for (decision, decided), (_, heard) in zip(found, sensed, strict=True)
+        ]
+
+    def _drawn(
+        self, sensed: Sensed, memory: DecideMemory, history: Sequence[ListenerEvent], log_odds: Doubles, told: Doubles
+    ) -> tuple[Decision, DecideMemory]:
+        """What happens, by lot, of log-odds (H,) as they are learned, and the terms (T,) that they are of."""
+        now_s = (sensed.frame + 1) * FRAME_S
+        odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
         may = _may_happen(sensed, history, now_s)
         draws = chance.of_instant(memory.seed, sensed.frame)[self.draws]
         hazards, events = dict(self._never), list(self._look_back(sensed.frame, history, now_s))
@@ -148,18 +176,10 @@ class EventModel:
         kept = remembered((*memory.done, *events), now_s) if events else memory.done
         return Decision(tuple(events), hazards), changed(memory, done=kept, hazards_hz=hazards)
 
-    def _log_odds(
-        self, sensed: Sensed, history: Sequence[ListenerEvent], now_s: float, calmness: Calmness
-    ) -> tuple[list[float], Doubles]:
-        """Of every kind, at the rates asked for; and what each term adds."""
-        learned = self.tables.hazards
-        nods = calmness.nod or learned["nod"].per_minute
-        evidence = np.concatenate([sensed.heard, done(history, now_s, math.log(nods))])
-        told = self.bank.contributions(evidence)
-        odds = self.bank.log_odds(told).tolist()
-        for at, more in enumerate(self.asked_odds(calmness)):
-            odds[at] += more
-        return odds, told
+    def _evidence(self, sensed: Sensed, history: Sequence[ListenerEvent], calmness: Calmness) -> Doubles:
+        """(len(EVIDENCE),) of a frame and of what was done before it."""
+        nods = calmness.nod or self.tables.hazards["nod"].per_minute
+        return np.concatenate([sensed.heard, done(history, (sensed.frame + 1) * FRAME_S, math.log(nods))])
 
     def asked_odds(self, calmness: Calmness) -> list[float]:
         """What the rates asked for add to the log-odds of each kind that does not have them among its evidence."""
@@ -193,6 +213,11 @@ class EventModel:
             times, duration_s = swings(duration_s, quantile(shape.swings_hz or SWINGS_HZ, pace))
         target = aside(size, side, up) if kind == "gaze_shift" else None
         return ListenerEvent(kind, _begin_s(frame), duration_s, size, times, target)
+
+
+def _asks(sensed: Sensed) -> bool:
+    """Whether hazards are asked at the end of this frame."""
+    return sensed.frame % STEP_FRAMES == STEP_FRAMES - 1
 
 
 def quantile(values: Sequence[float], share: float) -> float:

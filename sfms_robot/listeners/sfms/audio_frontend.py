@@ -5,7 +5,7 @@ One path offline and streaming: `rows` of a whole recording gives what `step` gi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -16,6 +16,7 @@ from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, Floats
 from sfms_robot.signals import mel, mfcc, phase
+from sfms_robot.signals.audio import energies_db
 
 if TYPE_CHECKING:  # transformers, which only a listener of this kind needs
     from sfms_robot.signals.wav2vec2 import Wav2Vec2
@@ -27,6 +28,7 @@ SHAPES: Final[Mapping[Audio, tuple[int, int]]] = {
     "mfcc78": (1, mfcc.DIM),
     "wav2vec2": (1, 768),
 }
+_SILENCE: Final = np.zeros(FRAME_SAMPLES, np.float32)
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,24 @@ class AudioFrontend:
         """Nothing heard yet."""
         return AudioState(self._start(), phase.start() if self.phased else None)
 
-    def step(self, samples: Floats, audio: AudioState) -> tuple[Floats, Floats, AudioState]:
-        """Samples (640,) of one frame, or none -> rows (R, bins), phase (F,), and the audio of the next frame."""
-        rows, sound = self._rows(samples if len(samples) else np.zeros(FRAME_SAMPLES, np.float32), audio.sound)
-        if audio.phase is None:
-            return rows, np.zeros(0, np.float32), AudioState(sound, None)
-        features, state = phase.step(samples, audio.phase)
-        return rows, features, AudioState(sound, state)
+    def step(self, sounds: Sequence[Floats], audio: AudioState) -> tuple[Floats, Floats, AudioState]:
+        """Frames of samples (640,), or none in them -> rows (frames * R, bins), phase (frames, F), and what is
+        remembered after them.
+        """
+        rows, phases, (after,) = self.step_each([sounds], [audio])
+        return rows, phases, after
+
+    def step_each(
+        self, sounds: Sequence[Sequence[Floats]], before: Sequence[AudioState]
+    ) -> tuple[Floats, Floats, list[AudioState]]:
+        """`step` of several streams, any number of frames each: rows and phases one stream behind the other."""
+        whole = [np.concatenate([sound if len(sound) else _SILENCE for sound in own]) for own in sounds]
+        rows, pasts = self._rows_each(whole, [state.sound for state in before])
+        if not self.phased:
+            return rows, np.zeros((sum(map(len, sounds)), 0), np.float32), [AudioState(past, None) for past in pasts]
+        levels = [energies_db(samples.reshape(-1, FRAME_SAMPLES)) for samples in whole]
+        phases, after = phase.step_each(levels, [state.phase or phase.start() for state in before])
+        return rows, phases, [AudioState(*each) for each in zip(pasts, after, strict=True)]
 
     def rows(self, audio: Floats) -> Floats:
         """Samples (N * 640,) -> rows (N * R, bins)."""
@@ -91,6 +104,12 @@ class AudioFrontend:
         if self.audio == "mel":
             return mel.start()
         return np.zeros(0, np.float32) if self.model is None else self.model.start()
+
+    def _rows_each(self, samples: Sequence[Floats], pasts: Sequence[Floats]) -> tuple[Floats, list[Floats]]:
+        if self.audio == "mel":
+            return mel.log_mel_each(samples, pasts)
+        found = [self._rows(*each) for each in zip(samples, pasts, strict=True)]
+        return np.concatenate([rows for rows, _ in found]), [past for _, past in found]
 
     def _rows(self, samples: Floats, past: Floats) -> tuple[Floats, Floats]:
         if self.audio == "mel":

@@ -37,6 +37,7 @@ SILENCE_LATELY = np.array(
     np.float32,
 )
 NEEDED = 0.5  # of what a class in the nucleus has at least: sums are rounded
+_WORD, _WORD_BITS = np.uint64(0xFFFFFFFF), np.uint64(32)
 LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing, and sorting it takes time
 
 
@@ -108,9 +109,9 @@ class Sampler:
     ) -> Tokens:
         """Tokens (B, G) of `frame` from the logits (B, N, classes of all groups) of the network `next`."""
         logits = by_group(flat, self._classes)  # (B, N, G, V)
-        known: Floats = guided(logits[:, 0], logits[:, 1], guidance) if logits.shape[1] > 1 else logits[:, 0]
+        possible: Floats = guided(logits[:, 0], logits[:, 1], guidance) if logits.shape[1] > 1 else logits[:, 0]
         too_soon = self._reach.too_soon(last.tokens[..., 0], frame - last.at[..., 0])
-        possible = np.where(too_soon, np.float32(-np.inf), known)
+        np.copyto(possible, np.float32(-np.inf), where=too_soon)
         possible /= self._temperature
         return sample(possible, self._bias, nucleus, chance)
 
@@ -156,11 +157,11 @@ def sample(logits: Floats, bias: Floats, nucleus: Floats, chance: Doubles) -> To
     row = np.arange(len(mass))
     whole = mass[row, kept - 1]
     place = np.minimum((mass <= (chance.reshape(-1) * whole)[:, None]).sum(-1), kept - 1)
-    drawn: Tokens = classes[row, place]
+    drawn: Tokens = classes[row, place].astype(np.int64)
     return drawn.reshape(likely.shape[:-1])
 
 
-def _sorted(shares: Floats, least: NDArray[np.floating]) -> tuple[Floats, NDArray[np.int64]]:
+def _sorted(shares: Floats, least: NDArray[np.floating]) -> tuple[Floats, NDArray[np.uint64]]:
     """Shares (R, V) of at least `least` (R, 1): the `LIKELIEST` of each row, largest first, (R, K), and their classes.
 
     Rows of fewer end in shares of 0. Of V classes that hold a nucleus none has less than a V-th of what is left
@@ -169,9 +170,12 @@ def _sorted(shares: Floats, least: NDArray[np.floating]) -> tuple[Floats, NDArra
     rows, found = np.nonzero(shares >= least)
     counts = np.bincount(rows, minlength=len(shares))
     place = np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]
-    values = np.zeros((len(shares), int(counts.max())), shares.dtype)
-    classes = np.zeros(values.shape, np.int64)
-    values[rows, place], classes[rows, place] = shares[rows, found], found
-    order = np.argsort(-values, axis=-1, kind="stable")[:, :LIKELIEST]
-    row = np.arange(len(shares))[:, None]
-    return values[row, order], classes[row, order]
+    # Bits of floats that are not negative rise as they do. Counted down, with the class behind them, they are numbers
+    # that sort in one go: largest first, of equal ones the first class.
+    downwards = _WORD - shares[rows, found].view(np.uint32).astype(np.uint64)
+    keys = np.full((len(shares), int(counts.max())), ~np.uint64(0))
+    keys[rows, place] = (downwards << _WORD_BITS) | found.astype(np.uint64)
+    keys.sort(axis=-1)
+    first = keys[:, :LIKELIEST]
+    values = (_WORD - (first >> _WORD_BITS)).astype(np.uint32).view(np.float32)
+    return values, first & _WORD

@@ -28,10 +28,12 @@ class LastKeyframes(NamedTuple):
 
     def then(self, drawn: Tokens, frame: int) -> LastKeyframes:
         """After the tokens (..., G) `drawn` for `frame`."""
-        key = (drawn > 0)[..., None]
-        newer = np.stack([drawn, self.tokens[..., 0]], axis=-1)
-        newer_at = np.stack([np.full_like(drawn, frame), self.at[..., 0]], axis=-1)
-        return LastKeyframes(np.where(key, newer, self.tokens), np.where(key, newer_at, self.at))
+        key, tokens, at = drawn > 0, self.tokens.copy(), self.at.copy()
+        for part in (tokens, at):
+            np.copyto(part[..., 1], part[..., 0], where=key)
+        np.copyto(tokens[..., 0], drawn, where=key)
+        np.copyto(at[..., 0], frame, where=key)
+        return LastKeyframes(tokens, at)
 
 
 def last_keyframes(tokens: Tokens) -> LastKeyframes:

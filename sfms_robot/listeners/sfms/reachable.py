@@ -44,8 +44,10 @@ class Reach:
 
     def too_soon(self, last: Tokens, gap: Tokens) -> NDArray[np.bool_]:
         """Tokens (B, G) of the last keyframes (0: none), frames since (B, G) -> classes (B, G, V + 1) out of reach."""
-        needed = np.stack([np.stack([self.needed(*each) for each in enumerate(row)]) for row in last.tolist()])
-        return needed > gap[..., None]
+        needed = np.concatenate([self.needed(*each) for row in last.tolist() for each in enumerate(row)])
+        passed = np.minimum(gap, NEVER - 1).astype(np.uint8)  # as wide as what it is compared with
+        too_soon: NDArray[np.bool_] = needed.reshape(*last.shape, self._classes) > passed[..., None]
+        return too_soon
 
     def needed(self, group: int, token: int) -> NDArray[np.uint8]:
         """(V + 1,) whole frames, at least, from a token to every class; class 0 may always follow, and anything may

@@ -14,13 +14,23 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import (
+    AUDIO_HZ,
+    FRAME_S,
+    FRAME_SAMPLES,
+    MOTION_DIM,
+    Doubles,
+    Floats,
+    Plan,
+    SpeakerFrame,
+    changed,
+)
 from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
 from sfms_robot.listeners.sfms.channels import HEAD, head_channels
@@ -31,16 +41,22 @@ from sfms_robot.listeners.sfms.sway import draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 
+_NO_FACE: Final = np.full(MOTION_DIM, np.nan, np.float32)
+
 
 @dataclass(frozen=True)
 class SpeakerState:
-    """The speaker's last P frames, the newest last, as `draw.Seen` wants them (no batch).
+    """The speaker's last P frames up to the newest plan, the newest last, as `draw.Seen` wants them (no batch); and
+    what was heard since then, which becomes features with the next plan, all of it at once.
 
     Attributes:
+        sounds, faces: of every frame since: its samples, and its motion (58,), NaN where no face is known.
         audio: what unfinished features still need.
-        rows: (R, bins) sound of the newest frame, standardised.
+        rows: (R, bins) sound of the newest of the P frames, standardised.
     """
 
+    sounds: tuple[Floats, ...]
+    faces: tuple[Floats, ...]
     audio: AudioState
     rows: Floats
     voice: Floats
@@ -52,15 +68,15 @@ class SpeakerState:
 
 @dataclass(frozen=True)
 class Memory:
-    """What one stream remembers; values only: a step makes a new one.
+    """What one stream remembers; values only: a step makes a new one. All but `frames` is as of the newest plan.
 
     Attributes:
         seed: what it draws hangs on it (`lots`).
         frames: how many have been heard.
         speaker: of the last P frames.
-        tokens: (P + H, G) own tokens up to now, those drawn for the future, UNDECIDED.
+        tokens: (P + H, G) own tokens up to then, those drawn for the future, UNDECIDED.
         control: (P + H, K) what was told of each of those frames when they were drawn.
-        path: (2 + H, C) standardised: the frame before, this frame, then the plan in force.
+        path: (2 + H, C) standardised: the frame before, the frame itself, then the plan in force.
         sway: what `sway.draw_sway` made for this stream; empty without.
     """
 
@@ -131,6 +147,8 @@ class SfmsListener(RunsOnEngine):
         """Memory of a stream that has heard nothing and looked neutral so far."""
         p = self.settings.past_frames
         speaker = SpeakerState(
+            sounds=(),
+            faces=(),
             audio=self.frontend.start(),
             rows=np.zeros(self.frontend.shape, np.float32),
             voice=np.zeros((p, self.settings.predictor_width), np.float32),
@@ -154,31 +172,38 @@ class SfmsListener(RunsOnEngine):
         undecided = np.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
         return np.concatenate([self._neutral, undecided]), self._still(2 + self.horizon)
 
+    def is_due(self, memory: Memory) -> bool:
+        """Whether the next frame brings a plan."""
+        return memory.frames % self.hop == 0
+
     def step(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Plan | None, Memory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place.
 
         `control`: rows of `signals.control` for the `control_frames` up to this frame and after it, (P + H, K); None
-        for a listener that is not told of events.
+        for a listener that is not told of events, and for a frame that brings no plan.
 
         Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
         """
-        return self.step_each([speaker], [memory], None if control is None else [control])[0]
+        return self.step_each([speaker], [memory], [control])[0]
 
     def step_each(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Memory], controls: Sequence[Floats] | None = None
+        self,
+        speakers: Sequence[SpeakerFrame],
+        memories: Sequence[Memory],
+        controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, Memory]]:
         """See `ports.BatchListener`; controls as of `step`. Those that are due are planned together."""
-        heard = self._hear([*speakers], [memory.speaker for memory in memories])
+        heard = [_listened(*each) for each in zip(speakers, [memory.speaker for memory in memories], strict=True)]
         return self._stepped([frame.time_s for frame in speakers], heard, memories, controls)
 
     def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[Memory], controls: Sequence[Floats] | None = None
+        self, speaker: SpeakerFrame, memories: Sequence[Memory], controls: Sequence[Floats | None] | None = None
     ) -> tuple[list[Plan], list[Memory]]:
         """`step` of streams that began together and heard the same speaker ever since; no plans between hops.
 
         As `step_each`, and the speaker is listened to once.
         """
-        heard = self._hear([speaker], [memories[0].speaker]) * len(memories)
+        heard = [_listened(speaker, memories[0].speaker)] * len(memories)
         found = self._stepped([speaker.time_s] * len(memories), heard, memories, controls)
         return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
 
@@ -187,53 +212,73 @@ class SfmsListener(RunsOnEngine):
         times_s: Sequence[float],
         heard: Sequence[SpeakerState],
         memories: Sequence[Memory],
-        controls: Sequence[Floats] | None,
+        controls: Sequence[Floats | None] | None,
     ) -> list[tuple[Plan | None, Memory]]:
         """Every stream one frame on, what its speaker did in it heard already."""
-        told = self._told(controls, len(memories))
-        tokens, path = passed(_stacked(memories, "tokens"), _stacked(memories, "path"), holds=self.holds)
-        control = later(_stacked(memories, "control"))
-        plans: list[Plan | None] = [None] * len(memories)
-        due = [row for row, memory in enumerate(memories) if memory.frames % self.hop == 0]
+        found: list[tuple[Plan | None, Memory]] = [
+            (None, changed(memory, frames=memory.frames + 1, speaker=speaker))
+            for memory, speaker in zip(memories, heard, strict=True)
+        ]
+        due = [row for row, memory in enumerate(memories) if self.is_due(memory)]
         if due:
-            speaking = [heard[row] for row in due]
-            planned = [memories[row] for row in due]
-            tokens[due] = revoked(tokens[due], control[due], told[due], self.horizon)
-            seen = _seen(speaking, tokens[due], told[due])
-            newest = [memory.frames for memory in planned]
-            tokens[due], path[due] = self.plan(seen, path[due], [memory.seed for memory in planned], newest)
-            control[due] = told[due]
-            shown = self.shown(path[due])
-            moved = [
-                self.with_sway(one, memory.sway, memory.frames + 1) for one, memory in zip(shown, planned, strict=True)
-            ]
-            for row, plan in zip(due, self._plans([times_s[row] for row in due], np.stack(moved)), strict=True):
-                plans[row] = plan
+            told = self._told([None if controls is None else controls[row] for row in due])
+            planned = self._planned([times_s[row] for row in due], [found[row][1] for row in due], told)
+            for row, each in zip(due, planned, strict=True):
+                found[row] = each
+        return found
+
+    def _planned(self, times_s: Sequence[float], memories: Sequence[Memory], told: Floats) -> list[tuple[Plan, Memory]]:
+        """Plans of streams that have heard all up to now, told (B, P + H, K), and their memories with them."""
+        tokens, path, control = self._moved_on(memories)
+        speakers, seen = self._taken_in([memory.speaker for memory in memories])
+        tokens = revoked(tokens, control, told, self.horizon)
+        newest = [memory.frames - 1 for memory in memories]
+        tokens, path = self.plan(
+            Seen(**seen, tokens=tokens, control=told), path, [memory.seed for memory in memories], newest
+        )
+        sway = _stacked([memory.sway for memory in memories])
+        plans = self._plans(times_s, self.with_sway(self.shown(path), sway, np.array(newest) + 1))
         after = [
-            Memory(memory.seed, memory.frames + 1, heard[row], tokens[row], control[row], path[row], memory.sway)
-            for row, memory in enumerate(memories)
+            changed(memory, speaker=speaker, tokens=own, control=rows, path=way)
+            for memory, speaker, own, rows, way in zip(memories, speakers, tokens, told, path, strict=True)
         ]
         return list(zip(plans, after, strict=True))
 
-    def _told(self, controls: Sequence[Floats] | None, streams: int) -> Floats:
+    def _moved_on(self, memories: Sequence[Memory]) -> tuple[Tokens, Floats, Floats]:
+        """Tokens, path and control (B, ...) of now, the frames heard since the last plan further on."""
+        tokens, path, control = (
+            _stacked([getattr(memory, name) for memory in memories]) for name in ("tokens", "path", "control")
+        )
+        since = [len(memory.speaker.sounds) for memory in memories]
+        if len(set(since)) == 1:
+            return *passed(tokens, path, since[0], self.holds), later(control, since[0])
+        for frames in set(since):
+            rows = [row for row, own in enumerate(since) if own == frames]
+            tokens[rows], path[rows] = passed(tokens[rows], path[rows], frames, self.holds)
+            control[rows] = later(control[rows], frames)
+        return tokens, path, control
+
+    def _told(self, controls: Sequence[Floats | None]) -> Floats:
         """(B, P + H, K). Raises ValueError for another shape, and where nothing is told to one that must be."""
         rows = sum(self.control_frames)
-        if controls is None and not self._columns:
-            return np.zeros((streams, self.settings.window_frames, 0), np.float32)
-        if controls is None:
+        if not self._columns and all(one is None for one in controls):
+            return np.zeros((len(controls), self.settings.window_frames, 0), np.float32)
+        told = [one for one in controls if one is not None]
+        if len(told) < len(controls):
             raise ValueError(f"this listener is told of events: control ({rows}, {self._columns}) is missing")
-        if len(controls) != streams or any(one.shape != (rows, self._columns) for one in controls):
-            shapes = ", ".join(str(one.shape) for one in controls)
-            raise ValueError(f"control has shape {shapes}, not {streams} times ({rows}, {self._columns})")
-        return np.stack(controls).astype(np.float32)
+        if any(one.shape != (rows, self._columns) for one in told):
+            shapes = ", ".join(str(one.shape) for one in told)
+            raise ValueError(f"control has shape {shapes}, not {len(told)} times ({rows}, {self._columns})")
+        return _stacked(told).astype(np.float32)
 
-    def with_sway(self, shown: Floats, sway: Doubles, first: int) -> Floats:
+    def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
         """Motion (..., N, C), standardised, of frames `first`, `first` + 1, ... -> in the model's space, with the slow
-        motion (..., 3, L, S) of each stream.
+        motion (..., 3, L, S) of each stream; `first` is of all streams, or (...) of each.
         """
         motion = shown * self._scales["motion_std"] + self._scales["motion_mean"]
         if self._head:
-            motion[..., self._head] += sway_at(sway, FRAME_S * (first + 1.0 + np.arange(shown.shape[-2])))
+            frames = np.asarray(first)[..., None] + 1.0 + np.arange(shown.shape[-2])
+            motion[..., self._head] += sway_at(sway, FRAME_S * frames)
         return motion
 
     def shown(self, path: Floats) -> Floats:
@@ -281,64 +326,82 @@ class SfmsListener(RunsOnEngine):
         """(frames, C) of a face at rest, standardised."""
         return np.repeat(self.standardise(self.space.neutral.astype(np.float32)[None]), frames, axis=0)
 
-    def _hear(self, speakers: Sequence[SpeakerFrame], before: Sequence[SpeakerState]) -> list[SpeakerState]:
-        """Of every stream, with the newest frame in place of the oldest."""
-        for speaker in speakers:
-            if len(speaker.audio) not in (0, FRAME_SAMPLES):
-                raise ValueError(
-                    f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(speaker.audio)}"
-                )
-        found = [self.frontend.step(one.audio, state.audio) for one, state in zip(speakers, before, strict=True)]
-        rows = [
-            self.standardise_sound(sound) * np.float32(len(speaker.audio) > 0)
-            for speaker, (sound, _, _) in zip(speakers, found, strict=True)
-        ]
-        voices = self.voices(
-            np.stack([np.concatenate(two) for two in zip((s.rows for s in before), rows, strict=True)])
+    def _taken_in(self, states: Sequence[SpeakerState]) -> tuple[Sequence[SpeakerState], dict[str, NDArray[Any]]]:
+        """States whose frames since the last plan are among their P; and those of all, the speaker's part of a `Seen`:
+        one speaker alone where all streams have the same.
+        """
+        if len(states) > 1 and all(state is states[0] for state in states):
+            (state,), seen = self._taken_in(states[:1])
+            return [state] * len(states), seen
+        counts = [len(state.sounds) for state in states]
+        ends: NDArray[np.int64] = np.cumsum(counts, dtype=np.int64)
+        rows, phase, audio = self.frontend.step_each(
+            [state.sounds for state in states], [state.audio for state in states]
         )
-        out = []
-        for speaker, state, (_, phase, audio), row, voice in zip(speakers, before, found, rows, voices, strict=True):
-            face, known = self._face(speaker)
-            out.append(
-                SpeakerState(
-                    audio,
-                    row,
-                    voice=_push(state.voice, voice),
-                    heard=_push(state.heard, np.bool_(len(speaker.audio) > 0)),
-                    phase=_push(state.phase, phase),
-                    face=_push(state.face, face),
-                    face_known=_push(state.face_known, np.bool_(known)),
-                )
-            )
-        return out
+        heard = np.array([len(sound) > 0 for state in states for sound in state.sounds])
+        rows = self.standardise_sound(rows.reshape(-1, *self.frontend.shape)) * heard[:, None, None].astype(np.float32)
+        face, known = self._faces([face for state in states for face in state.faces])
+        new = {
+            "face": face,
+            "face_known": known,
+            "voice": self.voices(_behind(rows, [state.rows for state in states], ends - counts)),
+            "heard": heard,
+            "phase": phase,
+        }
+        seen = {name: _pushed([getattr(state, name) for state in states], part, counts) for name, part in new.items()}
+        after = [
+            SpeakerState((), (), sound, rows[end - 1], **{name: part[row] for name, part in seen.items()})
+            for row, (sound, end) in enumerate(zip(audio, ends.tolist(), strict=True))
+        ]
+        return after, seen
 
-    def _face(self, speaker: SpeakerFrame) -> tuple[Floats, bool]:
-        """(C,) standardised, and whether it is known."""
-        if speaker.face is None or not np.isfinite(speaker.face.motion).all():
-            return np.zeros(self.space.dim, np.float32), False
-        return self.standardise(self.space.encode(speaker.face.motion[None]))[0], True
+    def _faces(self, motion: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+        """Motion (58,) of N frames, not finite where no face is known -> (N, C) standardised, and which are known."""
+        rows = _stacked(motion)
+        known: NDArray[np.bool_] = np.isfinite(rows).all(axis=1)
+        faces = np.zeros((len(rows), self.space.dim), np.float32)
+        if known.any():
+            faces[known] = self.standardise(self.space.encode(rows[known]))
+        return faces, known
 
 
-def _push(queue: NDArray[Any], new: NDArray[Any] | np.bool_) -> NDArray[Any]:
-    """(P, ...) without its oldest row and with `new` (...) as its newest."""
-    out = np.empty_like(queue)
-    out[:-1] = queue[1:]
-    out[-1] = new
+def _listened(speaker: SpeakerFrame, before: SpeakerState) -> SpeakerState:
+    """With the newest frame. Raises ValueError for another number of samples than those of a frame, or none."""
+    if len(speaker.audio) not in (0, FRAME_SAMPLES):
+        raise ValueError(f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(speaker.audio)}")
+    face = _NO_FACE if speaker.face is None else speaker.face.motion
+    sound = np.array(speaker.audio, np.float32)  # whoever gave it may use it again
+    return changed(before, sounds=(*before.sounds, sound), faces=(*before.faces, face))
+
+
+def _behind(rows: Floats, before: Sequence[Floats], begins: NDArray[np.int64]) -> Floats:
+    """Rows (N, R, bins) of N frames, each behind those of the frame before it: (N, 2R, bins). Streams begin at
+    `begins`, and theirs are `before`.
+    """
+    size = rows.shape[1]
+    out = np.empty((len(rows), 2 * size, rows.shape[2]), np.float32)
+    out[:, size:] = rows
+    out[1:, :size] = rows[:-1]
+    out[begins, :size] = before
     return out
 
 
-def _stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:
-    return np.stack([getattr(part, name) for part in parts])
+def _pushed(queues: Sequence[NDArray[Any]], new: NDArray[Any], counts: Sequence[int]) -> NDArray[Any]:
+    """Queues (P, ...) -> (N, P, ...), each with its share of `new`, as many as `counts` says, for its oldest."""
+    longest = len(queues[0])
+    out = np.empty((len(queues), *queues[0].shape), queues[0].dtype)
+    end = 0
+    for row, (queue, count) in enumerate(zip(queues, counts, strict=True)):
+        end += count
+        kept = max(longest - count, 0)
+        out[row, :kept] = queue[longest - kept :]
+        out[row, kept:] = new[end - (longest - kept) : end]
+    return out
 
 
-def _seen(speakers: Sequence[SpeakerState], tokens: Tokens, control: Floats) -> Seen:
-    """One batch; one speaker alone where all streams have the same."""
-    if all(speaker is speakers[0] for speaker in speakers):
-        speakers = speakers[:1]
-    face, known, voice, heard, phase = (
-        _stacked(speakers, name) for name in ("face", "face_known", "voice", "heard", "phase")
-    )
-    return Seen(face, known, voice, heard, phase, tokens, control)
+def _stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """(N, ...), not to be changed: of one it is that one."""
+    return parts[0][None] if len(parts) == 1 else np.concatenate(parts).reshape(len(parts), *parts[0].shape)
 
 
 def join(tail: Floats, decoded: Floats, seam: int) -> Floats:

@@ -50,9 +50,11 @@ def draw_sway(amplitude: Floats, spread: float, seed: int) -> Doubles:
 
 
 def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
-    """Sway (..., 3, L, S) at times (T,) since the stream began -> (..., T, S) in units of the motion; 0 before that."""
+    """Sway (..., 3, L, S) at times (T,) since the stream began, or (..., T) of each -> (..., T, S) in units of the
+    motion; 0 before that.
+    """
     frequency_hz, cosine, sine = (sway[..., part, :, :] for part in range(3))
-    turn = 2 * math.pi * times_s[:, None, None] * frequency_hz[..., None, :, :]  # (..., T, L, S)
+    turn = 2 * math.pi * times_s[..., None, None] * frequency_hz[..., None, :, :]  # (..., T, L, S)
     wave = cosine[..., None, :, :] * np.cos(turn) + sine[..., None, :, :] * np.sin(turn)
     begun = np.clip(times_s / EASE_S, 0, 1)
-    return np.asarray(wave.sum(-2) * (begun**2 * (3 - 2 * begun))[:, None], np.float32)
+    return np.asarray(wave.sum(-2) * (begun**2 * (3 - 2 * begun))[..., None], np.float32)
