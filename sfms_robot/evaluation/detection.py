@@ -14,9 +14,10 @@ import numpy as np
 
 from sfms_robot.corpora.compose.acting import Score, act
 from sfms_robot.corpora.compose.motions import Motions
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.signals.events import MOTION_EVENTS, find_gaze_shifts
 from sfms_robot.signals.eye_angles import directions
+from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, head_part
 
 IN_TIME_S: Final = 0.12
 LOOSE_S: Final = 0.5  # further apart is no pair at all
@@ -27,7 +28,9 @@ SIZES: Final[Mapping[str, tuple[float, ...]]] = {
     "blink": (0.0, 0.5, 0.75, 1.01),
     "smile": (0.0, 0.2, 0.3, 0.45, 0.6, 1.01),
 }
-_FULL_RAD: Final = np.radians([30.0, 20.0])  # an eye's yaw and pitch for a channel of 1
+EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])  # an eye's yaw and pitch for a channel of 1
+_EYES: Final = list(EYE_CHANNELS)
+_HEAD: Final = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
 
 
 @dataclass(frozen=True)
@@ -76,14 +79,27 @@ class Sightings:
 
 
 def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
-    """(start_s, end_s, size) of the events of a kind (`MOTION_EVENTS`) in motion (N, 58)."""
+    """(start_s, end_s, size) of the events of a kind (`MOTION_EVENTS`) in motion (N, 58).
+
+    The head goes along with a look aside and comes back: that is no nod, and what looking makes it do is left out
+    (where eyes move at all; of those that were not tracked nobody knows).
+    """
     how = MOTION_EVENTS[kind]
-    return how.find(how.signal(motion), FRAME_HZ)
+    if kind != "nod" or not motion[:, _EYES].any():
+        return how.find(how.signal(motion), FRAME_HZ)
+    rows = np.array(motion, np.float64)
+    rows[:, :3] -= head_part(gaze_rad(motion))
+    return how.find(how.signal(rows), FRAME_HZ)
+
+
+def gaze_rad(motion: Floats) -> Doubles:
+    """Motion (N, 58) -> where head and eyes together look (N, 2), yaw and pitch."""
+    return np.asarray(motion[:, _HEAD] + directions(motion, EYES_RAD).mean(axis=1), np.float64)
 
 
 def gaze_shifts(motion: Floats) -> list[float]:
     """Seconds at which head and eyes together, of motion (N, 58), go elsewhere."""
-    gaze = motion[:, [2, 1]] + directions(motion, _FULL_RAD).mean(axis=1)
+    gaze = gaze_rad(motion)
     return find_gaze_shifts(gaze[:, 0], gaze[:, 1], FRAME_HZ)
 
 

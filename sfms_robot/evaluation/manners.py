@@ -12,11 +12,10 @@ from typing import Final
 import numpy as np
 from scipy.signal import welch
 
+from sfms_robot.evaluation.detection import gaze_rad, seen
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats
 from sfms_robot.signals import events
-from sfms_robot.signals.eye_angles import directions
 
-EYES_RAD: Final = np.radians([30.0, 20.0])  # an eye's yaw and pitch for a channel of 1
 ON_PERSON_RAD: Final = np.deg2rad(5.0)
 FIXATION_RAD: Final = np.deg2rad(2.0)  # a look ends when gaze has gone that far from where it began
 SHIFT_RAD: Final = np.deg2rad(5.0)
@@ -24,7 +23,6 @@ SWAY_BANDS_HZ: Final = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.4))
 SWAY_WINDOW: Final = 20 * FRAME_HZ
 SLOW: Final = 10 * FRAME_HZ  # frames of which the median is a slow pose
 FindEvents = Callable[[Floats, float], Sequence[events.Event]]
-_HEAD: Final = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def manners(motions: Sequence[Floats], addressed: Sequence[events.Bools]) -> Man
     nods = [
         (size, end - start, _swings(motion, start, end))
         for motion in motions
-        for start, end, size in events.find_nods(motion[:, CHANNEL_INDEX["pitch"]], FRAME_HZ)
+        for start, end, size in seen(motion, "nod")
     ]
     gazes = [gaze_rad(motion) for motion in motions]
     minutes = sum(map(len, motions)) / FRAME_HZ / 60
@@ -87,11 +85,6 @@ def _swings(motion: Floats, start_s: float, end_s: float) -> float:
     pitch = motion[int(start_s * FRAME_HZ) : int(end_s * FRAME_HZ) + 2, CHANNEL_INDEX["pitch"]].astype(np.float64)
     turns = np.diff(np.sign(np.diff(pitch)))
     return max(1.0, round(float(np.count_nonzero(turns)) / 2))
-
-
-def gaze_rad(motion: Floats) -> Doubles:
-    """Motion (N, 58) -> where head and eyes together look (N, 2), yaw and pitch."""
-    return np.asarray(motion[:, _HEAD] + directions(motion, EYES_RAD).mean(axis=1), np.float64)
 
 
 def looks_s(gaze: Doubles) -> list[float]:

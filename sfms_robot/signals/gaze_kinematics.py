@@ -131,6 +131,20 @@ def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[
     return *found, states
 
 
+def head_part(gaze_rad: ArrayLike) -> Floats:
+    """Directions of gaze (N, 2), yaw and pitch -> what looking there makes the head do (N, 3), of somebody usual.
+
+    It tells looks from what the head does besides. What is not finite counts as straight ahead.
+    """
+    gaze = np.nan_to_num(np.asarray(gaze_rad, np.float64), posinf=0.0, neginf=0.0)
+    if not len(gaze):
+        return np.zeros((0, 3), np.float32)
+    yaw, pitch = gaze[0].tolist()
+    state = changed(start(0, wanders=False), share=sum(_SHARES) / 2, target_rad=(yaw, pitch), gaze_rad=(yaw, pitch))
+    head, _, _ = follow(gaze, np.zeros((len(gaze), 6)), state)
+    return head
+
+
 def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...], tuple[float, ...], GazeState]:
     """The head's part, the eyes, as in a `GazeFrame`, and the state after them."""
     state = _aimed(target, state)

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from sfms_robot.evaluation.manners import SWAY_BANDS_HZ, gaze_rad, looks_s, manners, shifts, slow_poses_deg, sway_db
+from sfms_robot.evaluation.detection import gaze_rad
+from sfms_robot.evaluation.manners import SWAY_BANDS_HZ, looks_s, manners, shifts, slow_poses_deg, sway_db
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, MOTION_DIM
 
 
