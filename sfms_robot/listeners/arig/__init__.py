@@ -70,6 +70,6 @@ def export_graphs(folder: Path, out: Path, int8: bool = False) -> list[Path]:
 
     settings = _settings(folder)
     model = ArigModel(settings).eval()
-    layers = [*fast.large_layers(model), *fast.SAMPLER_LAYERS] if int8 else []
+    layers = fast.large_layers(model) if int8 else []
     wanted = networks(model, kept=False)
     return export(out, settings, model, wanted, examples(settings, EXAMPLE_STREAMS), dict.fromkeys(wanted, layers))

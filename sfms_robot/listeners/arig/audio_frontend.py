@@ -6,6 +6,7 @@ silent. wav2vec2 features (768), where the data brings them, take the place of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,9 +15,11 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_SAMPLES, Floats
 from sfms_robot.signals import mel, phase, voice_activity
+from sfms_robot.signals.audio import energies_db
 
 MEL_WIDTH: Final = mel.ROWS_PER_FRAME * mel.MEL_BINS
 WIDTHS: Final = {"mel": MEL_WIDTH + phase.FEATURES, "wav2vec2": 768 + phase.FEATURES}  # numbers per frame
+_SILENCE: Final = np.zeros(FRAME_SAMPLES, np.float32)
 
 
 @dataclass(frozen=True)
@@ -42,15 +45,24 @@ def hear(samples: Floats | None, before: AudioState) -> tuple[Floats, bool, Audi
 
     Samples that are not finite are silence. Raises ValueError for another length.
     """
-    present = samples is not None and len(samples) > 0
-    if samples is None or not present:
-        samples = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-    if len(samples) != FRAME_SAMPLES:
-        raise ValueError(f"a frame at 16000 Hz has {FRAME_SAMPLES} samples or none, got {len(samples)}")
-    clean = _finite(samples)
-    rows, past = mel.log_mel(clean, before.past)
-    spoken, state = phase.step(clean, before.phase)
-    return np.concatenate([rows.reshape(-1), spoken]), present, AudioState(past, state)
+    features, (present,), (after,) = hear_each([samples], [before])
+    return features[0], present, after
+
+
+def hear_each(
+    samples: Sequence[Floats | None], before: Sequence[AudioState]
+) -> tuple[Floats, list[bool], list[AudioState]]:
+    """`hear` of N tracks, one frame of each -> features (N, 533), which are present, and the next states."""
+    present = [each is not None and len(each) > 0 for each in samples]
+    clean = [_SILENCE if each is None or not len(each) else _finite(each) for each in samples]
+    for each in clean:
+        if len(each) != FRAME_SAMPLES:
+            raise ValueError(f"a frame at 16000 Hz has {FRAME_SAMPLES} samples or none, got {len(each)}")
+    rows, pasts = mel.log_mel_each(clean, [state.past for state in before])
+    levels_db = [[level] for level in energies_db(np.stack(clean))]
+    spoken, phases = phase.step_each(levels_db, [state.phase for state in before])
+    features = np.concatenate([rows.reshape(len(clean), MEL_WIDTH), spoken], axis=1)
+    return features, present, [*map(AudioState, pasts, phases)]
 
 
 def track(samples: Floats) -> tuple[Floats, NDArray[np.bool_]]:

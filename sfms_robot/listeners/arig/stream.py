@@ -162,13 +162,13 @@ class ArigListener(RunsOnEngine):
 
         As `step_each`, and the speaker is listened to once.
         """
-        found = self._stepped([speaker] * len(memories), memories, controls, [self._hear(speaker, memories[0])])
+        found = self._stepped([speaker] * len(memories), memories, controls, self._hear([speaker], memories[:1]))
         return [plan for plan, _ in found], [memory for _, memory in found]
 
     def condition(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Floats, Memory]:
         """What the sampler is told of the next frame, (1, its width), and the memory but for what is to be drawn."""
         rows = self._rows(None if control is None else [control], 1)
-        z, _, (now,) = self._conditions([self._hear(speaker, memory)], [memory], rows)
+        z, _, (now,) = self._conditions(self._hear([speaker], [memory]), [memory], rows)
         return z, now
 
     def standardise(self, motion: Floats) -> Floats:
@@ -185,7 +185,7 @@ class ArigListener(RunsOnEngine):
         """Every stream one frame on. `heard`: what all of them heard, if that was worked out already."""
         rows = self._rows(controls, len(memories))
         if heard is None:
-            heard = [self._hear(speaker, memory) for speaker, memory in zip(speakers, memories, strict=True)]
+            heard = self._hear(speakers, memories)
         elif len(heard) < len(memories):
             heard = [*heard] * len(memories)
         z, logits, now = self._conditions(heard, memories, rows)
@@ -268,14 +268,19 @@ class ArigListener(RunsOnEngine):
             )
         return rows.reshape(streams, -1)
 
-    def _hear(self, speaker: SpeakerFrame, memory: Memory) -> Heard:
-        """Both people in the newest frame."""
-        user, heard, user_voice = audio_frontend.hear(speaker.audio, memory.user_voice)
-        agent, says, agent_voice = audio_frontend.hear(
-            audio_frontend.fit_frame(speaker.agent_audio), memory.agent_voice
-        )
-        face, seen = self._face(speaker)
-        return Heard(np.stack([user, agent]), np.array([heard, says]), face, seen, user_voice, agent_voice)
+    def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[Memory]) -> list[Heard]:
+        """Both people in the newest frame of each stream."""
+        samples, voices = [], []
+        for speaker, memory in zip(speakers, memories, strict=True):
+            samples += [speaker.audio, audio_frontend.fit_frame(speaker.agent_audio)]
+            voices += [memory.user_voice, memory.agent_voice]
+        sounds, present, voices = audio_frontend.hear_each(samples, voices)
+        here = np.array(present).reshape(-1, 2)
+        sounds = sounds.reshape(len(speakers), 2, -1)
+        return [
+            Heard(*each, *self._face(speaker), user, agent)
+            for speaker, *each, user, agent in zip(speakers, sounds, here, voices[::2], voices[1::2], strict=True)
+        ]
 
     def _frame_inputs(self, heard: Sequence[Heard], memories: Sequence[Memory], rows: Floats) -> list[NDArray[Any]]:
         """What the network `frame` takes."""

@@ -62,6 +62,13 @@ def test_sampler_and_small_layers_stay_exact():
     assert integers(fast.with_precision(arig_model(), "int8")) == []  # 16 wide
 
 
+def test_graphs_have_the_blocks_of_the_sampler_in_integers_too():
+    diffusion = {"width": 256, "steps": 4, "train_steps": 50, "blocks": 1}
+    exact = {f"{name}.weight" for name in integers(fast.with_precision(arig_model(**MIDDLE), "int8"))}
+    found = set(fast.large_layers(arig_model(**MIDDLE, diffusion=diffusion)))
+    assert found - exact == {"head.modulation.linear.weight", "head.up.0.weight", "head.down.0.weight"}
+
+
 def test_a_repeat_of_a_frame_is_exact():
     quick = arig_listener(**MIDDLE)
     memory = quick.start(1)
