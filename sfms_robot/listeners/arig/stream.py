@@ -275,11 +275,10 @@ class ArigListener(RunsOnEngine):
             samples += [speaker.audio, audio_frontend.fit_frame(speaker.agent_audio)]
             voices += [memory.user_voice, memory.agent_voice]
         sounds, present, voices = audio_frontend.hear_each(samples, voices)
-        here = np.array(present).reshape(-1, 2)
-        sounds = sounds.reshape(len(speakers), 2, -1)
+        here = np.array(present)
         return [
-            Heard(*each, *self._face(speaker), user, agent)
-            for speaker, *each, user, agent in zip(speakers, sounds, here, voices[::2], voices[1::2], strict=True)
+            Heard(sounds[at : at + 2], here[at : at + 2], *self._face(speaker), voices[at], voices[at + 1])
+            for at, speaker in zip(range(0, len(samples), 2), speakers, strict=True)
         ]
 
     def _frame_inputs(self, heard: Sequence[Heard], memories: Sequence[Memory], rows: Floats) -> list[NDArray[Any]]:
