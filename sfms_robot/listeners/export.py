@@ -81,7 +81,9 @@ def _graph(network: nn.Module, example: Mapping[str, Tensor], several: bool) -> 
     except ImportError as error:
         raise MissingExtra.of("sfms-robot export", "export") from error
     streams = torch.export.Dim("streams", min=1, max=MOST_STREAMS)
-    dynamic = _like_arguments(network, [{0: streams} for _ in example]) if several else None
+    free = torch.export.Dim("free", min=1, max=MOST_STREAMS)
+    also = {name: {1: free} for name in getattr(network, "free", ())}
+    dynamic = _like_arguments(network, [{0: streams} | also.get(name, {}) for name in example]) if several else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         quiet = logging.getLogger("torch.onnx")

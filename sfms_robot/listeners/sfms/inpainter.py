@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot.listeners.layers import Block, sinusoidal
-from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Neighbours
+from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 
 
@@ -47,26 +47,32 @@ class Inpainter(nn.Module):
             nn.init.zeros_(self.out.weight)
             nn.init.zeros_(self.out.bias)
 
-    def forward(self, codes: Tensor, mask: Tensor, quantizer: Quantizer, last: int | None = None) -> Tensor:
+    def forward(
+        self,
+        codes: Tensor,
+        mask: Tensor,
+        quantizer: Quantizer,
+        last: int | None = None,
+        around: Around | None = None,
+    ) -> Tensor:
         """codes (B, T, G, D), read where mask (B, T, G) is 1 -> motion (B, T, C), standardised.
 
-        `last`: only so many frames at the end are wanted, (B, last, C).
+        `last`: only so many frames at the end are wanted, (B, last, C). `around`: where the mask is 1, for who knows.
         """
-        neighbours = Neighbours.in_mask(mask, self.ramp)
+        if around is None:
+            neighbours = Neighbours.in_mask(mask, self.ramp)
+        else:
+            neighbours = Neighbours.at(around.before, around.after, self.ramp)
         places = sinusoidal(mask.shape[1], self.width).to(codes)
         # Multiplying by the mask is where learned placement gets its gradient: forward it changes nothing.
         keyed = codes * mask[..., None]
         z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places
-        seen = (mask > 0.5).any(-1)
-        seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
         # Other frames are neither looked at nor kept; but a gradient, which learned placement needs, passes there.
-        every = torch.arange(seen.shape[1], device=seen.device)
-        whole = torch.is_grad_enabled() or torch.compiler.is_exporting()  # how many there are is not known in a graph
-        keys = every if whole else seen.any(0).nonzero()[:, 0]
-        seen, z_keys = seen[:, keys], z_kf[:, keys]
+        rows, seen, found = _every(mask) if around is None else around[2:]
+        z_keys = z_kf.flatten(0, 1)[rows]
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
-        z_kf = torch.zeros_like(z_kf).index_copy(1, keys, z_keys * mask[:, keys].amax(-1, keepdim=True))
+        z_kf = z_keys.flatten(0, 1)[found] * mask.amax(-1, keepdim=True)
         between = neighbours.interpolate(keyed)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
         z_tf = self.transition_in(query) + places
@@ -85,3 +91,17 @@ class Inpainter(nn.Module):
     def _straight(codes: Tensor, neighbours: Neighbours, quantizer: Quantizer) -> Tensor:
         """Lines between the decoded keyframes (B, T, C), each channel between those of its own group."""
         return quantizer.by_channel(neighbours.interpolate(quantizer.decoder(codes)))
+
+
+def _every(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`Around.rows`, `seen` and `places` of a mask (B, T, G) with every frame among the keyframes of its window; where
+    no gradient is asked for, those alone that are one in any window.
+    """
+    seen = (mask > 0.5).any(-1)
+    seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
+    windows, frames = seen.shape
+    frame = torch.arange(frames, device=mask.device)
+    keys = frame if torch.is_grad_enabled() else seen.any(0).nonzero()[:, 0]
+    window = torch.arange(windows, device=mask.device)[:, None]
+    place = torch.zeros_like(frame).index_copy(0, keys, torch.arange(len(keys), device=mask.device))
+    return window * frames + keys, seen[:, keys], window * len(keys) + place

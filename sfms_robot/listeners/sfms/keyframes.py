@@ -17,6 +17,7 @@ Tokens = NDArray[np.int64]
 UNDECIDED: Final = -1
 KEPT_FRAMES: Final = 1  # of the future, whatever is told
 SAME: Final = 1e-5  # what is told of a frame differs by more, or does not
+KEYS_STEP: Final = 8
 NEUTRAL_STRIDE: Final = 8  # frames between the keyframes of the neutral face a stream begins with
 
 
@@ -45,6 +46,25 @@ def last_keyframes(tokens: Tokens) -> LastKeyframes:
     at = np.stack([last, before], axis=-1)
     found = [np.take_along_axis(tokens, np.maximum(each, 0), 1) for each in (last, before)]
     return LastKeyframes(np.where(at < 0, 0, np.stack(found, axis=-1)), at)
+
+
+def around(tokens: Tokens) -> tuple[NDArray[Any], ...]:
+    """The parts of `neighbours.Around` of tokens (B, T, G): where each frame's keyframes are, and which frames are any.
+
+    A window without any looks at all of its frames. K is as many as the fullest window has, up to the next whole
+    `KEYS_STEP`: engines prepare themselves for every K that they meet.
+    """
+    windows, frames, _ = tokens.shape
+    key, frame = tokens > 0, np.arange(frames)[:, None]
+    before = np.maximum.accumulate(np.where(key, frame, -1), axis=1)
+    after = np.ascontiguousarray(np.minimum.accumulate(np.where(key, frame, frames)[:, ::-1], axis=1)[:, ::-1])
+    seen: NDArray[np.bool_] = np.asarray(key.any(-1))
+    seen[~seen.any(-1)] = True
+    counts, window = seen.sum(-1, keepdims=True), np.arange(windows)[:, None]
+    most = min(-(-int(counts.max()) // KEYS_STEP) * KEYS_STEP, frames)
+    rows = np.argsort(~seen, axis=1, kind="stable")[:, :most] + window * frames
+    places = np.maximum(seen.cumsum(-1) - 1, 0) + window * most
+    return before, after, rows, np.arange(most) < counts, places
 
 
 def neutral_mask(frames: int, groups: int) -> Floats:

@@ -11,6 +11,7 @@ from sfms_robot import config
 from sfms_robot.listeners.sfms.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms.channels import head_channels
 from sfms_robot.listeners.sfms.inpainter import Inpainter
+from sfms_robot.listeners.sfms.neighbours import Around
 from sfms_robot.listeners.sfms.placement import Strategy, place
 from sfms_robot.listeners.sfms.predictor import Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
@@ -78,14 +79,17 @@ class Tokenizer(nn.Module):
         indices = self.quantizer.indices(self.quantizer.encode(motion))
         return torch.where(mask > 0.5, indices + 1, 0)
 
-    def decode(self, tokens: Tensor, last: int | None = None) -> Tensor:
-        """Motion (B, T, C) of tokens (B, T, G), or of the `last` frames alone; a token below 0 counts as transition."""
-        codes = self.quantizer.codes((tokens - 1).clamp(min=0))
-        return self.inpaint(codes, (tokens > 0).float(), last)
+    def decode(self, tokens: Tensor, last: int | None = None, around: Around | None = None) -> Tensor:
+        """Motion (B, T, C) of tokens (B, T, G), or of the `last` frames alone; a token below 0 counts as transition.
 
-    def inpaint(self, codes: Tensor, mask: Tensor, last: int | None = None) -> Tensor:
+        `around`: what there is around every frame, for who knows.
+        """
+        codes = self.quantizer.codes((tokens - 1).clamp(min=0))
+        return self.inpaint(codes, (tokens > 0).float(), last, around)
+
+    def inpaint(self, codes: Tensor, mask: Tensor, last: int | None = None, around: Around | None = None) -> Tensor:
         """Motion (B, T, C) of codes (B, T, G, D) at a mask (B, T, G), or of the `last` frames alone."""
-        out: Tensor = self.inpainter(codes, mask, self.quantizer, last)
+        out: Tensor = self.inpainter(codes, mask, self.quantizer, last, around)
         return out
 
 

@@ -4,12 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-BEYOND = 1e4  # frames, more than any window has
 POSITION_BITS = 6  # distances to the neighbouring keyframes up to 63 frames, as binary digits
+
+
+class Around(NamedTuple):
+    """What `keyframes.around` finds in tokens (B, T, G) before a network sees them; the same here as tensors.
+
+    Attributes:
+        before, after: (B, T, G) as `Neighbours.at` wants them.
+        rows: (B, K) frames that hold a keyframe of any group, as rows of (B * T).
+        seen: (B, K) which of those count.
+        places: (B, T) where each frame is among them, as a row of (B * K); anything for frames that are not.
+    """
+
+    before: Tensor
+    after: Tensor
+    rows: Tensor
+    seen: Tensor
+    places: Tensor
 
 
 @dataclass(frozen=True)
@@ -38,8 +55,15 @@ class Neighbours:
         t = mask.shape[1]
         frame = torch.arange(t, device=mask.device)[:, None]
         key = mask > 0.5
-        before = _highest_so_far(torch.where(key, frame, -1))
-        after = t - 1 - _highest_so_far(torch.where(key, t - 1 - frame, -1).flip(1)).flip(1)
+        before = torch.where(key, frame, -1).cummax(1).values
+        after = t - 1 - torch.where(key, t - 1 - frame, -1).flip(1).cummax(1).values.flip(1)
+        return cls.at(before, after, ramp)
+
+    @classmethod
+    def at(cls, before: Tensor, after: Tensor, ramp: int | None = None) -> Neighbours:
+        """From the keyframes (B, T, G) at or before each frame, -1 for none, and at or after it, T for none."""
+        t = before.shape[1]
+        frame = torch.arange(t, device=before.device)[:, None]
         has_before, has_after = before >= 0, after < t
         return cls(
             frame,
@@ -86,13 +110,3 @@ class Neighbours:
         bits = (torch.stack([self.since, self.until], dim=-1)[..., None] & powers) > 0
         ends = torch.stack([self.has_before.to(self.weight), self.has_after.to(self.weight), self.weight], dim=-1)
         return torch.cat([bits.flatten(-2).to(ends), ends], dim=-1)
-
-
-def _highest_so_far(numbers: Tensor) -> Tensor:
-    """Running maximum along the frames of (B, T, G)."""
-    if not torch.compiler.is_exporting():
-        return numbers.cummax(1).values
-    t = numbers.shape[1]  # cummax is not known to ONNX
-    to_come = torch.full((t, t), -BEYOND).triu(1)  # [t, s]: frame s is after frame t
-    found = numbers.float().transpose(1, 2)[:, :, None] + to_come  # (B, G, T, T), exact: numbers of frames
-    return found.amax(-1).transpose(1, 2).long()

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
 from sfms_robot.listeners.sfms.audio_frontend import SHAPES
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED, neutral_mask
+from sfms_robot.listeners.sfms.keyframes import KEYS_STEP, UNDECIDED, around, neutral_mask
 from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.neighbours import Around
 from sfms_robot.listeners.sfms.predictor import Context, LastKeyframes
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
@@ -22,7 +24,13 @@ from sfms_robot.signals.phase import FEATURES
 
 
 class Network(nn.Module):
-    """Of one model: its weights keep their names in model.safetensors, behind "model."."""
+    """Of one model: its weights keep their names in model.safetensors, behind "model.".
+
+    Attributes:
+        free: inputs of (B, K, ...), K any number but the same for all of them.
+    """
+
+    free: tuple[str, ...] = ()
 
     def __init__(self, model: SfmsModel, settings: config.Sfms) -> None:
         super().__init__()
@@ -86,9 +94,16 @@ class Next(Network):
 class Decode(Network):
     """Tokens as motion."""
 
-    def forward(self, tokens: Tensor) -> tuple[Tensor]:
-        """tokens (B, P + H, G) -> motion (B, 2 + H, C), standardised: two frames up to now, and the future."""
-        return (self.model.tokenizer.decode(tokens, last=self.future + 2),)
+    free = ("rows", "seen")
+
+    def forward(
+        self, tokens: Tensor, before: Tensor, after: Tensor, rows: Tensor, seen: Tensor, places: Tensor
+    ) -> tuple[Tensor]:
+        """tokens (B, P + H, G) and the parts of their `Around` -> motion (B, 2 + H, C), standardised: two frames up to
+        now, and the future.
+        """
+        found = Around(before, after, rows, seen, places)
+        return (self.model.tokenizer.decode(tokens, last=self.future + 2, around=found),)
 
 
 @torch.no_grad()
@@ -139,5 +154,12 @@ def examples(settings: config.Sfms, streams: int) -> Mapping[str, dict[str, Tens
             "at": recent[:, 0] - 1,
             "frame": torch.full((b,), p - 1),
         },
-        "decode": {"tokens": tokens},
+        "decode": dict(zip(("tokens", *Around._fields), (tokens, *_blank(b, window, groups)), strict=True)),
     }
+
+
+def _blank(streams: int, window: int, groups: int) -> Around:
+    """Of tokens that are some keyframes, for an example."""
+    tokens = np.ones((streams, window, groups), np.int64)
+    tokens[:, KEYS_STEP:] = 0
+    return Around(*map(torch.from_numpy, around(tokens)))

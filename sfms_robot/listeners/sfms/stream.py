@@ -35,7 +35,7 @@ from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
 from sfms_robot.listeners.sfms.channels import HEAD, head_channels
 from sfms_robot.listeners.sfms.draw import Sampler, Seen
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, later, neutral_mask, passed, revoked
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
 from sfms_robot.listeners.sfms.reachable import Reach
 from sfms_robot.listeners.sfms.sway import draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
@@ -307,7 +307,7 @@ class SfmsListener(RunsOnEngine):
         `newest`: the frame that each has heard last, from 0 at its beginning.
         """
         tokens = self.sampler.draw(seen, seeds, [frame + self.horizon for frame in newest])
-        (decoded,) = self.engine.run("decode", tokens)
+        (decoded,) = self.engine.run("decode", tokens, *around(tokens))
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
     def voices(self, rows: Floats) -> Floats:

@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.listeners.sfms.inpainter import Inpainter
-from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Neighbours
+from sfms_robot.listeners.sfms.keyframes import around
+from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 
 MEMBER = torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
@@ -64,6 +65,24 @@ def test_without_a_gradient_frames_that_are_no_keyframes_are_left_out_and_nothin
     whole = inpainter(codes, mask, quantizer)
     with torch.no_grad():
         torch.testing.assert_close(inpainter(codes, mask, quantizer), whole)
+
+
+@pytest.mark.parametrize("frames", [5, 20, 43])
+def test_what_is_found_in_tokens_before_a_network_sees_them_is_what_is_around_them(frames):
+    quantizer, inpainter = parts(layers=2)
+    torch.nn.init.normal_(inpainter.out.weight)
+    codes, mask = quantizer.encode(torch.randn(3, frames, 3)), torch.zeros(3, frames, 2)
+    mask[:2] = some_mask(frames)  # the third window has no keyframe at all
+    found = Around(*map(torch.from_numpy, around(mask.long().numpy())))
+    near, expected = Neighbours.at(found.before, found.after), Neighbours.in_mask(mask)
+    assert torch.equal(near.before, expected.before) and torch.equal(near.after, expected.after)
+    assert found.rows.shape[1] == frames and found.seen.any(1).all()
+    torch.testing.assert_close(inpainter(codes, mask, quantizer, None, found), inpainter(codes, mask, quantizer))
+    some = Around(*map(torch.from_numpy, around(mask[:2].long().numpy())))
+    assert some.rows.shape[1] in (frames, 8, 16, 24)
+    torch.testing.assert_close(
+        inpainter(codes[:2], mask[:2], quantizer, None, some), inpainter(codes, mask, quantizer)[:2]
+    )
 
 
 def test_every_keyframe_and_every_mask_entry_gets_a_gradient():

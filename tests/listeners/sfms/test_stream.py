@@ -115,6 +115,33 @@ def test_memory_is_not_changed(tiny):
                 np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 
+def test_who_gave_a_frame_may_use_its_arrays_again(tiny):
+    speaker = speech(13)
+    kept, memory = plans_of(tiny, speaker), tiny.start(1)
+    buffer = speech(1)[0]
+    for index, frame in enumerate(speaker):
+        buffer.audio[:], buffer.face.pose[:], buffer.face.blendshapes[:] = (
+            frame.audio, frame.face.pose, frame.face.blendshapes,
+        )  # fmt: skip
+        plan, memory = tiny.step(dataclasses.replace(buffer, time_s=frame.time_s), memory)
+        if plan is not None:
+            np.testing.assert_array_equal(plan.frames, kept[index].frames)
+
+
+def test_streams_begun_at_different_times_are_planned_together_as_each_alone(tiny):
+    speaker, ages = speech(21), (0, 4, 8)
+    alone = [plans_of(tiny, speaker[age:], seed) for seed, age in enumerate(ages)]
+    memories = [tiny.start(seed) for seed in range(len(ages))]
+    for index in range(len(speaker)):
+        here = [row for row, age in enumerate(ages) if index >= age]
+        found = tiny.step_each([speaker[index]] * len(here), [memories[row] for row in here])
+        for row, (plan, memory) in zip(here, found, strict=True):
+            memories[row] = memory
+            assert (plan is None) == (index - ages[row] not in alone[row])
+            if plan is not None:
+                np.testing.assert_allclose(plan.frames, alone[row][index - ages[row]].frames, atol=1e-5)
+
+
 def test_streams_side_by_side_do_what_each_does_alone(tiny):
     speaker, seeds = speech(21), (1, 2, 3)
     alone = [plans_of(tiny, speaker, seed) for seed in seeds]
