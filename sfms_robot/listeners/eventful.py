@@ -29,7 +29,7 @@ from typing import Any, Final, Protocol, Self, cast
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, Plan, SpeakerFrame, changed
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Floats, ListenerEvent, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.events.model import Decision, EventMemory, EventModel
 from sfms_robot.listeners.idle_motion import IdleMotion, IdleStream
 from sfms_robot.signals import gaze_kinematics
@@ -37,7 +37,7 @@ from sfms_robot.signals.control import control_track
 from sfms_robot.signals.gaze_kinematics import GazeState
 
 EYES: Final = list(gaze_kinematics.EYE_CHANNELS)
-AT_THE_PERSON: Final = np.zeros(2)
+AT_THE_PERSON: Final = (0.0, 0.0)
 TURNED_RAD: Final = np.deg2rad(60.0)
 MOVED_M: Final = 1.0
 
@@ -232,10 +232,12 @@ def frame_of(speaker: SpeakerFrame) -> int:
     return round(speaker.time_s * FRAME_HZ) - 1
 
 
-def target_at(events: Sequence[ListenerEvent], time_s: float) -> Doubles:
+def target_at(events: Sequence[ListenerEvent], time_s: float) -> tuple[float, float]:
     """(yaw, pitch) [rad] of the last gaze shift that has begun by `time_s`; at the person before the first."""
-    begun = [event for event in events if event.target_rad is not None and event.start_s <= time_s + 1e-9]
-    return np.array(begun[-1].target_rad) if begun else AT_THE_PERSON
+    for event in reversed(events):
+        if event.target_rad is not None and event.start_s <= time_s + 1e-9:
+            return event.target_rad
+    return AT_THE_PERSON
 
 
 def _remembered(events: tuple[ListenerEvent, ...], keep_s: float) -> tuple[ListenerEvent, ...]:

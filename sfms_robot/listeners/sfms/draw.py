@@ -150,7 +150,7 @@ def sample(logits: Floats, bias: Floats, nucleus: Floats, chance: Doubles) -> To
     likely = np.exp(biased, out=biased)
     shares = likely.reshape(-1, likely.shape[-1])  # (R, V), a row for every draw
     shares /= shares.sum(-1, keepdims=True)
-    within = np.broadcast_to(nucleus, likely.shape[:-1]).reshape(-1, 1)
+    within = (nucleus + np.zeros(likely.shape[:-1], np.float32)).reshape(-1, 1)  # broadcast
     values, classes = _sorted(shares, NEEDED * (1 - within) / shares.shape[-1])
     mass = values.cumsum(-1)
     kept = ((mass - values) < within).sum(-1)
@@ -167,7 +167,7 @@ def _sorted(shares: Floats, least: NDArray[np.floating]) -> tuple[Floats, NDArra
     Rows of fewer end in shares of 0. Of V classes that hold a nucleus none has less than a V-th of what is left
     outside: what is below that need not be sorted.
     """
-    rows, found = np.nonzero(shares >= least)
+    rows, found = np.divmod(np.flatnonzero(shares >= least), shares.shape[-1])
     counts = np.bincount(rows, minlength=len(shares))
     place = np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]
     # Bits of floats that are not negative rise as they do. Counted down, with the class behind them, they are numbers
