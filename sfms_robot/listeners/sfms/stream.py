@@ -7,6 +7,8 @@ what the tokens were drawn under: from the first future frame on for which that 
 the next frame's, which servos are already under way to. What is behind the last keyframe drawn is an extrapolation,
 which the next plan may correct: it starts where the motion was, at the speed it had, and the difference fades over
 `seam_frames`.
+
+Between plans nothing is computed: frames are kept, and become features with the next plan, all of them at once.
 """
 
 from __future__ import annotations
