@@ -68,6 +68,8 @@ class ArigPhase(Phase):
             other, for listeners that are told of them: smiles are rare.
         drop_audio, drop_face: share of windows in which the user is not heard, not seen; drop_agent: of those in which
             the agent says nothing, that have no agent's track.
+        quiet_room: share of windows in which what the user's microphone has besides speech is weaker, down to that of a
+            gate that is shut; silent_user: share in which it has nothing at all. No recording is as silent as that.
         gain_db: most that either track is louder or softer; colour_db: most that its bands are, smoothly from low to
             high, as another microphone has it; grain_db: deviation of every band of every row.
         stages: the curriculum, in order; shares add up to 1.
@@ -85,6 +87,8 @@ class ArigPhase(Phase):
     drop_audio: Share = 0.1
     drop_face: Share = 0.3
     drop_agent: Share = 0.5
+    quiet_room: Share = 0.0
+    silent_user: Share = 0.0
     gain_db: NonNegative = 6.0
     colour_db: NonNegative = 6.0
     grain_db: NonNegative = 2.0

@@ -101,6 +101,7 @@ ARIG = {
     "4.1: sounds and faces as they were": lambda one: (
         not (one.training.drop_audio or one.training.drop_face or one.training.drop_agent)
         and not (one.training.gain_db or one.training.colour_db or one.training.grain_db or one.training.event_windows)
+        and not (one.training.quiet_room or one.training.silent_user)
     ),
     "(4): ancestral sampling, nothing scaled or clamped": lambda one: (
         one.listener.diffusion.sampler == "ddpm"

@@ -36,12 +36,13 @@ from sfms_robot.learning.arig.losses import (
 from sfms_robot.learning.arig.trainer import draw, starts_by_event, train_arig, weights_of
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
-from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS
+from sfms_robot.listeners.arig import audio_frontend
+from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS, hear
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sojourns import FIRST, NODDING
 from sfms_robot.listeners.arig.told import features
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.mel import LN_PER_DB
+from sfms_robot.signals.mel import FLOOR, LN_PER_DB
 
 ARKIT = MotionSpace("arkit58", np.zeros(58))
 WINDOW = 24
@@ -176,6 +177,36 @@ def test_without_augmentation_windows_stay_as_they_are(corpus):
     assert torch.equal(truth, told.agent_motion)
     for name in ("user_sound", "agent_sound", "user_heard", "agent_motion", "voiced"):
         assert torch.equal(getattr(found, name), getattr(told, name))
+
+
+def test_a_quiet_room_takes_from_what_is_no_speech_down_to_digital_silence(corpus):
+    starts = corpus.starts_by_scene(WINDOW)["interaction"]
+    heard = cut(corpus, starts, WINDOW).voiced[..., 1].float().mean(1)
+    told = cut(corpus, starts[heard.sub(0.5).abs().argmin()].repeat(200), WINDOW)  # now speech, now none
+    room = torch.zeros_like(told.user_sound)
+    room[..., :MEL_WIDTH] = 3.0
+    told = replace(told, user_sound=told.user_sound + room)
+    found, _ = augment(told, a_student().model, quiet(quiet_room=1), torch.Generator().manual_seed(0))
+    voiced, floor = told.voiced[..., 1], np.log(FLOOR)
+    assert voiced.any() and not voiced.all() and torch.equal(found.user_sound[voiced], told.user_sound[voiced])
+    before, after = (each.user_sound[..., :MEL_WIDTH][~voiced] - floor for each in (told, found))
+    left = after.sum(-1) / before.sum(-1)
+    assert (after <= before + 1e-5).all() and (after > -1e-2).all()
+    assert float(left.min()) < 0.05 and float(left.max()) > 0.95
+    assert torch.equal(found.user_sound[..., MEL_WIDTH:], told.user_sound[..., MEL_WIDTH:])
+    assert torch.equal(found.agent_sound, told.agent_sound) and torch.equal(found.voiced, told.voiced)
+
+
+def test_a_silent_user_is_heard_as_a_stream_hears_silence(corpus):
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][::9][:10], WINDOW)
+    found, _ = augment(told, a_student().model, quiet(silent_user=1), torch.Generator().manual_seed(0))
+    state, heard = audio_frontend.start(), []
+    for _ in range(WINDOW):
+        sound, _, state = hear(np.zeros(FRAME_SAMPLES, np.float32), state)
+        heard.append(sound)
+    assert torch.equal(found.user_sound, torch.from_numpy(np.stack(heard)).expand(10, -1, -1))
+    assert told.voiced[..., 1].any() and not found.voiced[..., 1].any()
+    assert torch.equal(found.user_heard, told.user_heard)
 
 
 def sounds_off(corpus, sound: str = "mel", **changes) -> torch.Tensor:

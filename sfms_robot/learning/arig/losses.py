@@ -9,18 +9,20 @@ sounds within fewer steps. So are weights of groups of channels: by number, (3) 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.config.arig import STATES
-from sfms_robot.frames import POSE_CHANNELS
-from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH
+from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
+from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, track
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.parts import weighted_mean
 from sfms_robot.listeners.arig.sojourns import FIRST
@@ -130,8 +132,9 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
         return (torch.rand(b, 1, generator=generator) < share).to(device)
 
     deaf, blind = dropped(phase.drop_audio), dropped(phase.drop_face)
+    silent = dropped(phase.silent_user)
     mute = dropped(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
-    voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf], dim=-1)
+    voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf & ~silent], dim=-1)
     user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
     kept = _kept(model).to("cpu")
     slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, kept, phase, generator))
@@ -141,7 +144,7 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     missed = (missed * torch.randn(b, n, model.channels, generator=generator)).to(device) * model.motion_std
     told = replace(
         dyad,
-        user_sound=dyad.user_sound + user_off,
+        user_sound=_in_a_room(dyad.user_sound + user_off, voiced[..., 1:], silent, model, phase, generator),
         agent_sound=dyad.agent_sound + agent_off,
         user_heard=dyad.user_heard & ~deaf,
         agent_heard=dyad.agent_heard & ~mute,
@@ -167,6 +170,24 @@ def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, gener
     bands = gain * mel.LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
     off[..., :MEL_WIDTH] = (bands[:, :, None] + size[..., 1:2, None] * phase.grain_db * grain).flatten(2)
     return off
+
+
+def _in_a_room(
+    sound: Tensor, voiced: Tensor, silent: Tensor, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+) -> Tensor:
+    """Sound (B, N, A) of the user without some of what is no speech (voiced (B, N, 1)), or (silent (B, 1)) any sound.
+
+    Silence is what a stream hears of it from its start. Other features than logarithms of power stay as they are.
+    """
+    if model.settings.sound != "mel":
+        return sound
+    b, n = sound.shape[:2]
+    share = torch.rand(b, 1, 1, generator=generator) * (torch.rand(b, 1, 1, generator=generator) < phase.quiet_room)
+    bands = sound[..., :MEL_WIDTH]
+    less = share.to(sound.device) * (bands - math.log(mel.FLOOR)).clamp(min=0)
+    quieter = torch.cat([torch.where(voiced, bands, bands - less), sound[..., MEL_WIDTH:]], dim=-1)
+    silence = torch.from_numpy(track(np.zeros(n * FRAME_SAMPLES, np.float32))[0]).to(sound.device)
+    return torch.where(silent[..., None], silence, quieter)
 
 
 def _kept(model: ArigModel) -> Tensor:
