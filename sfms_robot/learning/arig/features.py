@@ -39,6 +39,7 @@ LEAST_STEP: Final = 0.01  # of a frame, in deviations of the motion
 LEAST_SPREAD: Final = 0.25  # of companded innovations: what hardly moves does not weigh more than what moves
 COMPANDED: Final = 4  # innovations above the deviation over this are companded: between what rests and what happens
 LARGEST_RHO: Final = 0.999  # of one frame to the next: a time constant of 40 s
+LEAST_RHO: Final = 0.1
 SIDED: Final = ("roll", "yaw", "y")  # of the head; nobody tells to which side a shake begins, so none is on average
 RARE: Final = 0.02  # of the frames with the same voices: a state so rare there is a label's edge
 
@@ -147,25 +148,41 @@ def _beside_phase(rows: Floats, audio: Floats | None) -> Floats:
     return np.concatenate([rows, place], axis=1).astype(np.float32)
 
 
-def autocorrelation(last: Tensor, now: Tensor) -> Tensor:
-    """Lag-1 autocorrelation (C,) of values of mean 0, (M, C) each and the next, within 0..`LARGEST_RHO`.
+def reflection(before: Tensor, after: Tensor) -> Tensor:
+    """Burg's coefficient (C,) of values of mean 0, (M, C) each: how much of one is the other, whichever comes first.
 
-    What never moves stays where it is.
+    Within -1..1: no autoregression with such coefficients grows (J. P. Burg, 1967). What never moves stays as it is.
     """
-    power = (last.square().sum(0) * now.square().sum(0)).sqrt()
-    found = torch.where(power > 0, (last * now).sum(0) / power.clamp(min=1e-9), 1.0)
-    return found.clamp(0.0, LARGEST_RHO)
+    power = (before.double().square() + after.double().square()).sum(0)
+    found = 2 * (before.double() * after.double()).sum(0) / power.clamp(min=1e-9)
+    return torch.where(power > 0, found, 1.0).float()
 
 
-def _fit_steps(model: ArigModel, last: Tensor, now: Tensor) -> None:
-    """From standardised motion (M, C) of frames and of the frames after them, less what is told of events."""
+def _fit_steps(model: ArigModel, of_dyads: Sequence[Tensor]) -> Tensor:
+    """From standardised motion (M, C) of every dyad, less what is told of events; what is to be drawn of it (N, C)."""
+    last, now = _pairs(of_dyads)
     if model.settings.draws != "innovation":
         model.step_std.copy_((now - last).std(0).clamp(min=LEAST_STEP))
-        return
-    model.rho.copy_(autocorrelation(last, now))
-    steps = now - model.expected(last)
-    model.step_std.copy_((steps.std(0) / COMPANDED).clamp(min=LEAST_STEP))
-    model.spread.copy_((steps / model.step_std).asinh().std(0).clamp(min=LEAST_SPREAD))
+        return model.target(now, last)
+    rho = reflection(last, now).clamp(0.0, LARGEST_RHO)
+    model.rho.copy_(rho)
+    left = now - rho * last
+    if not model.settings.own_head:
+        steps = [one[1:] - rho * one[:-1] for one in of_dyads]
+        backwards = torch.cat([one[:-2] - rho * one[1:-1] for one in of_dyads])
+        places = torch.cat([one[1:-1] for one in of_dyads])
+        before, after = _pairs(steps)
+        partial = reflection(backwards, after).clamp(-LARGEST_RHO, LARGEST_RHO)
+        model.step_rho.copy_((-partial / rho.clamp(min=LEAST_RHO)).where(~model.is_recalled, 0.0))
+        left = after - model.step_rho * (before - (1 - rho.square()) * places)
+    model.step_std.copy_((left.std(0) / COMPANDED).clamp(min=LEAST_STEP))
+    model.spread.copy_((left / model.step_std).asinh().std(0).clamp(min=LEAST_SPREAD))
+    return model.companded(left / model.step_std)
+
+
+def _pairs(of_dyads: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Rows of every dyad but its last, and those after them."""
+    return torch.cat([one[:-1] for one in of_dyads]), torch.cat([one[1:] for one in of_dyads])
 
 
 def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Tensor:
@@ -210,10 +227,8 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) ->
     model.motion_low.copy_(standard.amin(0))
     model.motion_high.copy_(standard.amax(0))
     of_dyads = torch.split(_beside_events(model, standard, corpus), list(corpus.lengths))
-    last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(-1), slice(1, None)))
-    _fit_steps(model, last, now)
+    drawn = _fit_steps(model, of_dyads)
     if isinstance(model.head, Denoiser) and model.settings.diffusion.clamp:
-        drawn = model.target(now, last)
         model.head.low.copy_(drawn.amin(0))
         model.head.high.copy_(drawn.amax(0))
     if model.settings.events and model.states is not None:

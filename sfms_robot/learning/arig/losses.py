@@ -88,7 +88,7 @@ def loss_parts(
     weights = channel_weights(model.settings, group_weights).to(truth.device) if group_weights else None
     found = model.condition(told, previous)
     target = model.standardise(truth[:, 1:])
-    to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
+    to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told), found.moved)
     motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), draws, generator, weights).mean()
     coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
     known = states[:, 1:] >= 0
@@ -119,9 +119,8 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
 
     Also the motion (B, N, C) that comes after such a past.
     The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
-    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. Of a
-    head that is drawn by innovations even that tenth is left to the autoregression: where it is held tells nothing of
-    what it does next, and what a stream's head forgets is what `rho` says.
+    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. A
+    head whose past is not told is as it was.
     Lips are another matter while the agent speaks: its sounds say where they have to be, so their past is off by more,
     in every window, and all of it is taken back at once.
     """
@@ -136,8 +135,8 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
     mute = dropped(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
     voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf & ~silent], dim=-1)
     user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
-    kept = _kept(model).to("cpu")
-    slow, fast = (each.to(device) * model.motion_std for each in _wander(b, n, kept, phase, generator))
+    off = model.motion_std * model.is_recalled
+    slow, fast = (each.to(device) * off for each in _wander(b, n, model.channels, phase, generator))
     lips = torch.tensor([name.startswith(SPOKEN) for name in model.settings.channels], device=device)
     spoken = dyad.voiced[..., :1] & lips
     missed = torch.rand(b, 1, 1, generator=generator) * phase.speaking_noise
@@ -152,7 +151,7 @@ def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: to
         agent_motion=dyad.agent_motion + slow + fast * model.step_std + torch.where(spoken, missed, 0.0),
         voiced=voiced,
     )
-    carried = kept.to(device) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
+    carried = (1 - RETURN) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
     return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
 
 
@@ -190,29 +189,22 @@ def _in_a_room(
     return torch.where(silent[..., None], silence, quieter)
 
 
-def _kept(model: ArigModel) -> Tensor:
-    """(C,) share of the slow part of the noise that is there a frame later."""
-    kept = torch.full((model.channels,), 1 - RETURN)
-    if model.settings.draws != "innovation":
-        return kept
-    head = torch.tensor([group_of(name) == "head" for name in model.settings.channels])
-    return torch.where(head, model.rho.cpu(), kept)
-
-
-def _wander(b: int, n: int, kept: Tensor, phase: config.ArigPhase, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _wander(
+    b: int, n: int, channels: int, phase: config.ArigPhase, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """Noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of steps.
 
-    The slow part goes elsewhere once a second or so, at once or gliding, and of it `kept` (C,) is there a frame later.
+    The slow part goes elsewhere once a second or so, at once or gliding, and of it a tenth is gone a frame later.
     A glide is a motion that goes on for no reason, as a stream's own may: nothing of its speed is in what comes after.
     """
     size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
     size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
-    jumps = torch.randn(b, n, len(kept), generator=generator)
+    jumps = torch.randn(b, n, channels, generator=generator)
     jumps = _glided(jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS), generator)
-    fast = torch.randn(b, n, len(kept), generator=generator)
+    fast = torch.randn(b, n, channels, generator=generator)
     slow = jumps.clone()
     for frame in range(1, n):
-        slow[:, frame] += kept * slow[:, frame - 1]
+        slow[:, frame] += (1 - RETURN) * slow[:, frame - 1]
     return size * slow, size * fast
 
 

@@ -33,7 +33,7 @@ class Rest(Part):
 
     def forward(self, still: Tensor) -> tuple[Tensor, ...]:
         """still (1, C) standardised -> embedded motion and silence (1, D), and the keys of each (1, 2D)."""
-        progress, motion, silence = self.model.progress, self.model.embed_motion(still), self.model.no_agent_sound[None]
+        progress, motion, silence = self.model.progress, self.model.embed_own(still), self.model.no_agent_sound[None]
         return motion, silence + 0.0, progress.temporal.keys(motion), progress.coarse.keys(silence)
 
 
@@ -121,7 +121,13 @@ class Draw(Part):
         self.register_buffer("places", places, persistent=False)
 
     def forward(
-        self, z: Tensor, noise: Tensor, standard: Tensor, motion_keys: Tensor, rows: Tensor | None = None
+        self,
+        z: Tensor,
+        noise: Tensor,
+        standard: Tensor,
+        motion_keys: Tensor,
+        rows: Tensor | None = None,
+        sample: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """One frame.
 
@@ -129,19 +135,20 @@ class Draw(Part):
             z: of `Frame`; noise: (N, *model.noise_shape).
             standard: (N, C) standardised motion of the frame before; motion_keys: of `stream.Memory`.
             rows: (N, 2K) of `Frame`, of a listener with events.
+            sample: (N, C) `model.moved` of the frame before, of one that is not told of its own head.
 
         Returns:
-            Motion (N, C) in plain units, the same standardised (N, C), as what the sampler drew (N, C), and embedded
-            (N, D), and the next motion_keys.
+            Motion (N, C) in plain units, the same standardised (N, C), `model.moved` (N, C), embedded (N, D), and the
+            next motion_keys.
         """
         model = self.model
         levels = self.levels
         if levels is None and self.places is not None and isinstance(model.head, Denoiser):
             levels = model.head.time(self.places)
-        made = model.drawn(model.sample(z, noise, levels), standard, rows)
-        motion = model.embed_motion(made)
+        made = model.drawn(model.sample(z, noise, levels), standard, rows, sample)
+        motion = model.embed_own(made)
         keys = push(motion_keys, model.progress.temporal.keys(motion))
-        return model.restore(made), made, model.target(made, standard, rows), motion, keys
+        return model.restore(made), made, model.moved(made, standard, rows), motion, keys
 
 
 def networks(model: ArigModel, kept: bool = True) -> dict[str, Part]:
@@ -185,6 +192,8 @@ def examples(settings: config.Arig, streams: int) -> Mapping[str, dict[str, Tens
     }
     if settings.events:
         draw["rows"] = torch.zeros(n, CONTROL_ROWS * len(COLUMNS))
+    if not settings.own_head:
+        draw["sample"] = torch.zeros(n, channels)
     return {"rest": {"still": torch.zeros(1, channels)}, "frame": frame, "draw": draw}
 
 

@@ -22,6 +22,12 @@ Beyond the paper, too:
    what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
    the face moves is too fine for the few numbers of z. The mean of what is to be drawn is predicted, and the sampler
    draws what is left: an event that is told shows after few steps of training, whatever the sampler's temperature.
+ - `own_head: false`: of the agent's head neither its past nor what was drawn last is told, and what it does of itself
+   is an autoregression of second order. With r = x - b (below) and its step v_t = r_t - rho r_(t-1), what is drawn is
+   v_t less step_rho (v_(t-1) - (1 - rho^2) r_(t-1)), the part of the last step that r does not tell yet: Burg's
+   autoregression of the data in two lags, which cannot grow. Driven by draws of bounded size
+   that know nothing of where the head is, it sways as far as people's do, and no weights can make it swing. Told of its
+   own past it learned to, at 0.5 Hz from one end of its range to the other.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest. Innovations are of what is left beside
    the motion b to be expected of the events (`told`): x_t = b_t + rho (x_(t-1) - b_(t-1)) + ...
@@ -38,6 +44,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
+from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.listeners.arig import told
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
 from sfms_robot.listeners.arig.codes import CodeHead
@@ -104,11 +111,13 @@ class Condition:
         z: (B, N-1, D), and beside it what the sampler is told besides.
         states: the states' logits (B, N-1, S) or None.
         outline: (B, N-1, D) coarse motion.
+        moved: (B, N-1, C) `ArigModel.moved` of the frame before.
     """
 
     z: Tensor
     states: Tensor | None
     outline: Tensor
+    moved: Tensor
 
 
 @dataclass(frozen=True)
@@ -129,8 +138,10 @@ class ArigModel(nn.Module):
     step_std: Tensor
     rho: Tensor
     spread: Tensor
+    step_rho: Tensor
     told: Tensor
     is_drawn: Tensor
+    is_recalled: Tensor
     sound_mean: Tensor
     sound_std: Tensor
 
@@ -150,8 +161,12 @@ class ArigModel(nn.Module):
             self.register_buffer("spread", torch.ones(self.channels))
             if self.is_told:
                 self.register_buffer("told", torch.zeros(told.FEATURES, self.channels))
+            if not settings.own_head:
+                self.register_buffer("step_rho", torch.zeros(self.channels))
         is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
         self.register_buffer("is_drawn", is_drawn, persistent=False)
+        is_recalled = torch.tensor([settings.own_head or name not in POSE_CHANNELS for name in settings.channels])
+        self.register_buffer("is_recalled", is_recalled, persistent=False)
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
         self.register_buffer("sound_std", torch.ones(self.sound_width))
         self.sounds_read = self.sound_width - (0 if settings.phase else phase.FEATURES)  # the place in a phrase is last
@@ -197,23 +212,45 @@ class ArigModel(nn.Module):
         """The inverse of `standardise`."""
         return motion * self.motion_std + self.motion_mean
 
-    def target(self, motion: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
-        """What the sampler is to draw: motion (..., C) after `last` (..., C), both standardised -> (..., C).
+    def moved(self, motion: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The step to motion (..., C) after `last` (..., C), both standardised, as the sampler draws steps: (..., C).
 
         `rows` (..., 2K): control of both frames.
         """
         if self.settings.draws == "motion":
             return motion
         step = (motion - self.expected(last, rows)) / self.step_std
-        return step.asinh() / self.spread if self.settings.draws == "innovation" else step
+        return self.companded(step) if self.settings.draws == "innovation" else step
 
-    def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
+    def target(self, motion: Tensor, last: Tensor, rows: Tensor | None = None, moved: Tensor | None = None) -> Tensor:
+        """What the sampler is to draw: `moved`, less what the step before it, `moved` (..., C), leads to."""
+        found = self.moved(motion, last, rows)
+        if self.settings.own_head or moved is None:
+            return found
+        return self.companded(self.expanded(found) - self._carried(last, rows, moved))
+
+    def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None, moved: Tensor | None = None) -> Tensor:
         """The inverse of `target`; a step never leads out of the range of the motion, and what is not drawn rests."""
         if self.settings.draws == "motion":
             return self._at_rest(sample)
-        step = (sample * self.spread).sinh() if self.settings.draws == "innovation" else sample
+        step = self.expanded(sample) if self.settings.draws == "innovation" else sample
+        if not self.settings.own_head and moved is not None:
+            step = step + self._carried(last, rows, moved)
         made = torch.addcmul(self.expected(last, rows), step, self.step_std).clamp(self.motion_low, self.motion_high)
         return self._at_rest(made)
+
+    def _carried(self, last: Tensor, rows: Tensor | None, moved: Tensor) -> Tensor:
+        """What the step `moved` (..., C) to `last` leads to of the next one, in `step_std`: see the module."""
+        _, off = self._events(last, rows)
+        return self.step_rho * (self.expanded(moved) - (1 - self.rho.square()) / self.step_std * off)
+
+    def companded(self, step: Tensor) -> Tensor:
+        """Steps (..., C), in `step_std`, as they are drawn."""
+        return step.asinh() / self.spread
+
+    def expanded(self, drawn: Tensor) -> Tensor:
+        """The inverse of `companded`."""
+        return (drawn * self.spread).sinh()
 
     def _at_rest(self, motion: Tensor) -> Tensor:
         """Standardised motion (..., C) with what is not drawn at its mean, which is 0."""
@@ -226,10 +263,15 @@ class ArigModel(nn.Module):
         """
         if self.settings.draws != "innovation":
             return last
+        now, off = self._events(last, rows)
+        return self.rho * off if now is None else now + self.rho * off
+
+    def _events(self, last: Tensor, rows: Tensor | None) -> tuple[Tensor | None, Tensor]:
+        """What is told of the frame (..., C), None for nothing, and how far `last` is off what was told of it."""
         if not self.is_told or rows is None:
-            return self.rho * last
+            return None, last
         before, now = (told.features(row) @ self.told for row in rows.chunk(2, dim=-1))
-        return now + self.rho * (last - before)
+        return now, last - before
 
     def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
         """Of the sampler (N, C), the mean included: z (N, D and beside it), noise and levels of `Denoiser.sample`.
@@ -259,11 +301,11 @@ class ArigModel(nn.Module):
             else drawn + weighted_mean(F.huber_loss(mean, wanted, reduction="none", delta=MEAN_DELTA), weights)
         )
 
-    def beside(self, z: Tensor, events: Tensor | None, sample: Tensor) -> Tensor:
-        """z (..., D) and what the sampler is told besides: embedded events (..., D), its last sample (..., C)."""
+    def beside(self, z: Tensor, events: Tensor | None, moved: Tensor) -> Tensor:
+        """z (..., D) and what the sampler is told besides: embedded events (..., D), the last step (..., C)."""
         told = [z] if events is None else [z, events]
         if self.settings.draws == "innovation":
-            told.append(sample)
+            told.append(moved.where(self.is_recalled, 0.0))
         return torch.cat(told, dim=-1) if len(told) > 1 else z
 
     def embed_events(self, rows: Tensor) -> Tensor | None:
@@ -281,6 +323,10 @@ class ArigModel(nn.Module):
         out: Tensor = self.motion_in(motion)
         return out
 
+    def embed_own(self, motion: Tensor) -> Tensor:
+        """`embed_motion` of the agent, of whose past the head may be none of the network's business."""
+        return self.embed_motion(motion.where(self.is_recalled, 0.0))
+
     def embed_face(self, motion: Tensor, seen: Tensor) -> Tensor:
         """Standardised motion (..., C) of the user, seen (...) bool -> (..., D)."""
         embedded = self.embed_motion(motion)
@@ -296,7 +342,7 @@ class ArigModel(nn.Module):
         user = self.embed_sound(dyad.user_sound, dyad.user_heard, self.no_user_sound)[:, :-1]
         agent = self.embed_sound(dyad.agent_sound, dyad.agent_heard, self.no_agent_sound)
         standard = self.standardise(dyad.agent_motion)[:, :-1]
-        motion = self.embed_motion(standard)
+        motion = self.embed_own(standard)
         face = self.embed_face(self.standardise(dyad.user_motion), dyad.user_seen)[:, :-1]
         b, t, d = motion.shape  # frame t of what follows is made from frames 0..t and makes frame t + 1
         c = self.settings.chunk_frames
@@ -324,9 +370,9 @@ class ArigModel(nn.Module):
             feature,
             None if events is None else events.flatten(0, 1),
         )
-        drawn = self.target(standard[:, 1:], standard[:, :-1], None if rows is None else rows[:, :-1])
-        sample = torch.cat([torch.zeros_like(standard[:, :1]), drawn], dim=1)
-        return Condition(self.beside(z.view(b, t, d), events, sample), logits, outline.view(b, t, d))
+        moved = self.moved(standard[:, 1:], standard[:, :-1], None if rows is None else rows[:, :-1])
+        moved = torch.cat([torch.zeros_like(standard[:, :1]), moved], dim=1)
+        return Condition(self.beside(z.view(b, t, d), events, moved), logits, outline.view(b, t, d), moved)
 
     def rows(self, dyad: Dyad) -> Tensor | None:
         """Control (B, N - 1, 2K) of the frames before and of frames 1..N-1, or None without events."""
@@ -356,7 +402,7 @@ class ArigModel(nn.Module):
         known = None if states is None else torch.where(states < 0, FIRST, states)
         found = self.condition(dyad, known)
         standard = self.standardise(dyad.agent_motion)
-        target = self.target(standard[:, 1:], standard[:, :-1], self.rows(dyad))
+        target = self.target(standard[:, 1:], standard[:, :-1], self.rows(dyad), found.moved)
         motion = self.sample_loss(found.z.flatten(0, 1), target.flatten(0, 1), generator=generator)
         motion = motion.view(target.shape[:2])
         if found.states is None or states is None:
@@ -366,7 +412,7 @@ class ArigModel(nn.Module):
 
     def generate(self, dyad: Dyad, noise: Tensor, states: Tensor | None = None) -> Tensor:
         """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape); states: above."""
-        z = self.condition(dyad, states).z
-        made = self.sample(z.flatten(0, 1), noise.flatten(0, 1))
+        found = self.condition(dyad, states)
+        made = self.sample(found.z.flatten(0, 1), noise.flatten(0, 1)).view(found.moved.shape)
         last = self.standardise(dyad.agent_motion[:, :-1])
-        return self.restore(self.drawn(made.view(*z.shape[:2], -1), last, self.rows(dyad)))
+        return self.restore(self.drawn(made, last, self.rows(dyad), found.moved))

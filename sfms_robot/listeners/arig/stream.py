@@ -47,8 +47,8 @@ class Memory:
         agent_behaviour, user_behaviour: (c, D) of the last c frames, the newest last.
         sound_keys: (3, 2D) of the agent's last sounds; motion_keys: (5, 2D) of its last motions.
         context: (2L, h, w - 1, D/h) keys and values of whole chunks, layer by layer, the newest last.
-        motion: (D,) embedded motion of the agent's last frame; standard: (C,) the same, standardised; sample: (C,) what
-            the sampler drew for it.
+        motion: (D,) embedded motion of the agent's last frame; standard: (C,) the same, standardised; sample: (C,) the
+            step to it, as the sampler draws steps.
         state: conversational state of the last frame, of `settings.states`; sojourn: that which it is drawn from, of a
             listener with events.
     """
@@ -192,6 +192,8 @@ class ArigListener(RunsOnEngine):
         noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self._noise_shape) for memory in now])
         inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
         told = [rows] if self.settings.events else []
+        if not self.settings.own_head:
+            told.append(_stacked(now, "sample"))
         made, standard, sample, motion, keys = self.engine.run("draw", *inputs, *told)
         sojourns, states = self._states(logits, now, rows, heard)
         out = []
