@@ -27,7 +27,7 @@ Beyond the paper, too:
    v_t less step_rho (v_(t-1) - (1 - rho^2) r_(t-1)), the part of the last step that r does not tell yet: Burg's
    autoregression of the data in two lags, which cannot grow. Driven by draws of bounded size
    that know nothing of where the head is, it sways as far as people's do, and no weights can make it swing. Told of its
-   own past it learned to, at 0.5 Hz from one end of its range to the other.
+   own past it learned to, from one end of its range to the other within a second.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest. Innovations are of what is left beside
    the motion b to be expected of the events (`told`): x_t = b_t + rho (x_(t-1) - b_(t-1)) + ...
