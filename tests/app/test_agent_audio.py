@@ -80,7 +80,7 @@ def test_a_robot_that_stops_speaking_while_somebody_talks_listens_within_a_secon
     memory, states = listener.start(3), []
     for frame in open_source(duration_s=6.0, agent_audio=voice(tmp_path / "said.wav", 4.0)).read(6.0):
         _, memory = listener.step(frame, memory)
-        states.append(STATES[paper_state(memory.state)])
+        states.append(STATES[paper_state(memory.how.state)])
     assert "listening" not in states[75:99] and set(states[75:99]) <= {"speaking", "interrupted", "giving_feedback"}
     assert set(states[125:]) <= {"listening", "giving_feedback"}
 

@@ -174,7 +174,7 @@ def named(card: Path) -> set[str]:
     return set(re.findall(r"`(?:[a-z]+\.)?([a-z_]+)(?::[^`]*)?`", said))
 
 
-@pytest.mark.parametrize("listener", ["sfms-small"])
+@pytest.mark.parametrize("listener", PAIRS)
 def test_a_card_names_every_departure_from_its_paper(listener):
     card = data_dir("configs") / "listeners" / listener / "CARD.md"
     assert departures(listener) - named(card) == set(), f"{card.parent.name}: not named in its card"
