@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import copy
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sfms_robot.errors import ModelError
 from sfms_robot.listeners.arig.model import ArigModel
@@ -43,6 +45,20 @@ class Int8Linear(nn.Module):
     __call__ = forward  # as parts.Part
 
 
+class Bf16Linear(nn.Module):
+    """Stands in for an nn.Linear: half of what is read. For benches: integers are faster wherever there are any."""
+
+    def __init__(self, linear: nn.Linear) -> None:
+        super().__init__()
+        self.weight = linear.weight.detach().bfloat16()
+        self.bias = linear.bias.detach().bfloat16()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.linear(x.bfloat16(), self.weight, self.bias).float()
+
+    __call__ = forward  # as parts.Part
+
+
 def supported() -> bool:
     """Whether this processor multiplies such integers fast."""
     return torch.backends.quantized.engine in ("x86", "fbgemm", "onednn")
@@ -57,10 +73,15 @@ def with_precision(model: ArigModel, precision: str) -> ArigModel:
         return model
     if not supported():
         raise ModelError("precision = 'int8' needs an x86 processor (auto, fp32)")
+    return with_layers(model, Int8Linear)
+
+
+def with_layers(model: ArigModel, kind: Callable[[nn.Linear], nn.Module]) -> ArigModel:
+    """A copy of the model whose large layers are of another kind; the sampler's stay."""
     out = copy.deepcopy(model)
     for name, part in out.named_children():
         if name in PARTS:
-            _replace(part)
+            _replace(part, kind)
     return out
 
 
@@ -75,10 +96,10 @@ def large_layers(model: ArigModel) -> list[str]:
     ]
 
 
-def _replace(module: nn.Module) -> None:
+def _replace(module: nn.Module, kind: Callable[[nn.Linear], nn.Module]) -> None:
     for name, child in module.named_children():
         if isinstance(child, nn.Linear):
             if child.weight.numel() >= SMALLEST:
-                setattr(module, name, Int8Linear(child))
+                setattr(module, name, kind(child))
         else:
-            _replace(child)
+            _replace(child, kind)

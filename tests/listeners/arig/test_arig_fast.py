@@ -26,6 +26,16 @@ def test_a_layer_in_integers_is_the_layer_within_a_percent_or_two():
     assert not torch.equal(found, exact)
 
 
+def test_large_layers_in_bf16_are_the_layers_within_a_percent():
+    model = arig_model(**MIDDLE)
+    quick = fast.with_layers(model, fast.Bf16Linear)
+    x = torch.randn(3, 256)
+    with torch.no_grad():
+        found, exact = quick.merge_user(x, x), model.merge_user(x, x)
+    assert 0 < (found - exact).norm() < 0.01 * exact.norm()
+    assert not any(isinstance(part, fast.Bf16Linear) for part in model.modules())
+
+
 def test_motion_differs_by_less_than_a_twentieth_of_its_spread():
     """Frame by frame: both models make every frame from the same memory."""
     exact, quick = arig_listener(**MIDDLE | {"precision": "fp32"}), arig_listener(**MIDDLE)
