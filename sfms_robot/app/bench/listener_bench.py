@@ -93,7 +93,7 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
         found = load(where, engine, eager=way == EAGER)
         streams[way] = Stream(found, _later(found, found.start(0), speaker))
     if isinstance(settings, config.Arig):
-        found = _in_bf16(streams[EAGER].listener, settings)
+        found = _in_bf16(ways[EAGER][0], settings)
         streams[BF16] = Stream(found, _later(found, found.start(0), speaker))
     take_turns(streams, speaker)
     rows = {f"{name} {way}": stream.figures(streams[EAGER]) for way, stream in streams.items()}
@@ -120,14 +120,17 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
     return rows
 
 
-def _in_bf16(exact: Listener, settings: config.Arig) -> Listener:
+def _in_bf16(where: Path, settings: config.Arig) -> Listener:
     """An ARIG on torch with its large layers in bf16, which no configuration asks for: its row says why."""
     from sfms_robot.listeners.arig import fast, torch_engine
-    from sfms_robot.listeners.arig.stream import ArigListener
 
-    model = fast.with_layers(_how(exact).model, fast.Bf16Linear)
-    plain = settings.model_copy(update={"precision": "fp32"})
-    return ArigListener(plain, torch_engine(plain, model)).build_graphs()
+    found = load(where, "torch", eager=True)
+    how = _how(found)
+    how.engine = torch_engine(
+        settings.model_copy(update={"precision": "fp32"}), fast.with_layers(how.model, fast.Bf16Linear)
+    )
+    how.build_graphs()
+    return found
 
 
 def _how(listener: Listener) -> Any:
