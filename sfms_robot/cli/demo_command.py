@@ -12,8 +12,8 @@ import typer
 
 from sfms_robot.cli import names
 
-# Of the ten seeds that `--seeds 10` tries, the first of the two that nod most.
-DEFAULT_SEED = 0
+# Of the ten seeds that `--seeds 10` tries, one in the middle by how often they nod.
+DEFAULT_SEED = 1
 
 
 def demo(

@@ -77,7 +77,6 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
             hazards={kind: hazards[kind] for kind in EVENT_KINDS},
             shapes=event_shapes.shapes(taught, motions),
         )
-        found = found if all_series else event_rollout.calibrated(found, taught, seed)
     if out is not None:
         save(out, found)
     figures: dict[str, Any] = {

@@ -2,9 +2,6 @@
 
 Between two nods everything about them is known beforehand, so a stretch is looked at as a whole: the first step whose
 lot falls below its chance is the next nod.
-
-A hazard that fits what people did makes too many by itself: a nod too many calls for more, and a head that always
-nods at people's mean rate nods more often than people whose rates scatter about it. `calibrated` takes that out.
 """
 
 from __future__ import annotations
@@ -19,13 +16,11 @@ from sfms_robot.frames import FRAME_HZ, Doubles, ListenerEvent
 from sfms_robot.learning.events.event_trainer import Student
 from sfms_robot.learning.events.labels import minutes, steps_of
 from sfms_robot.listeners.events.evidence import AT, COUNTED_S, DONE, HEARD, Bools, Ints
-from sfms_robot.listeners.events.hazards import STEP_S, EventTables, HazardBank
+from sfms_robot.listeners.events.hazards import STEP_S, HazardBank
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.signals.events import phrase_end_counts, phrase_ends, ratio_of
 
 STRETCH: Final = 400  # steps looked at together
-ROUNDS: Final = 3  # of a calibration
-_SLOPE: Final = 1.3  # log of nods a minute over log-odds of the hazard: nods call for nods
 
 
 @dataclass(frozen=True)
@@ -73,27 +68,6 @@ def roll_out(model: EventModel, one: Student, per_minute: float, seed: int) -> l
         at = int(np.ceil(nods[-1].end_s / STEP_S - 1e-6))
         at = max(at, found + 1)
     return nods
-
-
-def calibrated(tables: EventTables, students: Sequence[Student], seed: int) -> EventTables:
-    """With the intercept of nods that makes as many a minute of listening, in the students' places, as the knob says.
-
-    Of two roll-outs a round at the knob's usual rate; the same where nobody listens.
-    """
-    nod = tables.hazards["nod"]
-    for _ in range(ROUNDS):
-        model = EventModel(tables)
-        drawn = np.array([0.0, 0.0])
-        for number, one in enumerate(students):
-            for lot in (0, 1):
-                nods = roll_out(model, one, nod.per_minute, number + 1000 * (seed + lot))
-                drawn += count(one, np.array([each.start_s for each in nods])).listening
-        if not drawn.all():
-            break
-        more = float(np.log(drawn[0] / drawn[1] / nod.per_minute)) / _SLOPE
-        nod = nod.model_copy(update={"intercept": round(nod.intercept - more, 3)})
-        tables = tables.model_copy(update={"hazards": {**tables.hazards, "nod": nod}})
-    return tables
 
 
 def _done(nods: Sequence[ListenerEvent], now_s: Doubles, log_rate: float) -> Doubles:

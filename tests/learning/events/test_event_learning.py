@@ -137,23 +137,6 @@ def test_a_roll_out_nods_while_listening_only_and_more_with_the_knob():
     assert counts == sorted(counts) and counts[-1] > counts[0]
 
 
-def test_a_calibrated_knob_is_what_is_drawn():
-    one, tables = student(person(), np.random.default_rng(0)), EventModel.load().tables
-    nod = tables.hazards["nod"]
-    off = tables.model_copy(
-        update={"hazards": {**tables.hazards, "nod": nod.model_copy(update={"intercept": nod.intercept + 1.0})}}
-    )
-
-    def drawn(given):
-        nods = [len(event_rollout.roll_out(EventModel(given), one, nod.per_minute, 1000 * lot)) for lot in range(1, 3)]
-        return np.mean(nods) / (one.listening.sum() / FRAME_HZ / 60)
-
-    assert drawn(off) > 1.5 * nod.per_minute
-    found = event_rollout.calibrated(off, [one], 1)
-    assert drawn(found) == pytest.approx(nod.per_minute, rel=0.25)
-    assert found.hazards["nod"].weights == nod.weights
-
-
 def test_counts_of_a_person_are_his_own():
     one = student(person(answering()), np.random.default_rng(0))
     found = event_rollout.count(one, event_rollout.people_did(one))
