@@ -17,7 +17,7 @@ from typing import Final, Literal
 import numpy as np
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats, SpeakerFrame, changed
-from sfms_robot.listeners.events.evidence import Bools, Hearing, Instant, Scene, hear, hearing
+from sfms_robot.listeners.events.evidence import Hearing, Instant, Scene, hear, hearing
 from sfms_robot.listeners.events.face_signs import FaceState, read_signs
 from sfms_robot.signals import phase, voice_activity
 from sfms_robot.signals.audio import energy_db
@@ -25,7 +25,6 @@ from sfms_robot.signals.voice_activity import Ear
 
 Addressed = Literal["sense", "assume", "never"]
 OWN_VOICE_DB: Final = -50.0  # of full scale; what a program says is silent otherwise
-OWN_GAP_FRAMES: Final = 4  # between its words
 LOOK_S: Final = 0.25
 LOOKED, NOT_LOOKED = 0.6, 0.4
 LOST_FRAMES: Final = 25  # without a face nobody knows where its owner looks
@@ -39,7 +38,6 @@ class SenseMemory:
     Attributes:
         addressed: as asked for.
         ear: of their voice; deaf: there has been no sound to hear at all.
-        own: frames since own voice.
         attention: smoothed; None before any. looked: 1, 0, or NaN for nobody knows.
         unseen: frames since their face; None before the first.
         tells: somebody has told their attention.
@@ -48,7 +46,6 @@ class SenseMemory:
     addressed: Addressed = "sense"
     ear: Ear = field(default_factory=voice_activity.start)
     deaf: bool = True
-    own: int = 10**6
     attention: float | None = None
     looked: float = math.nan
     unseen: int | None = None
@@ -70,14 +67,13 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
     deaf = memory.deaf and not len(speaker.audio)
     ear = memory.ear if deaf else voice_activity.step(energy_db(speaker.audio), memory.ear)
     signs, face = read_signs(speaker.face, memory.face)
-    own = 0 if _sounds(speaker.agent_audio) else memory.own + 1
     looked, watching = _looked(speaker, memory)
     talks = signs.mouth_moves if deaf else ear.active
     nods = signs.nods and not talks and not memory.hearing.voices.speech
-    instant = Instant((own <= OWN_GAP_FRAMES, talks), (math.nan, looked), signs.laughs, nods, signs.smiles)
+    instant = Instant((_sounds(speaker.agent_audio), talks), (math.nan, looked), signs.laughs, nods, signs.smiles)
     heard, remembered = hear(instant, memory.hearing)
     frame = round(speaker.time_s / FRAME_S) - 1
-    return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, own=own, face=face, hearing=remembered)
+    return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, face=face, hearing=remembered)
 
 
 def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
@@ -85,7 +81,7 @@ def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") ->
     memory = SenseMemory(addressed)
     deaf, ear, face = True, memory.ear, memory.face
     speaks, looks, signs = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan), []
-    speaks[:, 0] = _own_in(speaker)
+    speaks[:, 0] = [_sounds(frame.agent_audio) for frame in speaker]
     for index, frame in enumerate(speaker):
         deaf = deaf and not len(frame.audio)
         ear = ear if deaf else voice_activity.step(energy_db(frame.audio), ear)
@@ -96,13 +92,6 @@ def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") ->
     laughs, nods, smiles = np.array(signs, bool).reshape(-1, 3).T
     silent = phase.times(speaks[:, 1])[:, 0] == 0
     return Scene(speaks, looks, laughs, nods & silent & np.r_[True, silent][:-1], smiles)
-
-
-def _own_in(speaker: Sequence[SpeakerFrame]) -> Bools:
-    """(N,) own voice, and the gaps between its words."""
-    sounds = np.array([_sounds(frame.agent_audio) for frame in speaker], bool)
-    index = np.arange(len(sounds))
-    return np.asarray(index - np.maximum.accumulate(np.where(sounds, index, -(10**6))) <= OWN_GAP_FRAMES)
 
 
 def _sounds(own_voice: Floats | None) -> bool:
