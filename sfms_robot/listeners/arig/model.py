@@ -227,21 +227,22 @@ class ArigModel(nn.Module):
         found = self.moved(motion, last, rows)
         if self.settings.own_head or moved is None:
             return found
-        return self.companded(self.expanded(found) - self._carried(last, rows, moved))
+        _, off = self._events(last, rows)
+        return self.companded(self.expanded(found) - self._carried(off, moved))
 
     def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None, moved: Tensor | None = None) -> Tensor:
         """The inverse of `target`; a step never leads out of the range of the motion, and what is not drawn rests."""
         if self.settings.draws == "motion":
             return self._at_rest(sample)
+        now, off = self._events(last, rows)
         step = self.expanded(sample) if self.settings.draws == "innovation" else sample
         if not self.settings.own_head and moved is not None:
-            step = step + self._carried(last, rows, moved)
-        made = torch.addcmul(self.expected(last, rows), step, self.step_std).clamp(self.motion_low, self.motion_high)
+            step = step + self._carried(off, moved)
+        made = torch.addcmul(self._begins(now, off), step, self.step_std).clamp(self.motion_low, self.motion_high)
         return self._at_rest(made)
 
-    def _carried(self, last: Tensor, rows: Tensor | None, moved: Tensor) -> Tensor:
-        """What the step `moved` (..., C) to `last` leads to of the next one, in `step_std`: see the module."""
-        _, off = self._events(last, rows)
+    def _carried(self, off: Tensor, moved: Tensor) -> Tensor:
+        """What the step `moved` (..., C), which led so far `off`, leads to of the next one, in `step_std`."""
         return self.step_rho * (self.expanded(moved) - (1 - self.rho.square()) / self.step_std * off)
 
     def companded(self, step: Tensor) -> Tensor:
@@ -261,9 +262,12 @@ class ArigModel(nn.Module):
 
         With events, to what is told of the frame, from what was told of the last: `rows` (..., 2K).
         """
+        return self._begins(*self._events(last, rows))
+
+    def _begins(self, now: Tensor | None, off: Tensor) -> Tensor:
+        """`expected` of what `_events` says."""
         if self.settings.draws != "innovation":
-            return last
-        now, off = self._events(last, rows)
+            return off
         return self.rho * off if now is None else now + self.rho * off
 
     def _events(self, last: Tensor, rows: Tensor | None) -> tuple[Tensor | None, Tensor]:
