@@ -1,16 +1,33 @@
-"""What there is to choose from: listeners, recorded people, serial ports, sound devices. Each row has a name and a
-description.
+"""Heads, listeners, recorded people, serial ports, sound devices: what there is to choose from, a row with a name and a
+description each.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+from sfms_robot.config import load_head
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.sound_devices import SoundDevice
 from sfms_robot.sources.speakers import shipped_speaker, speakers
+
+
+def shipped_heads() -> list[dict[str, Any]]:
+    """What `head list` shows."""
+    names = shipped_names(data_dir("configs") / "heads", "head.yaml")
+    heads = [load_head(name) for name in names]
+    return [
+        {
+            "name": head.name,
+            "description": head.description,
+            "joints": len(head.joints),
+            "neck": head.kinematics.kind if head.kinematics else None,
+            "buses": {name: bus.family for name, bus in head.buses.items()},
+        }
+        for head in heads
+    ]
 
 
 def shipped_listeners() -> list[dict[str, Any]]:

@@ -34,7 +34,6 @@ from sfms_robot.app.listen.status_server import StatusServer
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import Calmness, Head, Joint, load_head
-from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.frames import Doubles, Floats
@@ -178,22 +177,6 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
         stack.callback(bus.close)
         bus.connect()
         yield OpenHead(options, head, motion, bus, clock, rate_hz, opened)
-
-
-def shipped_heads() -> list[dict[str, Any]]:
-    """What `head list` shows."""
-    names = shipped_names(data_dir("configs") / "heads", "head.yaml")
-    heads = [load_head(name) for name in names]
-    return [
-        {
-            "name": head.name,
-            "description": head.description,
-            "joints": len(head.joints),
-            "neck": head.kinematics.kind if head.kinematics else None,
-            "buses": {name: bus.family for name, bus in head.buses.items()},
-        }
-        for head in heads
-    ]
 
 
 def build_motion(head: Head, rate_hz: float) -> Motion:
@@ -437,32 +420,15 @@ def run(
     Raises RobotError before torque came on.
     """
     head = prepare_head(options.servos)
-    if options.fleet is not None:
-        fleet_name(options.fleet)
-        check_zenoh()
-    if options.fast and split_kind(options.hears)[0] == "mic":
-        raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
-    if options.fast and options.play is not None:
-        raise ConfigError(f"--play {options.play}: what is heard of a loudspeaker takes real time, --fast has none")
-    if options.fast and options.listener.startswith(REMOTE):
-        raise ConfigError(f"--listener {options.listener}: another machine takes real time, --fast has none")
-    if options.record is not None:
-        check_folder(options.record, options.overwrite)
+    _check(options)
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
     if limited is not None:
         logger.warning("%s: %s", Path(options.listener).name, limited)
     interrupt, halt = interrupt or Interrupt(), halt or HaltLatch()
+    facts = {"head": head.name, "port": options.port, "listener": Path(options.listener).name}
     with signals_to(interrupt) if signals else nullcontext(), ExitStack() as stack:  # until all is closed again
-        if signals:
-            stack.enter_context(halt_signals(halt))
-        if options.halt_on is not None:
-            stack.enter_context(halt_switch(options.halt_on, halt))
-        facts = {"head": head.name, "port": options.port, "listener": Path(options.listener).name}
-        server = None
-        if options.status is not None:  # a port that is taken is found before a listener is loaded
-            server = stack.enter_context(closing(StatusServer(options.status)))
-            server.serve(RunStatus((), facts).document)
-            logger.warning("status: %s", server)
+        _enter_halts(options, halt, signals, stack)
+        server = _status_server(options, facts, stack)
         if feed is None and not options.dry_run:
             feed = _feed(options, stack)
         opening = _opening(options, stack) if source is None else _opened(source)
@@ -473,31 +439,14 @@ def run(
             raise ConfigError("--fast without a recording never ends: give it a --duration")
         if feed is None:
             return {"version": 1, "head": opened.config.name, "port": options.port, "exit": "done", **_present(opened)}
-        if isinstance(feed, NamedFeed):
-            feed.wait_loaded()
-        if isinstance(feed, ListenerProcess):
-            tick_s = 1.0 / opened.rate_hz
-            feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
+        _make_ready(feed, person, opened)
         live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
-        recorder = _recorder(options, opened.config)
+        recorder = _recorder(options, opened.config, stack)
         log = run_log(opened)
-        status = RunStatus(
-            list(opened.config.joints),
-            {**facts, "duration_s": duration_s},
-            lambda: {
-                **figures_so_far(log, opened.rate_hz, real=not options.fast),
-                "source": dict(person.statistics()),
-                "listener_state": dict(feed.statistics()),
-                "intensity": live.values["intensity"],
-            },
-        )
-        if recorder is not None:
-            stack.callback(recorder.close)
+        status = _status(options, {**facts, "duration_s": duration_s}, opened, log, person, feed, live)
         if panel is not None:
             stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
-        tellers = [RunTeller(outlet) for outlet in person.outlets]
-        for teller in tellers:
-            stack.callback(teller.close)
+        tellers = [stack.enter_context(closing(RunTeller(outlet))) for outlet in person.outlets]
         if server is not None:
             server.serve(status.document)
         watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
@@ -511,22 +460,82 @@ def run(
             observers=[status, *watchers, *observers, *tellers, *([] if recorder is None else [recorder])],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt, signals=False, log=log)
-        report = run_report(
-            drove.log, opened.bus, feed, head=opened.config.name, listener=Path(options.listener).name,
-            port=options.port, seed=options.seed, outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz,
-            elapsed_s=drove.elapsed_s, priority=drove.priority,
-        )  # fmt: skip
-        report["exit_code"] = drove.exit_code
-        report["limitation"] = limited
-        report["source"] = dict(person.statistics())
+        report = _report(options, opened, drove, feed, person) | {"limitation": limited}
         if recorder is not None:
             recorder.close()
             report["recording"] = recorder.statistics()
-        if options.fast:
-            report["wire"] = opened.digests()
     if options.record is not None:
         write_report(options.record, report)
     return report
+
+
+def _check(options: RunOptions) -> None:
+    """What cannot be had together, or not here, before anything is opened. Raises ConfigError."""
+    if options.fleet is not None:
+        fleet_name(options.fleet)
+        check_zenoh()
+    if options.fast and split_kind(options.hears)[0] == "mic":
+        raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
+    if options.fast and options.play is not None:
+        raise ConfigError(f"--play {options.play}: what is heard of a loudspeaker takes real time, --fast has none")
+    if options.fast and options.listener.startswith(REMOTE):
+        raise ConfigError(f"--listener {options.listener}: another machine takes real time, --fast has none")
+    if options.record is not None:
+        check_folder(options.record, options.overwrite)
+
+
+def _enter_halts(options: RunOptions, halt: HaltLatch, signals: bool, stack: ExitStack) -> None:
+    """Who may halt the head from outside: a signal, a switch."""
+    if signals:
+        stack.enter_context(halt_signals(halt))
+    if options.halt_on is not None:
+        stack.enter_context(halt_switch(options.halt_on, halt))
+
+
+def _status_server(options: RunOptions, facts: Mapping[str, Any], stack: ExitStack) -> StatusServer | None:
+    """Serves that a run begins; a port that is taken is found before a listener is loaded."""
+    if options.status is None:
+        return None
+    server = stack.enter_context(closing(StatusServer(options.status)))
+    server.serve(RunStatus((), facts).document)
+    logger.warning("status: %s", server)
+    return server
+
+
+def _make_ready(feed: PlanFeed, person: Source, opened: OpenHead) -> None:
+    """Blocks until a listener of another machine is loaded; one of this machine gets the hop that the head needs."""
+    if isinstance(feed, NamedFeed):
+        feed.wait_loaded()
+    if isinstance(feed, ListenerProcess):
+        tick_s = 1.0 / opened.rate_hz
+        feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
+
+
+def _status(
+    options: RunOptions, facts: Mapping[str, Any], opened: OpenHead, log: RunLog, person: Source, feed: PlanFeed,
+    live: LiveKnobs,
+) -> RunStatus:  # fmt: skip
+    """How it goes, for whoever asks meanwhile."""
+
+    def figures() -> dict[str, Any]:
+        return {
+            **figures_so_far(log, opened.rate_hz, real=not options.fast),
+            "source": dict(person.statistics()),
+            "listener_state": dict(feed.statistics()),
+            "intensity": live.values["intensity"],
+        }
+
+    return RunStatus(list(opened.config.joints), facts, figures)
+
+
+def _report(options: RunOptions, opened: OpenHead, drove: Drove, feed: PlanFeed, person: Source) -> dict[str, Any]:
+    report = run_report(
+        drove.log, opened.bus, feed, head=opened.config.name, listener=Path(options.listener).name,
+        port=options.port, seed=options.seed, outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz,
+        elapsed_s=drove.elapsed_s, priority=drove.priority,
+    )  # fmt: skip
+    report |= {"exit_code": drove.exit_code, "source": dict(person.statistics())}
+    return report | {"wire": opened.digests()} if options.fast else report
 
 
 def _watchers(options: RunOptions, status: RunStatus, controls: FleetControls, stack: ExitStack) -> list[Observer]:
@@ -580,14 +589,14 @@ def _rates(calmness: Calmness | None) -> dict[str, Any] | None:
     return None if calmness is None else calmness.model_dump(exclude_none=True)
 
 
-def _recorder(options: RunOptions, head: Head) -> Recorder | None:
+def _recorder(options: RunOptions, head: Head, stack: ExitStack) -> Recorder | None:
     if options.record is None:
         return None
     about = run_facts(
         head, options.listener, {**asdict(options), "audio": options.hears, "calmness": _rates(options.calmness)}
     )
     when_full: FullPolicy = "wait" if options.fast else "drop"
-    return Recorder(options.record, list(head.joints), when_full=when_full, about=about)
+    return stack.enter_context(closing(Recorder(options.record, list(head.joints), when_full=when_full, about=about)))
 
 
 def _present(opened: OpenHead) -> dict[str, Any]:

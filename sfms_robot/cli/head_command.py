@@ -24,7 +24,7 @@ def list_heads(
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Shipped heads, with joints and buses."""
-    from sfms_robot.app.session import shipped_heads
+    from sfms_robot.app.catalogue import shipped_heads
 
     if urdf is not None:
         from sfms_robot.app.head.head_scene import draw_shipped_heads

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from sfms_robot.app.catalogue import shipped_heads
 from sfms_robot.app.head.head_check import check
-from sfms_robot.app.session import shipped_heads
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError

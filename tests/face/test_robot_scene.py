@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from sfms_robot.app.catalogue import shipped_heads
 from sfms_robot.app.head.head_scene import scene_of
-from sfms_robot.app.session import shipped_heads
 from sfms_robot.config import load_head
 from sfms_robot.config.check import check_head
 from sfms_robot.errors import ConfigError
