@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sfms_robot.config.listener import (
         ChannelGroup,
         Listener,
+        MadeSize,
         Sampling,
         Sfms,
     )
@@ -75,6 +76,7 @@ __all__ = [
     "Register",
     "RobotDescription",
     "Safety",
+    "MadeSize",
     "Sampling",
     "Sfms",
     "Stage",
@@ -105,7 +107,7 @@ _NAMES: Final = {
     "config.head": ("Head", "load_head"),
     "config.joint": ("Joint", "JointDefaults", "LimitClass"),
     "config.life": ("Gaze", "Idle", "Life", "Person"),
-    "config.listener": ("ChannelGroup", "Listener", "Sampling", "Sfms"),
+    "config.listener": ("ChannelGroup", "Listener", "MadeSize", "Sampling", "Sfms"),
     "config.listener_kinds": ("load_listener", "parse_listener"),
     "config.mapping": ("Coupling", "Expression", "Fold", "Region"),
     "config.named_bus": ("Bus",),

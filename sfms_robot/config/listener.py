@@ -44,6 +44,16 @@ class ChannelGroup(Model):
         return math.prod(self.levels)
 
 
+class MadeSize(Model):
+    """How large events come out of a listener that is told how large to make them: `gain` times that, and `offset_deg`.
+
+    Found by roll-outs on training dyads after training; a stream is told other sizes by as much (`signals.control`).
+    """
+
+    gain: Positive = 1.0
+    offset_deg: Finite = 0.0
+
+
 class Sampling(Model):
     """How tokens are drawn and shown.
 
@@ -53,6 +63,7 @@ class Sampling(Model):
             coarse codes has corners, which servos would make heard. 0 is the paper.
         reach: may a code follow another only as fast as faces moved in training (`listeners.sfms.reachable`)? The paper
             has no such rule.
+        nod_size: how large nods come out beside how large they are told to be; of a listener with `events`.
     """
 
     temperature: Positive = 1.0
@@ -60,6 +71,7 @@ class Sampling(Model):
     seam_frames: Count = 4
     smoothing: Share = 0.0
     reach: bool = True
+    nod_size: MadeSize = MadeSize()
 
 
 class Scores(Model):

@@ -81,7 +81,8 @@ class PredictorTraining(Phase):
         group_weights: of each group's loss; 1 where it is not named.
         event_windows: share of windows in whose future an event other than a blink is under way, for listeners that are
             told; what is told decides it, so it changes no odds.
-        calibration_rounds: roll-outs that bring keyframe rates to those of the data.
+        calibration_rounds: roll-outs that bring keyframe rates to those of the data; if any, one more finds how large
+            nods come out of a listener that is told how large they are to be.
     """
 
     transition_weight: Positive = 0.5

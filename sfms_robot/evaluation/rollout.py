@@ -188,9 +188,9 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
     for now in range(0, frames, listener.hop):  # the newest frame heard
         frames_passed = listener.hop if now else 1
         tokens, path = passed(tokens, path, frames_passed, listener.holds)
-        told = control_at(listener, dyad.events or (), now)
-        if told is not None:
-            control, before = told[None].astype(np.float32), later(control, frames_passed)
+        asked = control_at(listener, dyad.events or (), now)
+        if asked is not None:
+            control, before = listener.told([asked]), later(control, frames_passed)
             tokens = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
         seen = Seen(

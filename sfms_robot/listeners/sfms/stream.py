@@ -14,6 +14,7 @@ Between plans nothing is computed: frames are kept, and become features with the
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -41,7 +42,7 @@ from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later
 from sfms_robot.listeners.sfms.reachable import Reach
 from sfms_robot.listeners.sfms.sway import draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.control import COLUMNS
+from sfms_robot.signals.control import COLUMNS, resized
 
 _NO_FACE: Final = np.full(MOTION_DIM, np.nan, np.float32)
 
@@ -223,7 +224,7 @@ class SfmsListener(RunsOnEngine):
         ]
         due = [row for row, memory in enumerate(memories) if self.is_due(memory)]
         if due:
-            told = self._told([None if controls is None else controls[row] for row in due])
+            told = self.told([None if controls is None else controls[row] for row in due])
             planned = self._planned([times_s[row] for row in due], [found[row][1] for row in due], told)
             for row, each in zip(due, planned, strict=True):
                 found[row] = each
@@ -260,8 +261,11 @@ class SfmsListener(RunsOnEngine):
             control[rows] = later(control[rows], frames)
         return tokens, path, control
 
-    def _told(self, controls: Sequence[Floats | None]) -> Floats:
-        """(B, P + H, K). Raises ValueError for another shape, and where nothing is told to one that must be."""
+    def told(self, controls: Sequence[Floats | None]) -> Floats:
+        """What the predictor is told of controls as of `step`, (B, P + H, K): nods so that they come out as asked.
+
+        Raises ValueError for another shape, and where nothing is told to one that must be.
+        """
         rows = sum(self.control_frames)
         if not self._columns and all(one is None for one in controls):
             return np.zeros((len(controls), self.settings.window_frames, 0), np.float32)
@@ -271,7 +275,8 @@ class SfmsListener(RunsOnEngine):
         if any(one.shape != (rows, self._columns) for one in told):
             shapes = ", ".join(str(one.shape) for one in told)
             raise ValueError(f"control has shape {shapes}, not {len(told)} times ({rows}, {self._columns})")
-        return _stacked(told).astype(np.float32)
+        asked, made = _stacked(told).astype(np.float32), self.settings.sampling.nod_size
+        return resized(asked, "nod", made.gain, math.radians(made.offset_deg))
 
     def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
         """Motion (..., N, C), standardised, of frames `first`, `first` + 1, ... -> in the model's space, with the slow
