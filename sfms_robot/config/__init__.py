@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         MadeSize,
         Sampling,
         Sfms,
+        SmileCourse,
     )
     from sfms_robot.config.listener_kinds import load_listener, parse_listener
     from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
@@ -67,6 +68,7 @@ __all__ = [
     "LimitClass",
     "Listener",
     "LoadRule",
+    "MadeSize",
     "Model",
     "Person",
     "Phase",
@@ -76,9 +78,9 @@ __all__ = [
     "Register",
     "RobotDescription",
     "Safety",
-    "MadeSize",
     "Sampling",
     "Sfms",
+    "SmileCourse",
     "Stage",
     "Threshold",
     "TokenizerTraining",
@@ -107,7 +109,7 @@ _NAMES: Final = {
     "config.head": ("Head", "load_head"),
     "config.joint": ("Joint", "JointDefaults", "LimitClass"),
     "config.life": ("Gaze", "Idle", "Life", "Person"),
-    "config.listener": ("ChannelGroup", "Listener", "MadeSize", "Sampling", "Sfms"),
+    "config.listener": ("ChannelGroup", "Listener", "MadeSize", "Sampling", "Sfms", "SmileCourse"),
     "config.listener_kinds": ("load_listener", "parse_listener"),
     "config.mapping": ("Coupling", "Expression", "Fold", "Region"),
     "config.named_bus": ("Bus",),

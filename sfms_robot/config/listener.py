@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -16,6 +16,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
 Placement = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
 GAZE_CHANNELS = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
+CORNERS = ("mouthSmileLeft", "mouthSmileRight")
 
 
 class ChannelGroup(Model):
@@ -54,6 +55,29 @@ class MadeSize(Model):
     offset_deg: Finite = 0.0
 
 
+class SmileCourse(Model):
+    """How a smile that is told goes (`listeners.sfms.smiles`), in shares of its size; found in training dyads.
+
+    Attributes:
+        rise: at `RISE_S` after its beginning. fall: `FALL_S` before its end.
+        spread: deviation of the corners of a mouth (0 to 1) from that which is left to what the predictor draws.
+    """
+
+    RISE_S: ClassVar[tuple[float, ...]] = (0.0, 0.12, 0.24, 0.36, 0.48, 0.6, 0.72, 0.96)
+    FALL_S: ClassVar[tuple[float, ...]] = (0.0, 0.12, 0.24, 0.36, 0.48, 0.6, 0.96)
+
+    spread: Positive
+    rise: tuple[Share, ...] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0)
+    fall: tuple[Share, ...] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 1.0)
+
+    @model_validator(mode="after")
+    def _complete(self) -> SmileCourse:
+        for key, shares, at in (("rise", self.rise, self.RISE_S), ("fall", self.fall, self.FALL_S)):
+            if len(shares) != len(at):
+                raise ValueError(f"{key}: {len(shares)} shares, {len(at)} are needed")
+        return self
+
+
 class Sampling(Model):
     """How tokens are drawn and shown.
 
@@ -64,6 +88,7 @@ class Sampling(Model):
         reach: may a code follow another only as fast as faces moved in training (`listeners.sfms.reachable`)? The paper
             has no such rule.
         nod_size: how large nods come out beside how large they are told to be; of a listener with `events`.
+        smile: the course that smiles keep to, likewise; None: the predictor's own.
     """
 
     temperature: Positive = 1.0
@@ -72,6 +97,7 @@ class Sampling(Model):
     smoothing: Share = 0.0
     reach: bool = True
     nod_size: MadeSize = MadeSize()
+    smile: SmileCourse | None = None
 
 
 class Scores(Model):
@@ -206,6 +232,10 @@ class Sfms(Listener):
                 raise ValueError(f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost")
         if self.sway and not self.events:
             raise ValueError("sway: without events a nod cannot be told from it")
+        if self.sampling.smile is not None and not self.events:
+            raise ValueError("sampling.smile: without events no smile is told")
+        if self.sampling.smile is not None and self.smiling_group is None:
+            raise ValueError(f"sampling.smile: no group holds both of {', '.join(CORNERS)}")
         if self.wav2vec2 is not None and self.audio != "wav2vec2":
             raise ValueError(f"wav2vec2: audio is {self.audio}, which needs no model")
         if self.hop_frames > self.future_frames:
@@ -214,6 +244,11 @@ class Sfms(Listener):
             if width % (2 * self.heads):
                 raise ValueError(f"{key} {width} is not a multiple of twice heads ({self.heads})")
         return self
+
+    @property
+    def smiling_group(self) -> str | None:
+        """The group that holds both corners of the mouth; None: there is none."""
+        return next((name for name, group in self.groups.items() if {*CORNERS} <= {*group.channels}), None)
 
     @property
     def hop_frames(self) -> int:

@@ -1,17 +1,17 @@
-"""The roll-out, brought to the data by what both can be counted on: keyframes, and how large nods are.
+"""The roll-out, brought to the data by what both can be counted on: keyframes, how large nods are, and how smiles go.
 
 Teacher forcing never shows the model its own mistakes, so left to itself it places keyframes somewhat too often or
 too rarely, and looks restless or frozen. A bias on class 0 per group moves that rate.
 
 Nods that are told come out nearer to the usual size than they are told to be: a small network hears a size less well
 than that there is a nod. How much nearer is a line, fitted to nods that were told and what was made of them; a stream
-is told the size that the line turns into the one asked for.
+is told the size that the line turns into the one asked for. How smiles go is taken from the data as it is.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
+from sfms_robot.config.listener import CORNERS
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Dataset, Order, usable
 from sfms_robot.corpora.formats import open_for
@@ -37,6 +38,8 @@ from sfms_robot.listeners.space import MotionSpace
 DYADS = 8  # that are listened to
 NOD_DYADS = 32  # likewise, for their nods
 LEAST_NODS = 20
+SMILE_DYADS = 128  # likewise, for their smiles: nothing is rolled out
+LEAST_SMILES = 10
 GAINS = (0.4, 2.0)  # what is not between them is no answer to what was told
 AROUND_FRAMES = 2  # of a nod, which are looked at
 LARGEST_STEP = 1.0  # of a bias, per round
@@ -59,6 +62,7 @@ def calibrate(
     some = _some(every, settings.window_frames)
     found = calibrated(corrected(training), model, some, training.predictor, each=each)
     if found.events and training.predictor.calibration_rounds:
+        found = coursed(found, _some(every, settings.window_frames, SMILE_DYADS))
         found = sized(found, model, _some(every, settings.window_frames, NOD_DYADS))
         each()
     checkpoint.save_config(out, found)
@@ -149,6 +153,34 @@ def _nods(listener: SfmsListener, dyad: Dyad, rolled: OfflineRollout) -> Doubles
             more = np.ptp(ours[:, first:last], axis=1) - np.ptp(theirs[first:last])
             found += [(nod.size, nod.size + float(each)) for each in more]
     return np.degrees(np.array(found, np.float64).reshape(-1, 2))
+
+
+def coursed(settings: config.Sfms, dyads: Sequence[Dyad]) -> config.Sfms:
+    """`settings` with the median course of smiles of `dyads`, where smiles keep to one; as they are, if too few do."""
+    smile = settings.sampling.smile
+    if smile is None:
+        return settings
+    found = [np.array(rows) for rows in zip(*(row for dyad in dyads for row in _courses(dyad)), strict=True)]
+    if not found or len(found[0]) < LEAST_SMILES:
+        return settings
+    rise, fall = (np.clip(np.median(rows, axis=0), 0, 1).round(3).tolist() for rows in found)
+    told = config.SmileCourse(spread=smile.spread, rise=tuple(rise), fall=tuple(fall))
+    return settings.model_copy(update={"sampling": settings.sampling.model_copy(update={"smile": told})})
+
+
+def _courses(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
+    """Shares of its size at `RISE_S` and `FALL_S` of each smile that is long enough for both, and of no laugh."""
+    corners = dyad.listener[:, [CHANNEL_INDEX[name] for name in CORNERS]].mean(axis=1)
+    times_s = (1 + np.arange(len(corners))) * FRAME_S
+    rise_s, fall_s = np.array(config.SmileCourse.RISE_S), np.array(config.SmileCourse.FALL_S)
+    laughs = [event for event in dyad.events or () if event.kind == "laugh"]
+    for event in dyad.events or ():
+        whole = event.duration_s >= rise_s[-1] + fall_s[-1] and event.start_s >= 0 and event.end_s <= times_s[-1]
+        alone = not any(one.start_s < event.end_s and one.end_s > event.start_s for one in laughs)
+        if event.kind == "smile" and whole and alone:
+            at = (event.start_s + rise_s, event.end_s - fall_s)
+            first, last = (np.interp(when, times_s, corners) / event.size for when in at)
+            yield first, last
 
 
 def _rolled_out(listener: SfmsListener, dyads: Sequence[Dyad], seed: int) -> list[OfflineRollout]:

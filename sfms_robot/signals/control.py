@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_S, Floats, ListenerEvent
+from sfms_robot.frames import FRAME_S, Doubles, Floats, ListenerEvent
 
 # A gaze shift is not among them: the eyes follow `gaze_kinematics`, behind the model.
 KINDS: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "blink")
@@ -73,3 +73,8 @@ def resized(rows: Floats, kind: str, gain: float, offset: float) -> Floats:
     wanted = (rows[..., at + 3] - np.float32(offset / full)) / np.float32(gain)
     out[..., at + 3] = np.where(rows[..., at] > 0, np.clip(wanted, 0.0, BOUND), rows[..., at + 3])
     return out
+
+
+def since_s(told: Floats) -> Doubles:
+    """Column `since` (...,) -> how long the event is under way, seconds; the longest that is told is 10.7."""
+    return np.asarray(_SOFT_S * np.expm1(told.astype(np.float64)))

@@ -4,7 +4,15 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.evaluation.sampling_calibration import GAINS, LEAST_NODS, made_size, placing, sized
+from sfms_robot.evaluation.sampling_calibration import (
+    GAINS,
+    LEAST_NODS,
+    LEAST_SMILES,
+    coursed,
+    made_size,
+    placing,
+    sized,
+)
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
 from sfms_robot.listeners.sfms.model import SfmsModel
 
@@ -107,3 +115,34 @@ def test_sizes_are_found_whatever_was_found_before(told_model):
 @pytest.mark.parametrize("sizes_rad", [[0.04, 0.1], [0.1] * LEAST_NODS, []])
 def test_too_few_nods_or_all_of_a_size_tell_nothing(told_model, sizes_rad):
     assert sized(told_settings(), told_model, [nodding(sizes_rad)]) == told_settings()
+
+
+def smiling(count: int) -> Dyad:
+    """Smiles of many sizes, of 3 s: straight up within 0.96 s, straight down in the last 0.96 s."""
+    motion = np.zeros((100 * (count + 1), 58), np.float32)
+    times_s = (1 + np.arange(len(motion))) * 0.04
+    smiles = []
+    for number in range(count):
+        event = ListenerEvent("smile", 1.0 + 4 * number, 3.0, 0.3 + 0.02 * number)
+        knots_s = np.array([event.start_s, event.start_s + 0.96, event.end_s - 0.96, event.end_s])
+        for name in ("mouthSmileLeft", "mouthSmileRight"):
+            motion[:, CHANNEL_INDEX[name]] += event.size * np.interp(times_s, knots_s, [0, 1, 1, 0])
+        smiles.append(event)
+    frames = len(motion)
+    silence = np.zeros(frames * FRAME_SAMPLES, np.float32)
+    return Dyad("a", silence, motion * 0, motion, np.ones(frames, bool), events=tuple(smiles))
+
+
+def test_the_course_of_smiles_is_found_at_every_size():
+    asked = told_settings(sampling={"smile": {"spread": 0.1}})
+    found = coursed(asked, [smiling(LEAST_SMILES)]).sampling.smile
+    np.testing.assert_allclose(found.rise, np.array(found.RISE_S) / 0.96, atol=2e-3)
+    np.testing.assert_allclose(found.fall, np.array(found.FALL_S) / 0.96, atol=2e-3)
+    assert found.spread == 0.1
+
+
+def test_too_few_smiles_tell_no_course_and_a_listener_without_gets_none():
+    asked = told_settings(sampling={"smile": {"spread": 0.1}})
+    assert coursed(asked, [smiling(LEAST_SMILES - 1)]) == asked
+    assert coursed(asked, []) == asked
+    assert coursed(told_settings(), [smiling(LEAST_SMILES)]) == told_settings()

@@ -29,6 +29,7 @@ from sfms_robot.listeners.engine import Engine
 from sfms_robot.listeners.lots import Use, uniforms
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, LastKeyframes, Tokens, last_keyframes
 from sfms_robot.listeners.sfms.reachable import Reach
+from sfms_robot.listeners.sfms.smiles import ToldSmiles
 from sfms_robot.signals.phase import PHRASE_KNOTS_S, SILENCE_KNOTS_S, SPEECH_KNOTS_S
 
 # 1 at the hats of `phase.features` that stand for silence up to 1.6 s: their sum falls from 1 there to 0 at 3.2 s.
@@ -57,9 +58,9 @@ class Seen:
 class Sampler:
     """How the tokens of one listener are drawn: its predictor, and what its settings say of every group."""
 
-    def __init__(self, settings: config.Sfms, engine: Engine, reach: Reach) -> None:
+    def __init__(self, settings: config.Sfms, engine: Engine, reach: Reach, smiles: ToldSmiles | None = None) -> None:
         groups, common = list(settings.groups.values()), settings.sampling
-        self._engine, self._reach = engine, reach
+        self._engine, self._reach, self._smiles = engine, reach, smiles
         self._temperature = np.float32(common.temperature)
         self._bias = np.array([group.transition_bias for group in groups], np.float32)
         nucleus = [group.nucleus or common.nucleus for group in groups]
@@ -87,9 +88,11 @@ class Sampler:
         guidance = 1 + (self._guidance - 1) * lately[:, None, None]  # (1 or B, G, 1)
         nucleus = self._nucleus_in_silence + (self._nucleus - self._nucleus_in_silence) * lately[:, None]
         chances = self._chances(seeds, frames, window - first)
+        corners = None if self._smiles is None else self._smiles.wanted(seen.control[:, first:])
         for frame in range(first, window):
             (flat,) = self._engine.run("next", slots[..., frame - window, :], *last, np.array([frame - 1]))
-            drawn = self._drawn(flat, last, frame, guidance, nucleus, chances[:, frame - window])
+            wanted = None if corners is None else corners[:, frame - first]
+            drawn = self._drawn(flat, last, frame, guidance, nucleus, chances[:, frame - window], wanted)
             known = tokens[:, frame]
             tokens[:, frame] = np.where(known == UNDECIDED, drawn, known)
             last = last.then(tokens[:, frame], frame)
@@ -105,14 +108,28 @@ class Sampler:
         return np.array(drawn)
 
     def _drawn(
-        self, flat: Floats, last: LastKeyframes, frame: int, guidance: Floats, nucleus: Floats, chance: Doubles
+        self,
+        flat: Floats,
+        last: LastKeyframes,
+        frame: int,
+        guidance: Floats,
+        nucleus: Floats,
+        chance: Doubles,
+        corners: Doubles | None,
     ) -> Tokens:
-        """Tokens (B, G) of `frame` from the logits (B, N, classes of all groups) of the network `next`."""
+        """Tokens (B, G) of `frame` from the logits (B, N, classes of all groups) of the network `next`.
+
+        `corners` (B,): of smiles that are told (`ToldSmiles.wanted`); None: smiles are left to the network.
+        """
         logits = by_group(flat, self._classes)  # (B, N, G, V)
         possible: Floats = guided(logits[:, 0], logits[:, 1], guidance) if logits.shape[1] > 1 else logits[:, 0]
         too_soon = self._reach.too_soon(last.tokens[..., 0], frame - last.at[..., 0])
         np.copyto(possible, np.float32(-np.inf), where=too_soon)
         possible /= self._temperature
+        if self._smiles is not None and corners is not None:
+            group = self._smiles.group
+            smiling, lost = self._smiles.penalties(corners, last.tokens[:, group, 0])
+            possible[smiling, group, : lost.shape[1]] -= lost
         return sample(possible, self._bias, nucleus, chance)
 
     def _lately(self, seen: Seen) -> Floats:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
+from sfms_robot.config.listener import CORNERS
 from sfms_robot.frames import (
     AUDIO_HZ,
     FRAME_S,
@@ -40,6 +41,7 @@ from sfms_robot.listeners.sfms.channels import HEAD, head_channels
 from sfms_robot.listeners.sfms.draw import Sampler, Seen
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
 from sfms_robot.listeners.sfms.reachable import Reach
+from sfms_robot.listeners.sfms.smiles import ToldSmiles
 from sfms_robot.listeners.sfms.sway import draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS, resized
@@ -120,7 +122,17 @@ class SfmsListener(RunsOnEngine):
         own = [[settings.channels.index(name) for name in group.channels] for group in groups]
         sizes, bounded = [group.codes for group in groups], settings.sampling.reach
         reach = Reach(codes[0], own, sizes, self._scales["motion_speed"], bounded)
-        self.sampler = Sampler(settings, engine, reach)
+        self.sampler = Sampler(settings, engine, reach, self._told_smiles(codes[0]))
+
+    def _told_smiles(self, codes: Floats) -> ToldSmiles | None:
+        """Of the standardised motion (V, C) of every code; None: this listener's smiles keep to no course."""
+        smile, name = self.settings.sampling.smile, self.settings.smiling_group
+        if smile is None or name is None:
+            return None
+        at = [self.settings.channels.index(channel) for channel in CORNERS]
+        corners = codes[:, at] * self._scales["motion_std"][at] + self._scales["motion_mean"][at]
+        own = corners[: self.settings.groups[name].codes].mean(axis=1)
+        return ToldSmiles(smile, list(self.settings.groups).index(name), own)
 
     @property
     def hop(self) -> int:

@@ -1,0 +1,120 @@
+"""Laws of the course that a smile keeps to when it is told."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_sfms import plans_of, speech, tiny_listener, told_listener
+
+from sfms_robot.config import SmileCourse
+from sfms_robot.config.listener import CORNERS
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, ListenerEvent
+from sfms_robot.listeners.sfms.smiles import ToldSmiles, course
+from sfms_robot.signals.control import COLUMNS, control_track
+
+SMILE = ListenerEvent("smile", 0.6, 2.4, 0.5)
+LAUGH = ListenerEvent("laugh", 1.0, 1.0, 0.8)
+CODES = np.linspace(0, 1, 11)
+HOW = SmileCourse(spread=0.1)
+FACE = [name for name in BLENDSHAPES if not name.startswith("eyeLook")]
+
+
+def told(*events, how: SmileCourse = HOW):
+    return ToldSmiles(how, 1, CODES).wanted(control_track(events, 0, 90))
+
+
+def test_a_smile_rises_to_its_size_and_is_over_when_it_is_over():
+    wanted = told(SMILE)
+    times_s = (1 + np.arange(90)) * 0.04
+    under_way = (times_s >= SMILE.start_s - 1e-6) & (times_s < SMILE.end_s - 1e-6)
+    np.testing.assert_array_equal(np.isfinite(wanted), under_way)
+    shown = wanted[under_way]
+    peak = int(shown.argmax())
+    assert (np.diff(shown[: peak + 1]) >= -1e-6).all() and (np.diff(shown[peak:]) <= 1e-4).all()
+    assert shown.max() == pytest.approx(SMILE.size, rel=1e-3) and shown[0] < 0.05 and shown[-1] < 0.05
+
+
+@given(st.floats(0, 12), st.floats(0, 12))
+def test_a_course_is_a_share(since_s: float, left_s: float):
+    assert 0 <= float(course(HOW, np.float64(since_s), np.float64(left_s))) <= 1
+
+
+def test_without_a_smile_and_in_a_laugh_nothing_is_wanted():
+    nod = ListenerEvent("nod", 0.2, 1.0, 0.1, swings=2)
+    assert np.isnan(told(nod)).all() and np.isnan(told()).all()
+    both = told(SMILE, LAUGH)
+    laughing = control_track([LAUGH], 0, 90)[:, COLUMNS.index("laugh.active")] > 0
+    assert np.isnan(both[laughing]).all() and np.isfinite(both[~laughing & np.isfinite(told(SMILE))]).all()
+
+
+def test_a_code_loses_the_more_the_further_it_lies_from_the_course():
+    """The transition as much as the code that is held; with none held, as one at rest."""
+    wanted = np.array([np.nan, 0.5, 0.5, 0.2])
+    smiling, lost = ToldSmiles(HOW, 1, CODES).penalties(wanted, np.array([0, 6, 0, 3]))
+    assert smiling.tolist() == [1, 2, 3] and lost.shape == (3, 12) and (lost >= 0).all()
+    np.testing.assert_allclose(lost[0, 1:], (CODES - 0.5) ** 2 / 0.02, rtol=1e-5)
+    np.testing.assert_allclose(lost[:, 0], [lost[0, 6], lost[1, 1], lost[2, 3]])
+
+
+def corners(plans) -> np.ndarray:
+    at = [CHANNEL_INDEX[name] for name in CORNERS]
+    return np.array([plan.frames[0, at].mean() for plan in plans.values()])
+
+
+def test_a_narrow_course_is_kept_to_by_any_weights():
+    """As near as codes allow; without one untrained weights smile at nothing."""
+    how = {"smile": {"spread": 0.01}, "reach": False}
+    before, after = (
+        corners(plans_of(told_listener(hop=1, **how_), speech(70), events=[SMILE])) for how_ in ({}, {"sampling": how})
+    )
+    shown = told(SMILE)[1:71]
+    plateau = np.flatnonzero(shown > 0.95 * SMILE.size)
+    assert np.abs(after[plateau] - SMILE.size).mean() < np.abs(before[plateau] - SMILE.size).mean()
+
+
+def test_smiles_that_are_not_told_are_as_they_were():
+    plain, steered = told_listener(hop=2), told_listener(hop=2, sampling={"smile": {"spread": 0.1}})
+    nod = ListenerEvent("nod", 0.8, 0.8, 0.1, swings=2)
+    before, after = (plans_of(one, speech(50), events=[nod]) for one in (plain, steered))
+    for index, plan in before.items():
+        np.testing.assert_array_equal(after[index].frames, plan.frames)
+
+
+def test_streams_that_smile_beside_others_do_what_each_does_alone():
+    listener = told_listener(hop=2, sampling={"smile": {"spread": 0.05}})
+    past, ahead = listener.control_frames
+    own = ((SMILE,), (), (LAUGH, ListenerEvent("smile", 0.4, 1.5, 0.3)))
+    alone = [plans_of(listener, speech(40), seed, events) for seed, events in zip((1, 2, 3), own, strict=True)]
+    memories = [listener.start(seed) for seed in (1, 2, 3)]
+    for index, frame in enumerate(speech(40)):
+        known = [[e for e in events if e.start_s <= (index + 3) * 0.04 + 1e-9] for events in own]
+        plans, memories = listener.step_many(
+            frame, memories, [control_track(each, index + 1 - past, past + ahead) for each in known]
+        )
+        for plan, each in zip(plans, alone, strict=False):
+            np.testing.assert_allclose(plan.frames, each[index].frames, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "smile, text",
+    [
+        ({"spread": 0.0}, "spread"),
+        ({"spread": 0.1, "rise": [0.0, 1.0]}, "rise: 2 shares, 8 are needed"),
+        ({"spread": 0.1, "fall": [0.0]}, "fall: 1 shares, 7 are needed"),
+    ],
+)
+def test_a_course_that_is_none_is_refused(smile, text):
+    with pytest.raises(ConfigError, match=text):
+        told_listener(sampling={"smile": smile})
+
+
+def test_a_listener_that_cannot_keep_to_one_says_so():
+    with pytest.raises(ConfigError, match="sampling.smile: without events no smile is told"):
+        tiny_listener(sampling={"smile": {"spread": 0.1}})
+    apart = {
+        "one": {"channels": [*POSE_CHANNELS, CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
+        "other": {"channels": [name for name in FACE if name != CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
+    }
+    with pytest.raises(ConfigError, match="sampling.smile: no group holds both of mouthSmileLeft, mouthSmileRight"):
+        told_listener(groups=apart, sampling={"smile": {"spread": 0.1}})
