@@ -36,21 +36,24 @@ _COUNT: Final = MOTION_DIM - SHAPES.start
 
 @dataclass(frozen=True)
 class IdleStream:
-    """One stream's own: frequencies [Hz], factors of cosine and sine, (L, K) each; loadings (K, 52)."""
+    """One stream's own: of every line, which is one cosine, frequency [rad/s], size and phase [rad], (L, K) each;
+    loadings (K, 52).
+    """
 
-    frequency_hz: Doubles
-    cosine: Doubles
-    sine: Doubles
+    frequency: Doubles
+    size: Doubles
+    phase: Doubles
     loadings: Doubles
 
     def added(self, frames: Floats, times_s: Doubles) -> Floats:
         """Motion (N, 58) with the idle motion of times (N,) since the stream began: a new array."""
-        turn = 2 * math.pi * times_s[:, None, None] * self.frequency_hz
-        parts = (self.cosine * np.cos(turn) + self.sine * np.sin(turn)).sum(1)  # (N, K)
-        begun = np.clip(times_s / EASE_S, 0, 1)
+        turn = times_s[:, None, None] * self.frequency
+        turn -= self.phase
+        parts = (self.size * np.cos(turn, out=turn)).sum(1)  # (N, K)
+        begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
         eased = parts * (begun**2 * (3 - 2 * begun))[:, None]
         out = frames.copy()
-        out[:, SHAPES] = np.clip(out[:, SHAPES] + eased @ self.loadings, 0, 1)
+        out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + eased @ self.loadings, 0), 1)
         return out
 
 
@@ -77,7 +80,9 @@ class IdleMotion:
         size = math.exp(self.spread * rng.standard_normal() - self.spread**2)  # of power 1 in the mean
         factors = size * rng.standard_normal((2, bands, LINES, parts)) * (self.amplitude / math.sqrt(LINES))[:, None]
         cosine, sine = factors.reshape(2, bands * LINES, parts)
-        return IdleStream(frequency_hz.reshape(-1, parts), cosine, sine, self.loadings.astype(np.float64))
+        size, phase = np.hypot(cosine, sine), np.arctan2(sine, cosine)
+        frequency = 2 * math.pi * frequency_hz.reshape(-1, parts)
+        return IdleStream(frequency, size, phase, self.loadings.astype(np.float64))
 
     def save(self, file: Path) -> None:
         """Raises ModelError where it cannot be written."""

@@ -8,6 +8,7 @@ and it misses one of a hundred.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -52,7 +53,7 @@ def start() -> Ear:
 
 def step(level_db: float, ear: Ear) -> Ear:
     """One frame of 40 ms; `.active` of the result says whether it is speech. Not finite counts as silence."""
-    level = max(level_db, SILENT_DB) if np.isfinite(level_db) else SILENT_DB
+    level = max(level_db, SILENT_DB) if math.isfinite(level_db) else SILENT_DB
     fall = level < ear.floor_db
     floor = ear.floor_db + (_ATTACK * (level - ear.floor_db) if fall else min(_RISE_DB, level - ear.floor_db))
     rise = level > ear.peak_db

@@ -30,7 +30,7 @@ _NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: somebody who al
 _NEUTRAL_FALL: Final = 0.1
 _MOTION: Final = 0.12
 _SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
-_CORNERS: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
+_CORNERS: Final = CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]
 _JAW: Final = CHANNEL_INDEX["jawOpen"]
 _PITCH: Final = CHANNEL_INDEX["pitch"]
 
@@ -69,12 +69,13 @@ class FaceState:
 
 def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceState]:
     """One frame of 40 ms. Without a face, or with one that holds what is not finite, nothing is seen."""
-    if face is None or not (np.isfinite(face.pose).all() and np.isfinite(face.blendshapes).all()):
+    motion = None if face is None else face.motion
+    if motion is None or not np.isfinite(motion).all():
         return Signs(), changed(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
-    motion = face.motion
-    nods, state = _nod(float(motion[_PITCH]), state)
-    smiles, beams, state = _smile(_within(float(motion[_CORNERS].mean())), state)
-    jaw = _within(float(motion[_JAW]))
+    pitch, left, right, jaw = (motion.item(channel) for channel in (_PITCH, *_CORNERS, _JAW))
+    nods, state = _nod(pitch, state)
+    smiles, beams, state = _smile(_within((left + right) / 2), state)
+    jaw = _within(jaw)
     opening = state.opening + _MOTION * (abs(jaw - state.jaw) - state.opening)
     moves = opening > OPENING
     return Signs(nods, smiles, beams and moves, moves), changed(state, frame=state.frame + 1, jaw=jaw, opening=opening)

@@ -142,7 +142,7 @@ class HazardBank:
         """(..., len(EVIDENCE)) -> (..., T): what each term adds to the log-odds of its kind; NaN and none add 0."""
         k = self._knots
         value = evidence[..., k.column]
-        time = np.minimum(log_time(np.maximum(np.where(k.number, 0.0, value), 0.0)), _LONG_AGO)
+        time = np.minimum(log_time(np.maximum(evidence, 0.0)), _LONG_AGO)[..., k.column]
         hat = np.minimum((time - k.left) * k.left_slope, (k.right - time) * k.right_slope)
         hat = np.minimum(np.maximum(hat, 0.0), 1.0)
         each = np.where(np.isnan(value), 0.0, k.weight * np.where(k.number, value, hat))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +32,7 @@ from sfms_robot.signals.event_sizes import SWINGS_HZ, aside, swings
 
 LEAD_FRAMES: Final = 2  # an event decided with frame n begins behind frame n + 1 + LEAD_FRAMES
 LISTENING_S: Final = 2.0  # somebody else spoke this recently
+_LISTENING: Final = ("silence_s", "own_voice_s", "phrase_s", "last_phrase_s")  # what tells it
 AT_PERSON: Final = (0.0, 0.0)
 # What one thing at a time does: while one of a group is under way none of it begins.
 GROUPS: Final = (
@@ -94,6 +96,7 @@ class EventModel:
         self.bank = HazardBank(tables.hazards)
         self.draws = [EVENT_KINDS.index(kind) for kind in self.bank.kinds]
         self._never: Mapping[str, float] = dict.fromkeys(EVENT_KINDS, 0.0)
+        self.asked_odds = lru_cache(maxsize=64)(self._asked_odds)  # asked for with every frame, by all streams
 
     @classmethod
     def load(cls, file: Path | None = None) -> EventModel:
@@ -181,7 +184,7 @@ class EventModel:
         nods = calmness.nod or self.tables.hazards["nod"].per_minute
         return np.concatenate([sensed.heard, done(history, (sensed.frame + 1) * FRAME_S, math.log(nods))])
 
-    def asked_odds(self, calmness: Calmness) -> list[float]:
+    def _asked_odds(self, calmness: Calmness) -> list[float]:
         """What the rates asked for add to the log-odds of each kind that does not have them among its evidence."""
         learned = self.tables.hazards
         return [
@@ -231,11 +234,8 @@ def _begin_s(frame: int) -> float:
 
 def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) -> frozenset[str]:
     """Kinds that the moment allows."""
-    heard = sensed.heard
-    spoken_to = heard[AT["silence_s"]] <= LISTENING_S and not (
-        np.isnan(heard[AT["phrase_s"]]) and np.isnan(heard[AT["last_phrase_s"]])
-    )
-    listening = spoken_to and heard[AT["own_voice_s"]] > 0
+    silence_s, own_s, phrase_s, last_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
+    listening = silence_s <= LISTENING_S and own_s > 0 and not (math.isnan(phrase_s) and math.isnan(last_s))
     under_way = {event.kind for event in history if event.end_s > now_s and event.kind != "gaze_shift"}
     shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
     if shift is not None and (shift.target_rad != AT_PERSON or shift.start_s > now_s):

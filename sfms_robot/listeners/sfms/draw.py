@@ -37,9 +37,7 @@ SILENCE_LATELY = np.array(
     [0.0] * len(SPEECH_KNOTS_S) + [float(knot <= 1.6) for knot in SILENCE_KNOTS_S] + [0.0] * len(PHRASE_KNOTS_S),
     np.float32,
 )
-NEEDED = 0.5  # of what a class in the nucleus has at least: sums are rounded
-_WORD, _WORD_BITS = np.uint64(0xFFFFFFFF), np.uint64(32)
-LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing, and sorting it takes time
+LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing
 
 
 @dataclass(frozen=True)
@@ -164,35 +162,17 @@ def sample(logits: Floats, bias: Floats, nucleus: Floats, chance: Doubles) -> To
     biased = logits.copy()
     biased[..., 0] += bias
     biased -= biased.max(-1, keepdims=True)
-    likely = np.exp(biased, out=biased)
-    shares = likely.reshape(-1, likely.shape[-1])  # (R, V), a row for every draw
+    shares = np.exp(biased, out=biased).reshape(-1, logits.shape[-1])  # (R, V), a row for every draw
     shares /= shares.sum(-1, keepdims=True)
-    within = (nucleus + np.zeros(likely.shape[:-1], np.float32)).reshape(-1, 1)  # broadcast
-    values, classes = _sorted(shares, NEEDED * (1 - within) / shares.shape[-1])
+    within = np.broadcast_to(nucleus, logits.shape[:-1]).reshape(-1, 1)
+    values = np.sort(shares, axis=-1)[:, : -LIKELIEST - 1 : -1]  # largest first
     mass = values.cumsum(-1)
-    kept = ((mass - values) < within).sum(-1)
+    kept = (mass - values < within).sum(-1)
     row = np.arange(len(mass))
-    whole = mass[row, kept - 1]
-    place = np.minimum((mass <= (chance.reshape(-1) * whole)[:, None]).sum(-1), kept - 1)
-    drawn: Tokens = classes[row, place].astype(np.int64)
-    return drawn.reshape(likely.shape[:-1])
-
-
-def _sorted(shares: Floats, least: NDArray[np.floating]) -> tuple[Floats, NDArray[np.uint64]]:
-    """Shares (R, V) of at least `least` (R, 1): the `LIKELIEST` of each row, largest first, (R, K), and their classes.
-
-    Rows of fewer end in shares of 0. Of V classes that hold a nucleus none has less than a V-th of what is left
-    outside: what is below that need not be sorted.
-    """
-    rows, found = np.divmod(np.flatnonzero(shares >= least), shares.shape[-1])
-    counts = np.bincount(rows, minlength=len(shares))
-    place = np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]
-    # Bits of floats that are not negative rise as they do. Counted down, with the class behind them, they are numbers
-    # that sort in one go: largest first, of equal ones the first class.
-    downwards = _WORD - shares[rows, found].view(np.uint32).astype(np.uint64)
-    keys = np.full((len(shares), int(counts.max())), ~np.uint64(0))
-    keys[rows, place] = (downwards << _WORD_BITS) | found.astype(np.uint64)
-    keys.sort(axis=-1)
-    first = keys[:, :LIKELIEST]
-    values = (_WORD - (first >> _WORD_BITS)).astype(np.uint32).view(np.float32)
-    return values, first & _WORD
+    point = chance.reshape(-1) * mass[row, kept - 1]
+    place = np.minimum((mass <= point[:, None]).sum(-1), kept - 1)
+    value = values[row, place][:, None]
+    alike = shares == value  # mostly that class alone; of several the first ones come first
+    before = place - (values > value).sum(-1)
+    drawn = (alike.cumsum(-1) > before[:, None] if before.any() else alike).argmax(-1)
+    return drawn.reshape(logits.shape[:-1])

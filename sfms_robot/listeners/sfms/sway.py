@@ -7,6 +7,8 @@ drawn from what recorded heads do (Shinozuka's spectral representation of a stat
 
     x(t) = size * sum over lines l of  amplitude[l] * (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a, b ~ N(0, 1)
 
+of which every line is one cosine, |(a, b)| cos(2 pi f t - atan2(b, a)): as such it is kept.
+
 `LINES` frequencies drawn from each of the `BANDS_HZ` per channel, amplitudes fitted to the bands' powers, `size` a
 stream's own manner. A function of time alone: any frame of the future is known, nothing adds up, and after an hour it
 is where it was. It sets in over the first `EASE_S`.
@@ -37,24 +39,26 @@ def draw_sway(amplitude: Floats, spread: float, seed: int) -> Doubles:
         seed: of the stream.
 
     Returns:
-        (3, BANDS * LINES, S) frequencies [Hz], factors of cosine and of sine in units of the motion.
+        (3, BANDS * LINES, S) frequencies [rad/s], sizes in units of the motion, and phases [rad].
     """
     bands, channels = amplitude.shape
     edges = np.array(BANDS_HZ)
     uniform = uniforms(seed, 0, Use.SWAY, bands * LINES * channels).reshape(bands, LINES, channels)
     frequency_hz = edges[:-1, None, None] + uniform * (edges[1:] - edges[:-1])[:, None, None]
     drawn = normals(seed, 1, Use.SWAY, 1 + 2 * bands * LINES * channels).astype(np.float64)
-    size, factors = math.exp(spread * drawn[0]), drawn[1:].reshape(2, bands, LINES, channels)
-    factors = size * factors * (amplitude.astype(np.float64) / math.sqrt(LINES))[:, None]
-    return np.concatenate([frequency_hz[None], factors]).reshape(3, bands * LINES, channels)
+    factors = math.exp(spread * drawn[0]) * drawn[1:].reshape(2, bands, LINES, channels)
+    factors *= (amplitude.astype(np.float64) / math.sqrt(LINES))[:, None]
+    size, phase = np.hypot(*factors), np.arctan2(factors[1], factors[0])
+    return np.stack([2 * math.pi * frequency_hz, size, phase]).reshape(3, bands * LINES, channels)
 
 
 def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
     """Sway (..., 3, L, S) at times (T,) since the stream began, or (..., T) of each -> (..., T, S) in units of the
     motion; 0 before that.
     """
-    frequency_hz, cosine, sine = (sway[..., part, :, :] for part in range(3))
-    turn = 2 * math.pi * times_s[..., None, None] * frequency_hz[..., None, :, :]  # (..., T, L, S)
-    wave = cosine[..., None, :, :] * np.cos(turn) + sine[..., None, :, :] * np.sin(turn)
-    begun = np.clip(times_s / EASE_S, 0, 1)
+    frequency, size, phase = (sway[..., None, part, :, :] for part in range(3))  # (..., 1, L, S)
+    turn = times_s[..., None, None] * frequency  # (..., T, L, S)
+    turn -= phase
+    wave = size * np.cos(turn, out=turn)
+    begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
     return np.asarray(wave.sum(-2) * (begun**2 * (3 - 2 * begun))[..., None], np.float32)
