@@ -35,6 +35,18 @@ def exported_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor
     return out
 
 
+def exported_self_attention(x: Tensor, weight: Tensor, bias: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
+    """`exported_attention` of x (B, T, D) over itself with the product that makes queries, keys and values of it:
+    weight (3D, D), bias (3D,), in this order.
+    """
+    mask = None if seen is None else seen.to(torch.int32)
+    out: Tensor = torch.onnx.ops.symbolic(
+        "com.microsoft::Attention", (x, weight.T, bias, mask), {"num_heads": heads}, dtype=x.dtype, shape=x.shape,
+        version=1,
+    )  # fmt: skip
+    return out
+
+
 def exported_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
     """LayerNorm of x (..., D), then `scale` and `shift`, which broadcast to x, as one operator: for graphs alone."""
     out: Tensor = torch.onnx.ops.symbolic(
@@ -56,9 +68,7 @@ class Attention(nn.Module):
     def forward(self, x: Tensor, memory: Tensor, seen: Tensor | None = None) -> Tensor:
         """`seen` (B, S): True where the memory may be looked at; at least one per row."""
         if torch.compiler.is_exporting():
-            k, v = self.key_value(memory).chunk(2, dim=-1)
-            whole: Tensor = self.out(exported_attention(self.query(x), k, v, self.heads, seen))
-            return whole
+            return self._exported(x, memory, seen)
         (b, t, d), s = x.shape, memory.shape[1]
         q = self.query(x).view(b, t, self.heads, -1).transpose(1, 2)  # (B, h, T, D/h)
         k, v = self.key_value(memory).view(b, s, 2, self.heads, -1).permute(2, 0, 3, 1, 4)  # (B, h, S, D/h)
@@ -66,6 +76,19 @@ class Attention(nn.Module):
         y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         out: Tensor = self.out(y.transpose(1, 2).reshape(b, t, d))
         return out
+
+    def _exported(self, x: Tensor, memory: Tensor, seen: Tensor | None) -> Tensor:
+        """`forward` in as few operators as there are; what hangs on weights alone is worked out with the graph."""
+        own, other = self.query, self.key_value
+        if memory is x:
+            weight, bias = torch.cat([own.weight, other.weight]), torch.cat([own.bias, other.bias])
+            y = exported_self_attention(x, weight, bias, self.heads, seen)
+            return F.linear(y, self.out.weight, self.out.bias)
+        # A bias of all keys changes no softmax, and one of all values is a bias of what is seen of them.
+        k, v = F.linear(memory, other.weight).chunk(2, dim=-1)
+        y = exported_attention(self.query(x), k, v, self.heads, seen)
+        bias = self.out.bias + self.out.weight @ other.bias.chunk(2)[1]
+        return F.linear(y, self.out.weight, bias)
 
 
 class FeedForward(nn.Module):
@@ -106,8 +129,10 @@ class Block(nn.Module):
         `last`: only so many frames at the end of x are wanted (B, last, D); they look at all of it nevertheless.
         """
         y = self.norm(x)
-        wanted = slice(None if last is None else -last, None)
-        x = x[:, wanted] + self.attention(y[:, wanted], y, seen)
+        if last is None:
+            x = x + self.attention(y, y, seen)
+        else:
+            x = x[:, -last:] + self.attention(y[:, -last:], y, seen)
         if self.cross is not None and self.cross_norm is not None and memory is not None:
             x = x + self.cross(self.cross_norm(x), memory, memory_seen)
         out: Tensor = x + self.forward_part(x)
