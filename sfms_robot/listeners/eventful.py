@@ -9,7 +9,8 @@ Of every frame, in this order:
     idle        the small motion of a resting face, where the listener has learned any (`idle_motion`)
 
 An event is decided `LEAD_FRAMES` before it begins, whatever the hop: a plan that is made in between shows it from its
-beginning. What has been decided is never taken back.
+beginning. What has been decided is never taken back. Between plans frames are kept and nothing is decided: only with
+the next plan could it be told.
 
 The model of motion learned from people who sat before a camera. A face further from that than any camera follows
 (upside down, far off) is not one that it is shown; events judge it against its own last second (`events.face_signs`).
@@ -71,8 +72,9 @@ class EventfulMemory:
         when, how: of the events, and of the motion.
         events: decided, and not over since longer than the model looks back; the last gaze shift always.
         news: those of them that no plan has told yet.
-        gaze: state of the eyes after the newest frame, then after every row of the plan in force.
+        gaze: state of the eyes after the newest frame decided upon, then after every row of the plan in force.
         idle: the stream's own idle motion; None: it has none.
+        waiting: frames since then, which events are told of with the next plan.
     """
 
     when: EventMemory
@@ -81,6 +83,7 @@ class EventfulMemory:
     news: tuple[ListenerEvent, ...]
     gaze: tuple[GazeState, ...]
     idle: IdleStream | None = None
+    waiting: tuple[SpeakerFrame, ...] = ()
 
 
 class EventfulListener:
@@ -125,21 +128,24 @@ class EventfulListener:
 
     def calmed(self, memory: EventfulMemory, calmness: Calmness) -> EventfulMemory:
         """The same stream, from now on with other rates."""
+        if memory.waiting:
+            ((_, memory),) = self._decided([memory.waiting], [memory])
         return changed(memory, when=self.when.calmed(memory.when, calmness))
 
     def step(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
-        ((decision, told),) = self._decided([speaker], [memory])
-        plan, how = self.how.step(_believed(speaker), told.how, self._control(speaker, told))
-        return self._looking(plan, decision, changed(told, how=how))
+        return self.step_each([speaker], [memory])[0]
 
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
     ) -> list[tuple[Plan | None, EventfulMemory]]:
         """See `ports.BatchListener`; a motion model that steps one stream at a time is asked for each."""
-        decided = self._decided(speakers, memories)
+        decided = self._heard(speakers, memories)
         told = [memory for _, memory in decided]
-        controls = [self._control(*each) for each in zip(speakers, told, strict=True)]
+        controls = [
+            None if decision is None else self._control(speaker, memory)
+            for speaker, (decision, memory) in zip(speakers, decided, strict=True)
+        ]
         moved = self._move_each([*map(_believed, speakers)], [memory.how for memory in told], controls)
         return [
             self._looking(plan, decision, changed(memory, how=how))
@@ -159,9 +165,9 @@ class EventfulListener:
         self, speaker: SpeakerFrame, memories: Sequence[EventfulMemory]
     ) -> tuple[list[Plan], list[EventfulMemory]]:
         """`step` of streams that began together and heard the same speaker ever since; no plans between hops."""
-        decided = self._decided([speaker] * len(memories), memories)
+        decided = self._heard([speaker] * len(memories), memories)
         told = [memory for _, memory in decided]
-        controls = [self._control(speaker, memory) for memory in told]
+        controls = [None if decision is None else self._control(speaker, memory) for decision, memory in decided]
         plans, hows = self._move_many(_believed(speaker), [memory.how for memory in told], controls)
         found = [
             self._looking(plan, decision, changed(memory, how=how))
@@ -179,33 +185,53 @@ class EventfulListener:
         plans, after = together(speaker, hows, controls)
         return plans or [None] * len(hows), after
 
-    def _decided(
+    def _heard(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
-    ) -> list[tuple[Decision, EventfulMemory]]:
-        """What a frame decides, of each stream, and the memory that knows of it."""
-        past_s = self.how.control_frames[0] * FRAME_S
-        found = []
-        decided = self.when.step_each(speakers, [memory.when for memory in memories])
-        for speaker, memory, (decision, when) in zip(speakers, memories, decided, strict=True):
-            events = _remembered((*memory.events, *decision.events), speaker.time_s - past_s)
-            found.append((decision, changed(memory, when=when, events=events, news=memory.news + decision.events)))
+    ) -> list[tuple[Decision | None, EventfulMemory]]:
+        """What is decided up to a frame that brings a plan, of each stream, and the memory that knows of it; with any
+        other frame nothing is, and it waits.
+        """
+        is_due: Callable[[Any], bool] = getattr(self.how, "is_due", lambda _: True)
+        found: list[tuple[Decision | None, EventfulMemory]] = [
+            (None, memory if is_due(memory.how) else changed(memory, waiting=(*memory.waiting, _kept(speaker))))
+            for speaker, memory in zip(speakers, memories, strict=True)
+        ]
+        due = [row for row, memory in enumerate(memories) if is_due(memory.how)]
+        frames = [(*memories[row].waiting, speakers[row]) for row in due]
+        for row, each in zip(due, self._decided(frames, [memories[row] for row in due]), strict=True):
+            found[row] = each
         return found
 
-    def _control(self, speaker: SpeakerFrame, memory: EventfulMemory) -> Floats | None:
-        """What the motion model is told; None with a frame that brings no plan, for one that can tell."""
-        is_due: Callable[[Any], bool] | None = getattr(self.how, "is_due", None)
-        if is_due is not None and not is_due(memory.how):
-            return None
+    def _decided(
+        self, speakers: Sequence[Sequence[SpeakerFrame]], memories: Sequence[EventfulMemory]
+    ) -> list[tuple[Decision, EventfulMemory]]:
+        """What the frames of each stream decide, as the last one leaves it, and the memory that knows of it."""
+        past_s = self.how.control_frames[0] * FRAME_S
+        told = [(Decision((), {}), memory.when, memory.news) for memory in memories]
+        for at in range(max(map(len, speakers), default=0)):
+            rows = [row for row, own in enumerate(speakers) if at < len(own)]
+            decided = self.when.step_each([speakers[row][at] for row in rows], [told[row][1] for row in rows])
+            for row, (decision, when) in zip(rows, decided, strict=True):
+                told[row] = decision, when, told[row][2] + decision.events
+        found = []
+        for own, memory, (decision, when, news) in zip(speakers, memories, told, strict=True):
+            events = _remembered((*memory.events, *news[len(memory.news) :]), own[-1].time_s - past_s)
+            gaze = memory.gaze[min(len(own), len(memory.gaze) - 1) :]  # so many frames have passed
+            found.append((decision, changed(memory, when=when, events=events, news=news, gaze=gaze, waiting=())))
+        return found
+
+    def _control(self, speaker: SpeakerFrame, memory: EventfulMemory) -> Floats:
+        """What the motion model is told with a frame that brings a plan."""
         past, ahead = self.how.control_frames
         return control_track(memory.events, frame_of(speaker) + 1 - past, past + ahead)
 
     def _looking(
-        self, plan: Plan | None, decision: Decision, memory: EventfulMemory
+        self, plan: Plan | None, decision: Decision | None, memory: EventfulMemory
     ) -> tuple[Plan | None, EventfulMemory]:
         """The plan with eyes, what was decided since the one before, and the memory after it."""
-        newest = memory.gaze[min(1, len(memory.gaze) - 1) :]  # one frame has passed
-        if plan is None:
-            return None, changed(memory, gaze=newest)
+        if plan is None or decision is None:
+            return None, memory
+        newest = memory.gaze
         shifts = [event for event in memory.events if event.target_rad is not None]
         targets = [target_at(shifts, time_s) for time_s in plan.times_s.tolist()]
         head_rad, eyes, states = gaze_kinematics.follow(targets, plan.frames, newest[0])
@@ -225,6 +251,17 @@ def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
     pose = [abs(value) for value in speaker.face.pose.tolist()]
     near = max(pose[:3]) <= TURNED_RAD and max(pose[3:]) <= MOVED_M and not any(map(math.isnan, pose))
     return speaker if near else changed(speaker, face=None)
+
+
+def _kept(speaker: SpeakerFrame) -> SpeakerFrame:
+    """The frame with arrays of its own: whoever gave it may use them again."""
+    face, own = speaker.face, speaker.agent_audio
+    return changed(
+        speaker,
+        audio=np.array(speaker.audio),
+        agent_audio=None if own is None else np.array(own),
+        face=None if face is None else changed(face, pose=np.array(face.pose), blendshapes=np.array(face.blendshapes)),
+    )
 
 
 def frame_of(speaker: SpeakerFrame) -> int:

@@ -182,3 +182,34 @@ def test_control_rows_are_those_the_model_asks_for(lively):
     past, ahead = lively.how.control_frames
     memory = lively.start(0)
     assert lively._control(SpeakerFrame(0.04, np.zeros(0, np.float32)), memory).shape == (past + ahead, len(COLUMNS))
+
+
+def test_frames_may_be_used_again_by_who_gave_them(lively):
+    slow, faces = lively.at_hop(4), np.random.default_rng(0).uniform(0, 0.3, (120, 58))
+    frames = [
+        replace(frame, face=FaceFrame.of(frame.time_s, row)) for frame, row in zip(speech(120), faces, strict=True)
+    ]
+    kept, _ = plans_of(slow, frames)
+    memory, plans = slow.start(1), []
+    for frame in frames:
+        plan, memory = slow.step(frame, memory)
+        plans += [] if plan is None else [plan]
+        frame.audio[:], frame.face.pose[:], frame.face.blendshapes[:] = 1.0, 1.0, 1.0
+    assert any(plan.events for plan in kept)
+    for plan, other in zip(plans, kept, strict=True):
+        assert plan.events == other.events
+        np.testing.assert_array_equal(plan.frames, other.frames)
+
+
+def test_rates_change_from_the_next_frame_on_between_plans_too(lively):
+    slow, told = lively.at_hop(4), []
+    memory = slow.start(5)
+    for index, frame in enumerate(speech(600)):
+        if index == 302:  # two frames wait for a plan
+            assert memory.waiting
+            memory = slow.calmed(memory, NOTHING)
+            assert not memory.waiting
+        plan, memory = slow.step(frame, memory)
+        told += [] if plan is None else [event for event in plan.events if event.draw is not None]
+    begun_s = [event.start_s for event in told]
+    assert min(begun_s) < 12.0 and max(begun_s) <= (302 + LEAD_FRAMES) * FRAME_S + 1e-6

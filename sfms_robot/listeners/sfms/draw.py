@@ -174,5 +174,5 @@ def sample(logits: Floats, bias: Floats, nucleus: Floats, chance: Doubles) -> To
     value = values[row, place][:, None]
     alike = shares == value  # mostly that class alone; of several the first ones come first
     before = place - (values > value).sum(-1)
-    drawn = (alike.cumsum(-1) > before[:, None] if before.any() else alike).argmax(-1)
+    drawn: Tokens = (alike.cumsum(-1) > before[:, None] if before.any() else alike).argmax(-1)
     return drawn.reshape(logits.shape[:-1])
