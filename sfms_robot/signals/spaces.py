@@ -109,8 +109,7 @@ def decode(
     axes, upright = _at_rest(space, *rest.tolist())
 
     motion = np.zeros((len(values), MOTION_DIM))
-    turned = _rotations(known, values[:, known.rotation]) @ upright.T
-    motion[:, POSE][:, :3] = angles_of(axes @ turned @ axes.T)
+    motion[:, POSE][:, :3] = angles_of(axes @ _rotations(known, values[:, known.rotation]) @ upright.T)
     scale = metres_per_unit if metres_per_unit is not None else known.metres_per_unit
     if known.translation is not None and scale is not None and len(values):
         place = values[:, known.translation]
@@ -118,7 +117,8 @@ def decode(
         motion[:, POSE][:, 3:] = scale * (place - home) @ axes.T
 
     if known.jaw is None:
-        motion[:, SHAPES] = np.clip(reorder(values[:, known.expression], "faceverse"), 0.0, 1.0)
+        shapes = reorder(values[:, known.expression], "faceverse")
+        motion[:, SHAPES] = np.minimum(np.maximum(shapes, 0.0), 1.0)
         return Decoded(motion.astype(np.float32), None, None)
     jaw_rad = values[:, known.jaw] @ axes.T
     jaw_open = np.clip(jaw_rad[:, 1] / JAW_FULL_OPEN_RAD, 0.0, 1.0)
@@ -144,8 +144,7 @@ def encode(
     values = np.asarray(motion, dtype=np.float64)
     rest = rest_of(space) if neutral is None else np.asarray(neutral, dtype=np.float64)
     axes, upright = _at_rest(space, *rest[known.rotation].tolist())
-    turned = axes.T @ turned_by(values[:, POSE][:, :3]) @ axes
-    whole = turned @ upright
+    whole = axes.T @ turned_by(values[:, POSE][:, :3]) @ upright
     out = np.tile(rest, (len(values), 1))
     if known.euler:
         out[:, known.rotation] = angles_of(whole)
@@ -190,9 +189,12 @@ def _space(name: str) -> Space:
 
 @lru_cache(maxsize=64)
 def _at_rest(space: str, *rotation: float) -> tuple[Doubles, Doubles]:
-    """A (3, 3) of a space, and the rotation (3, 3) of a face at rest as the space writes it; not to be changed."""
+    """A (3, 3) of a space, and A (3, 3) after the rotation of a face at rest as the space writes it: a head's rotation
+    R is A^T R of ours, then that. Not to be changed.
+    """
     known = _space(space)
-    return np.array(known.axes, dtype=np.float64), _rotations(known, np.array([rotation]))[0]
+    axes = np.array(known.axes, dtype=np.float64)
+    return axes, axes @ _rotations(known, np.array([rotation]))[0]
 
 
 def _rotations(space: Space, values: Doubles) -> Doubles:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sfms_robot.listeners.layers import Block, sinusoidal
 from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Around, Neighbours
@@ -69,10 +70,10 @@ class Inpainter(nn.Module):
         z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places
         # Other frames are neither looked at nor kept; but a gradient, which learned placement needs, passes there.
         rows, seen, found = _every(mask) if around is None else around[2:]
-        z_keys = z_kf.flatten(0, 1)[rows]
+        z_keys = F.embedding(rows, z_kf.flatten(0, 1))
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
-        z_kf = z_keys.flatten(0, 1)[found] * mask.amax(-1, keepdim=True)
+        z_kf = F.embedding(found, z_keys.flatten(0, 1)) * mask.amax(-1, keepdim=True)
         between = neighbours.interpolate(keyed)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
         z_tf = self.transition_in(query) + places

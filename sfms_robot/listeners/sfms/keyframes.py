@@ -39,13 +39,15 @@ class LastKeyframes(NamedTuple):
 
 def last_keyframes(tokens: Tokens) -> LastKeyframes:
     """Tokens (B, T, G) -> the last keyframes at every frame, that frame included; -1 is before the first frame."""
-    frame = np.arange(tokens.shape[1])[:, None]
-    last = np.maximum.accumulate(np.where(tokens > 0, frame, -1), axis=1)
-    earlier = np.concatenate([np.full_like(last[:, :1], -1), last[:, :-1]], axis=1)  # of the frame before
-    before = np.where(last < 0, -1, np.take_along_axis(earlier, np.maximum(last, 0), 1))
-    at = np.stack([last, before], axis=-1)
-    found = [np.take_along_axis(tokens, np.maximum(each, 0), 1) for each in (last, before)]
-    return LastKeyframes(np.where(at < 0, 0, np.stack(found, axis=-1)), at)
+    windows, frames, groups = tokens.shape
+    window, group = np.arange(windows)[:, None, None], np.arange(groups)
+    # Frame -1 before all others holds no keyframe, nor is any before it: it is where those look that have none.
+    known = np.zeros((windows, frames + 1, groups), tokens.dtype)
+    np.maximum(tokens, 0, out=known[:, 1:])
+    last = np.maximum.accumulate(np.where(known > 0, np.arange(frames + 1)[:, None], 0), axis=1)
+    before = np.concatenate([last[:, :1], last[:, :-1]], axis=1)[window, last, group]  # as of the frame before
+    at = np.stack([last, before], axis=-1)[:, 1:]
+    return LastKeyframes(known[window[..., None], at, group[:, None]], at - 1)
 
 
 def around(tokens: Tokens) -> tuple[NDArray[Any], ...]:

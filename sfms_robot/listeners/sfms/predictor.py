@@ -84,7 +84,7 @@ class Predictor(nn.Module):
 
     codes: Tensor
     place: Tensor
-    group: Tensor
+    first: Tensor
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class Predictor(nn.Module):
         place = (classes.cumsum(0) - classes)[:, None] + torch.arange(most + 1)  # row of `classify` of every class
         place = torch.where(torch.arange(most + 1) < classes[:, None], place, int(classes.sum()))
         self.register_buffer("place", place.flatten(), persistent=False)  # classes a group lacks: one row too many
-        self.register_buffer("group", torch.arange(groups)[:, None], persistent=False)
+        self.register_buffer("first", torch.arange(groups)[:, None] * (most + 1), persistent=False)  # row of each group
         self.groups, self.future = groups, future
         described = groups * (2 * grid.shape[1] + 2)
         self.speaker = speaker
@@ -181,7 +181,7 @@ class Predictor(nn.Module):
 
     def describe(self, recent: LastKeyframes, frame: Tensor | int) -> Tensor:
         """Last keyframes (..., G) as seen at `frame`: both codes and how long ago they were, (..., G * (2D + 2))."""
-        codes = self.codes[self.group, recent.tokens]  # (..., G, 2, D)
+        codes = nn.functional.embedding(recent.tokens + self.first, self.codes.flatten(0, 1))  # (..., G, 2, D)
         ages = torch.log1p((frame - recent.at) / AGE_SCALE_FRAMES)
         return torch.cat([codes.flatten(-2), ages], dim=-1).flatten(-2)
 

@@ -56,15 +56,16 @@ class Grid(nn.Module):
     levels: Tensor
     radix: Tensor
     table: Tensor
-    group: Tensor
+    first: Tensor
 
     def __init__(self, levels: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.register_buffer("levels", as_levels(levels), persistent=False)
         self.register_buffer("radix", _radix(self.levels), persistent=False)
         every = torch.arange(max(map(math.prod, levels)))[:, None].expand(-1, len(levels))
-        self.register_buffer("table", indices_to_codes(every, self.levels), persistent=False)  # (V, G, D)
-        self.register_buffer("group", torch.arange(len(levels)), persistent=False)
+        table = indices_to_codes(every, self.levels).transpose(0, 1)  # (G, V, D)
+        self.register_buffer("table", table.flatten(0, 1), persistent=False)
+        self.register_buffer("first", torch.arange(len(levels)) * len(every), persistent=False)  # row of each group
         self.dims = len(levels[0])
 
     def nearest(self, latent: Tensor) -> Tensor:
@@ -77,7 +78,7 @@ class Grid(nn.Module):
 
     def codes(self, indices: Tensor) -> Tensor:
         """(..., G) -> (..., G, D)."""
-        return self.table[indices, self.group]
+        return F.embedding(indices + self.first, self.table)
 
     def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
         """The stop-gradient terms of equation (13): a grid cannot move, and rounding is never far."""
@@ -178,7 +179,7 @@ class Quantizer(nn.Module):
     slots: Tensor
     filled: Tensor
     owner: Tensor
-    slot: Tensor
+    place: Tensor
     levels: Tensor
 
     def __init__(
@@ -204,7 +205,8 @@ class Quantizer(nn.Module):
         self.register_buffer("slots", torch.stack([F.pad(c, (0, most - len(c))) for c in own]), persistent=False)
         self.register_buffer("filled", torch.stack([(torch.arange(most) < len(c)).float() for c in own]), False)
         self.register_buffer("owner", member.argmax(0), persistent=False)
-        self.register_buffer("slot", (member.cumsum(-1) * member).amax(0).long() - 1, persistent=False)
+        slot = ((member.cumsum(-1) * member).amax(0).long() - 1).clamp(min=0)
+        self.register_buffer("place", self.owner * most + slot, persistent=False)  # of a channel in all slots
         sizes = [math.prod(row) for row in levels]
         self.codebook: Grid | Codebook = Grid(levels) if kind == "fsq" else Codebook(sizes, dims)
         self.dims = self.codebook.dims
@@ -226,7 +228,7 @@ class Quantizer(nn.Module):
 
     def by_channel(self, slots: Tensor) -> Tensor:
         """What `decoder` makes, (..., G, slots of a group), in the order of channels (..., C)."""
-        return slots[..., self.owner, self.slot] * self.drawn
+        return slots.flatten(-2).index_select(-1, self.place) * self.drawn
 
     def indices(self, codes: Tensor) -> Tensor:
         """Codes (..., G, D) -> (..., G) from 0."""
