@@ -14,7 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.corpora.compose.ami import Person
+from sfms_robot.corpora.meeting_evidence import meeting_evidence
+from sfms_robot.evaluation.listener_meetings import SHIFT_S
+from sfms_robot.evaluation.reference_hazard import mute
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.learning.events.event_trainer import scene_of
 from sfms_robot.listeners.events.chance import of_instants
 from sfms_robot.listeners.events.evidence import Ints, heard_in
 from sfms_robot.listeners.events.hazards import STEP_FRAMES
@@ -29,6 +34,15 @@ def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) ->
     alone = scene.speaks.copy()
     alone[:, 0] = False
     return heard_in(scene), heard_in(replace(scene, speaks=alone))
+
+
+def annotated(person: Person, frames: int) -> tuple[Doubles, Doubles, Doubles]:
+    """(frames, len(HEARD)) each, what annotators saw of his meeting where a head has a microphone and a camera: given
+    his own voice, without it, and without it where the others are a minute off, as of `ReferenceHazard`.
+    """
+    own, alone = (heard_in(scene_of(meeting_evidence(each))) for each in (person, mute(person)))
+    at = np.minimum(np.arange(frames), len(own) - 1)
+    return own[at], alone[at], np.roll(alone, round(SHIFT_S * FRAME_HZ), axis=0)[at]
 
 
 def forced_hazards(

@@ -267,7 +267,8 @@ def figures_of(sums: Sums) -> dict[str, Figure]:
         figures["nod_deg"] = median("nod_deg_sizes", (SIZES_DEG[1:] + SIZES_DEG[:-1]) / 2)
     if "decided_intervals" in sums:
         figures["decided_interval_ks"] = distance("decided_intervals", "people_intervals")
-    if "nod_hazard_auc" in sums and "r2_nod_hazard_auc" in sums:
-        gained = "nod_hazard_auc_matched_minus_shifted"
-        figures[f"{gained}_of_r2"] = ratio(gained, f"r2_{gained}")
+    gained = "nod_hazard_auc_matched_minus_shifted"
+    for who in ("", "annotated_"):
+        if {f"{who}{gained}", f"r2_{gained}"} <= sums.keys():
+            figures[f"{who}{gained}_of_r2"] = ratio(f"{who}{gained}", f"r2_{gained}")
     return figures

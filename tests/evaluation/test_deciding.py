@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
+from ami_tables import write_tables
 
 from sfms_robot.config import Calmness
+from sfms_robot.corpora.compose.ami import read_people
 from sfms_robot.evaluation import timing
-from sfms_robot.evaluation.deciding import decisions, delayed, forced_hazards, sensed, spans_of
-from sfms_robot.evaluation.listener_meetings import ListenerMeeting, shifted
+from sfms_robot.evaluation.deciding import annotated, decisions, delayed, forced_hazards, sensed, spans_of
+from sfms_robot.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, shifted
+from sfms_robot.evaluation.reference_hazard import mute
 from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, FRAME_SAMPLES
-from sfms_robot.listeners.events.hazards import EventTables
+from sfms_robot.learning.events.event_trainer import student
+from sfms_robot.listeners.events.evidence import HEARD
+from sfms_robot.listeners.events.hazards import STEP_FRAMES, EventTables
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.events.sensing import Sensed
 from sfms_robot.signals.audio import AudioFile
@@ -18,6 +23,7 @@ from sfms_robot.sources.speakers import shipped_speaker
 
 MINUTES = 6
 FRAMES = MINUTES * 60 * FRAME_HZ
+SHIFT_FRAMES = round(SHIFT_S * FRAME_HZ)
 
 
 def model(intercept=-4.0, **nod_weights):
@@ -135,3 +141,14 @@ def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
     assert 3 <= counts.mean() / (frames * FRAME_S / 60) <= 7, "addressed: as many a minute as people's"
     assert 1.28 <= counts.var(ddof=1) / counts.mean() <= 1.82
     assert 0.03 <= (counts == 0).mean() <= 0.15
+
+
+def test_what_annotators_saw_is_what_hazards_were_taught_on(tmp_path):
+    person = read_people(write_tables(tmp_path, until_s=120.0))[0]
+    frames = int(person.until_s * FRAME_HZ)
+    own, alone, elsewhere = annotated(person, frames)
+    for given, told in ((person, own), (mute(person), alone)):
+        taught = student(given, np.random.default_rng(0)).evidence[1:, : len(HEARD)]  # as steps begin
+        assert np.array_equal(told[STEP_FRAMES - 1 :: STEP_FRAMES][: len(taught)], taught, equal_nan=True)
+    assert not np.array_equal(own, alone, equal_nan=True)
+    assert np.array_equal(elsewhere[SHIFT_FRAMES:], alone[:-SHIFT_FRAMES], equal_nan=True)

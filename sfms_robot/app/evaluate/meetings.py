@@ -28,7 +28,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import timing
 from sfms_robot.evaluation.bootstrap import LEVEL, Estimate, Sums, estimates
-from sfms_robot.evaluation.deciding import decisions, delayed, forced_hazards, sensed
+from sfms_robot.evaluation.deciding import annotated, decisions, delayed, forced_hazards, sensed
 from sfms_robot.evaluation.detection import SIZES, Calibration, Sightings, added_up, asked_and_seen, figures
 from sfms_robot.evaluation.listener_meetings import ListenerMeeting, listener_meeting, part, shifted, without_own_voice
 from sfms_robot.evaluation.reference_hazard import ReferenceHazard
@@ -40,7 +40,7 @@ from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.registry import engine_name
 from sfms_robot.ports import Listener
 
-_PREFIXES: Final = {"decided": "decided_", "people": "people_", "R2": "r2_"}
+_PREFIXES: Final = {"annotated": "annotated_", "decided": "decided_", "people": "people_", "R2": "r2_"}
 
 
 @dataclass(frozen=True)
@@ -192,9 +192,9 @@ def _play(task: _Task) -> _Played:
         sums |= timing.hazard_sums("r2_", one, *task.reference.scores(task.person, one.frames))
     seeds = range(1000 * (options.seed + task.number), 1000 * (options.seed + task.number) + options.seeds)
     if isinstance(listener, EventfulListener):
-        sums |= _by_events(listener.when, listener.calmness, one, seeds)
+        sums |= _by_events(listener.when, listener.calmness, task.person, one, seeds)
     if isinstance(listener, EventModel):
-        sums |= _by_events(listener, Calmness(), one, seeds)
+        sums |= _by_events(listener, Calmness(), task.person, one, seeds)
     sightings: Mapping[str, Sightings] = {}
     if frames and not isinstance(listener, EventModel):
         rolled = rollout(listener, without_own_voice(part(one.speaker, first, frames)), seeds)
@@ -210,8 +210,12 @@ def middle(frames: int, minutes: float) -> tuple[int, int]:
     return (frames - wanted) // 2, wanted
 
 
-def _by_events(model: EventModel, calmness: Calmness, one: ListenerMeeting, seeds: Sequence[int]) -> Sums:
-    """How its hazards, given his own history, rank what he did; and what it decides, left to itself."""
+def _by_events(
+    model: EventModel, calmness: Calmness, person: Person, one: ListenerMeeting, seeds: Sequence[int]
+) -> Sums:
+    """How its hazards, given his own history, rank what he did, once as annotators saw the others, without what sensing
+    loses; and what it decides, left to itself.
+    """
     history = one.history
     with_voice, heard = sensed(one.speaker, calmness)
     _, elsewhere = sensed(shifted(one.speaker), calmness)
@@ -219,6 +223,8 @@ def _by_events(model: EventModel, calmness: Calmness, one: ListenerMeeting, seed
     silent = forced_hazards(model, heard, history, calmness)
     other = forced_hazards(model, elsewhere, history, calmness)
     sums = timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
+    seen = [forced_hazards(model, each, history, calmness)["nod"] for each in annotated(person, one.frames)]
+    sums |= timing.hazard_sums("annotated_", one, *seen)
     for kind in timing.ANNOTATED:
         sums[f"{kind}_hazard_auc"] = timing.ranked(speaking[kind], one, kind)
     return sums | timing.decided_sums(one, decisions(model, heard, seeds, calmness))

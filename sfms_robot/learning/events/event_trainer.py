@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.corpora.compose.ami import Person
-from sfms_robot.corpora.meeting_evidence import meeting_evidence
+from sfms_robot.corpora.meeting_evidence import MeetingEvidence, meeting_evidence
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.learning.events import logistic
 from sfms_robot.learning.events.labels import Lesson, Looks, lesson, looks_of, minutes, spans_of, steps_of
@@ -103,7 +103,7 @@ class Student:
 def student(person: Person, rng: np.random.Generator) -> Student:
     """Evidence and lessons of one person; `rng` draws the events that nobody annotated."""
     meeting = meeting_evidence(person)
-    scene = Scene(meeting.speaks, meeting.looks, meeting.laughs, meeting.nods, np.zeros_like(meeting.laughs))
+    scene = scene_of(meeting)
     spans = spans_of(person, meeting, rng)
     nods = _begun_in(spans["nod"], meeting.listening)
     looks = looks_of(person, meeting, counts_in(scene)) if person.gaze is not None else None
@@ -122,6 +122,11 @@ def student(person: Person, rng: np.random.Generator) -> Student:
         np.asarray(meeting.speaks[:, 1:].any(axis=1)),
         lessons,
     )
+
+
+def scene_of(meeting: MeetingEvidence) -> Scene:
+    """As annotators saw it; nobody annotated smiles."""
+    return Scene(meeting.speaks, meeting.looks, meeting.laughs, meeting.nods, np.zeros_like(meeting.laughs))
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
