@@ -45,6 +45,7 @@ CHANNEL_INDEX: Final[Mapping[str, int]] = {name: index for index, name in enumer
 POSE: Final = slice(0, 6)
 SHAPES: Final = slice(6, 58)
 MOTION_DIM: Final = len(CHANNELS)  # 58
+SMILE_CORNERS: Final = ("mouthSmileLeft", "mouthSmileRight")  # of the mouth: what tells a smile
 
 # Columns of each motion space a listener may work in (`signals.spaces`); arkit58 is a motion array itself.
 _AXES: Final = ("x", "y", "z")

@@ -9,14 +9,13 @@ from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, Positive
 from sfms_robot.config.hop import default_hop
-from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS
+from sfms_robot.frames import BLENDSHAPES, SMILE_CORNERS, SPACE_CHANNELS
 
 Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
 Placement = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
 GAZE_CHANNELS = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
-CORNERS = ("mouthSmileLeft", "mouthSmileRight")
 
 
 class ChannelGroup(Model):
@@ -235,7 +234,7 @@ class Sfms(Listener):
         if self.sampling.smile is not None and not self.events:
             raise ValueError("sampling.smile: without events no smile is told")
         if self.sampling.smile is not None and self.smiling_group is None:
-            raise ValueError(f"sampling.smile: no group holds both of {', '.join(CORNERS)}")
+            raise ValueError(f"sampling.smile: no group holds both of {', '.join(SMILE_CORNERS)}")
         if self.wav2vec2 is not None and self.audio != "wav2vec2":
             raise ValueError(f"wav2vec2: audio is {self.audio}, which needs no model")
         if self.hop_frames > self.future_frames:
@@ -248,7 +247,7 @@ class Sfms(Listener):
     @property
     def smiling_group(self) -> str | None:
         """The group that holds both corners of the mouth; None: there is none."""
-        return next((name for name, group in self.groups.items() if {*CORNERS} <= {*group.channels}), None)
+        return next((name for name, group in self.groups.items() if {*SMILE_CORNERS} <= {*group.channels}), None)
 
     @property
     def hop_frames(self) -> int:

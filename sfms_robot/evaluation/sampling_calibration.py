@@ -19,12 +19,11 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
-from sfms_robot.config.listener import CORNERS
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import Dataset, Order, usable
 from sfms_robot.corpora.formats import open_for
 from sfms_robot.evaluation.rollout import OfflineRollout, offline_rollout
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Doubles
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, Doubles
 from sfms_robot.learning.corpus import without_gaze
 from sfms_robot.learning.sfms.features import gather
 from sfms_robot.learning.sfms.predictor_trainer import corrected
@@ -114,17 +113,18 @@ def sized(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: 
 
     Left as they are where the dyads hold fewer than `LEAST_NODS`, or all of one size.
     """
-    plain = settings.model_copy(
-        update={"sampling": settings.sampling.model_copy(update={"nod_size": config.MadeSize()})}
-    )
+    plain = _sampling(settings, nod_size=config.MadeSize())
     listener = SfmsListener(plain, torch_engine(plain, model.eval()))
     rolled = _rolled_out(listener, dyads, seed)
     told, made = np.concatenate([_nods(listener, *each) for each in zip(dyads, rolled, strict=True)]).T
     if len(told) < LEAST_NODS * STREAMS or np.ptp(told) < 1.0:
         return settings
-    return settings.model_copy(
-        update={"sampling": settings.sampling.model_copy(update={"nod_size": made_size(told, made)})}
-    )
+    return _sampling(settings, nod_size=made_size(told, made))
+
+
+def _sampling(settings: config.Sfms, **changes: config.MadeSize | config.SmileCourse) -> config.Sfms:
+    """`settings` that sample otherwise."""
+    return settings.model_copy(update={"sampling": settings.sampling.model_copy(update=changes)})
 
 
 def made_size(told_deg: Doubles, made_deg: Doubles) -> config.MadeSize:
@@ -164,13 +164,12 @@ def coursed(settings: config.Sfms, dyads: Sequence[Dyad]) -> config.Sfms:
     if not found or len(found[0]) < LEAST_SMILES:
         return settings
     rise, fall = (np.clip(np.median(rows, axis=0), 0, 1).round(3).tolist() for rows in found)
-    told = config.SmileCourse(spread=smile.spread, rise=tuple(rise), fall=tuple(fall))
-    return settings.model_copy(update={"sampling": settings.sampling.model_copy(update={"smile": told})})
+    return _sampling(settings, smile=config.SmileCourse(spread=smile.spread, rise=tuple(rise), fall=tuple(fall)))
 
 
 def _courses(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
     """Shares of its size at `RISE_S` and `FALL_S` of each smile that is long enough for both, and of no laugh."""
-    corners = dyad.listener[:, [CHANNEL_INDEX[name] for name in CORNERS]].mean(axis=1)
+    corners = dyad.listener[:, [CHANNEL_INDEX[name] for name in SMILE_CORNERS]].mean(axis=1)
     times_s = (1 + np.arange(len(corners))) * FRAME_S
     rise_s, fall_s = np.array(config.SmileCourse.RISE_S), np.array(config.SmileCourse.FALL_S)
     laughs = [event for event in dyad.events or () if event.kind == "laugh"]

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfms_robot.frames import CHANNEL_INDEX
+from sfms_robot.frames import CHANNEL_INDEX, SMILE_CORNERS
 from sfms_robot.signals.peaks import band_pass, find_peaks, half_widths
 
 Event = tuple[float, float, float]
@@ -106,7 +106,7 @@ class EventKind:
 
 
 _LIDS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
-_CORNERS: Final = [CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]]
+_CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
 
 # What counts as a nod, a blink, a smile of a face: for the report, for callbacks, for whoever asks.
 MOTION_EVENTS: Final[Mapping[str, EventKind]] = {

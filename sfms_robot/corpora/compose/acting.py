@@ -22,6 +22,7 @@ from sfms_robot.frames import (
     MOTION_DIM,
     POSE,
     SHAPES,
+    SMILE_CORNERS,
     Doubles,
     Floats,
     ListenerEvent,
@@ -32,7 +33,7 @@ from sfms_robot.signals.events import runs
 
 NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay below 1800 deg/s^2
 _FADE: Final = FRAME_HZ
-_CORNERS: Final = [SHAPE["mouthSmileLeft"], SHAPE["mouthSmileRight"]]
+_CORNERS: Final = [SHAPE[name] for name in SMILE_CORNERS]
 _LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
 _MIRROR: Final = [
     BLENDSHAPES.index(

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, FaceFrame, changed
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, FaceFrame, changed
 
 NOD_RAD: Final = math.radians(2.0)  # a swing there, within a second, and most of it back
 BACK: Final = 0.6
@@ -30,7 +30,7 @@ _NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: somebody who al
 _NEUTRAL_FALL: Final = 0.1
 _MOTION: Final = 0.12
 _SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
-_CORNERS: Final = CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["mouthSmileRight"]
+_CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
 _JAW: Final = CHANNEL_INDEX["jawOpen"]
 _PITCH: Final = CHANNEL_INDEX["pitch"]
 

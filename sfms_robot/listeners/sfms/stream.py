@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
-from sfms_robot.config.listener import CORNERS
 from sfms_robot.frames import (
     AUDIO_HZ,
     FRAME_S,
     FRAME_SAMPLES,
     MOTION_DIM,
+    SMILE_CORNERS,
     Doubles,
     Floats,
     Plan,
@@ -129,7 +129,7 @@ class SfmsListener(RunsOnEngine):
         smile, name = self.settings.sampling.smile, self.settings.smiling_group
         if smile is None or name is None:
             return None
-        at = [self.settings.channels.index(channel) for channel in CORNERS]
+        at = [self.settings.channels.index(channel) for channel in SMILE_CORNERS]
         corners = codes[:, at] * self._scales["motion_std"][at] + self._scales["motion_mean"][at]
         own = corners[: self.settings.groups[name].codes].mean(axis=1)
         return ToldSmiles(smile, list(self.settings.groups).index(name), own)

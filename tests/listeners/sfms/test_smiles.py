@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from tiny_sfms import plans_of, speech, tiny_listener, told_listener
 
 from sfms_robot.config import SmileCourse
-from sfms_robot.config.listener import CORNERS
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, ListenerEvent
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, SMILE_CORNERS, ListenerEvent
 from sfms_robot.listeners.sfms.smiles import ToldSmiles, course
 from sfms_robot.signals.control import COLUMNS, control_track
 
@@ -58,7 +57,7 @@ def test_a_code_loses_the_more_the_further_it_lies_from_the_course():
 
 
 def corners(plans) -> np.ndarray:
-    at = [CHANNEL_INDEX[name] for name in CORNERS]
+    at = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
     return np.array([plan.frames[0, at].mean() for plan in plans.values()])
 
 
@@ -113,8 +112,12 @@ def test_a_listener_that_cannot_keep_to_one_says_so():
     with pytest.raises(ConfigError, match="sampling.smile: without events no smile is told"):
         tiny_listener(sampling={"smile": {"spread": 0.1}})
     apart = {
-        "one": {"channels": [*POSE_CHANNELS, CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
-        "other": {"channels": [name for name in FACE if name != CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
+        "one": {"channels": [*POSE_CHANNELS, SMILE_CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
+        "other": {
+            "channels": [name for name in FACE if name != SMILE_CORNERS[0]],
+            "levels": (3, 2),
+            "keyframe_cost": 1.0,
+        },
     }
     with pytest.raises(ConfigError, match="sampling.smile: no group holds both of mouthSmileLeft, mouthSmileRight"):
         told_listener(groups=apart, sampling={"smile": {"spread": 0.1}})
