@@ -20,6 +20,8 @@ HABIT_SPREAD: Final = 0.2  # from person to person
 SWINGS_HZ: Final = (1.8, 3.0)  # pace of a person's nods: there and back
 MOST_SWINGS: Final = 4
 SWING_S: Final = (0.3, 0.66)
+# Seconds of a swing, and how many degrees far recorded nods then get on a neck that gives 1600 deg/s^2 (median).
+SWING_REACH: Final = ((0.3, 0.34, 0.38, 0.42, 0.5), (5.4, 6.9, 7.4, 9.1, 12.0))
 SHAKE: Final = 0.8  # of a nod's size
 TILT_DEG: Final = (2.0, 6.0)
 LAUGH: Final = (0.5, 0.9)
@@ -40,6 +42,11 @@ def swings(length_s: float, pace_hz: float) -> tuple[int, float]:
     """How often a head goes there and back in about that time, and how long that takes it."""
     count = int(min(max(round(length_s * pace_hz), 1), MOST_SWINGS))
     return count, count * min(max(length_s / count, SWING_S[0]), SWING_S[1])
+
+
+def swing_reach_rad(swing_s: float) -> float:
+    """How far, peak to peak, a head gets there and back within that time."""
+    return math.radians(float(np.interp(swing_s, *SWING_REACH)))
 
 
 def aside(angle_rad: float, side: float, up: float) -> tuple[float, float]:

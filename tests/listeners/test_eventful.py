@@ -80,6 +80,13 @@ def test_each_event_is_told_once_before_it_begins_and_with_why(lively):
     assert drawn and all(event.draw < event.probability and event.evidence for event in drawn)
 
 
+@pytest.mark.parametrize("hop", [1, 2, 4])
+def test_a_plan_tells_of_an_event_before_the_first_frame_that_shows_it(when, hop):
+    plans, _ = plans_of(EventfulListener(told_listener(hop=hop), when, LIVELY), speech(300))
+    begun = [(plan.times_s[0] - FRAME_S, event.start_s) for plan in plans for event in plan.events]
+    assert begun and all(start_s >= shown_s - 1e-6 for shown_s, start_s in begun)
+
+
 def test_the_same_frames_are_the_same_plans_and_a_step_changes_no_memory(lively):
     speaker = speech(60)
     (plans, memory), (again, _) = plans_of(lively, speaker), plans_of(lively, speaker)

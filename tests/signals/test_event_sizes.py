@@ -3,7 +3,21 @@
 import numpy as np
 import pytest
 
-from sfms_robot.signals.event_sizes import ASIDE_DEG, ASIDE_MEAN_S, SWING_S, aside, aside_rad, aside_s, swings
+from sfms_robot.corpora.compose import acting
+from sfms_robot.corpora.compose.motions import load
+from sfms_robot.data import data_dir
+from sfms_robot.signals.event_sizes import (
+    ASIDE_DEG,
+    ASIDE_MEAN_S,
+    NOD_DEG,
+    SWING_REACH,
+    SWING_S,
+    aside,
+    aside_rad,
+    aside_s,
+    swing_reach_rad,
+    swings,
+)
 
 
 def test_looks_aside_are_peoples():
@@ -24,3 +38,11 @@ def test_as_often_to_the_left_as_to_the_right_and_as_far_as_asked():
 def test_a_swing_is_never_faster_nor_slower_than_a_neck_goes(length_s):
     count, lasts_s = swings(length_s, 2.4)
     assert 1 <= count <= 4 and SWING_S[0] <= lasts_s / count <= SWING_S[1]
+
+
+def test_a_swing_reaches_as_far_as_recorded_ones_do_in_that_time():
+    nods = load(data_dir("sim") / "listeners" / "motions.npz")["train"].nods
+    for swing_s in SWING_REACH[0]:
+        manner = acting.NodManner(np.deg2rad(NOD_DEG[2]), 1, swing_s, 1.0)
+        reached = np.median([np.ptp(acting.nod_curve(manner, shape, 0.4, 50)) for shape in nods])
+        assert np.degrees(swing_reach_rad(swing_s)) == pytest.approx(np.degrees(reached), rel=0.1)

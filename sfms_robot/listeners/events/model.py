@@ -2,8 +2,8 @@
 
     person's frame -> evidence (sensing) -> log-odds of each kind (hazards) -> a number drawn falls below: event
 
-A hazard is asked every 80 ms. What is decided begins `LEAD_FRAMES` after the next frame's beginning, so that a plan
-made every second frame still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a
+A hazard is asked every 80 ms. What is decided begins `LEAD_FRAMES` later, so that a plan made every fourth frame still
+shows its onset, and is never taken back. Nothing of the head happens inside a nod, a
 shake or a tilt; nobody nods, laughs or says "mm-hm" who is speaking or has not been spoken to for two seconds.
 
 Laws: the same evidence and seed give the same events; a later frame changes nothing before; memory is never changed in
@@ -28,9 +28,9 @@ from sfms_robot.listeners.events import chance
 from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
 from sfms_robot.listeners.events.hazards import FILE, STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
 from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
-from sfms_robot.signals.event_sizes import SWINGS_HZ, aside, swings
+from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
 
-LEAD_FRAMES: Final = 2  # an event decided with frame n begins behind frame n + 1 + LEAD_FRAMES
+LEAD_FRAMES: Final = 3  # an event decided with frame n begins behind frame n + LEAD_FRAMES
 LISTENING_S: Final = 2.0  # somebody else spoke this recently
 _LISTENING: Final = ("silence_s", "own_voice_s", "phrase_s", "last_phrase_s")  # what tells it
 AT_PERSON: Final = (0.0, 0.0)
@@ -203,7 +203,7 @@ class EventModel:
         return (ListenerEvent("gaze_shift", _begin_s(frame), until_s, shift.size, target_rad=AT_PERSON),)
 
     def shaped(self, kind: str, frame: int, seed: int) -> ListenerEvent:
-        """How long, how large, where to: by lot."""
+        """How long, how large, where to: by lot; no larger than a head gets within a swing."""
         shape = self.tables.shapes[kind]
         long, large, side, up = chance.of_event(seed, frame, kind, 4).tolist()
         habit, pace = chance.of_habit(seed, kind, 2).tolist()
@@ -214,6 +214,7 @@ class EventModel:
         times = 1
         if kind in SWINGING:
             times, duration_s = swings(duration_s, quantile(shape.swings_hz or SWINGS_HZ, pace))
+            size = min(size, swing_reach_rad(duration_s / times) * (SHAKE if kind == "shake" else 1.0))
         target = aside(size, side, up) if kind == "gaze_shift" else None
         return ListenerEvent(kind, _begin_s(frame), duration_s, size, times, target)
 
