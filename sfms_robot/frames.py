@@ -55,6 +55,8 @@ SPACE_CHANNELS: Final[Mapping[str, tuple[str, ...]]] = {
     "deca56": (*(f"expression_{i}" for i in range(50)), *(f"head_{a}" for a in _AXES), *(f"jaw_{a}" for a in _AXES)),
 }
 
+PITCH_CHANNEL: Final[Mapping[str, str]] = {"arkit58": "pitch", "faceverse58": "rotation_x", "deca56": "head_x"}
+
 # The order of Apple's ARKit header (eyes, jaw, mouth, brows, cheeks, nose, tongue).
 _APPLE: Final = (
     "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft",

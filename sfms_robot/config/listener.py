@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, Positive
 from sfms_robot.config.hop import default_hop
-from sfms_robot.frames import BLENDSHAPES, SMILE_CORNERS, SPACE_CHANNELS
+from sfms_robot.frames import BLENDSHAPES, PITCH_CHANNEL, SMILE_CORNERS, SPACE_CHANNELS
 
 Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -44,18 +44,8 @@ class ChannelGroup(Model):
         return math.prod(self.levels)
 
 
-class MadeSize(Model):
-    """How large events come out of a listener that is told how large to make them: `gain` times that, and `offset_deg`.
-
-    Found by roll-outs on training dyads after training; a stream is told other sizes by as much (`signals.control`).
-    """
-
-    gain: Positive = 1.0
-    offset_deg: Finite = 0.0
-
-
 class SmileCourse(Model):
-    """How a smile that is told goes (`listeners.sfms.smiles`), in shares of its size; found in training dyads.
+    """How a smile that is told goes (`listeners.sfms.courses`), in shares of its size; found in training dyads.
 
     Attributes:
         rise: at `RISE_S` after its beginning. fall: `FALL_S` before its end.
@@ -77,6 +67,18 @@ class SmileCourse(Model):
         return self
 
 
+class NodCourse(Model):
+    """How a nod that is told goes (`listeners.sfms.courses`), in shares of its size.
+
+    Attributes:
+        fall: how large each swing is beside the one before it; found in training dyads.
+        spread: deviation, where swings turn, that is left to what the predictor draws.
+    """
+
+    spread: Positive
+    fall: Share = 0.8
+
+
 class Sampling(Model):
     """How tokens are drawn and shown.
 
@@ -86,8 +88,7 @@ class Sampling(Model):
             coarse codes has corners, which servos would make heard. 0 is the paper.
         reach: may a code follow another only as fast as faces moved in training (`listeners.sfms.reachable`)? The paper
             has no such rule.
-        nod_size: how large nods come out beside how large they are told to be; of a listener with `events`.
-        smile: the course that smiles keep to, likewise; None: the predictor's own.
+        nod, smile: the course that they keep to, of a listener with `events`; None: the predictor's own.
     """
 
     temperature: Positive = 1.0
@@ -95,7 +96,7 @@ class Sampling(Model):
     seam_frames: Count = 4
     smoothing: Share = 0.0
     reach: bool = True
-    nod_size: MadeSize = MadeSize()
+    nod: NodCourse | None = None
     smile: SmileCourse | None = None
 
 
@@ -231,8 +232,9 @@ class Sfms(Listener):
                 raise ValueError(f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost")
         if self.sway and not self.events:
             raise ValueError("sway: without events a nod cannot be told from it")
-        if self.sampling.smile is not None and not self.events:
-            raise ValueError("sampling.smile: without events no smile is told")
+        for kind in ("nod", "smile"):
+            if getattr(self.sampling, kind) is not None and not self.events:
+                raise ValueError(f"sampling.{kind}: without events no {kind} is told")
         if self.sampling.smile is not None and self.smiling_group is None:
             raise ValueError(f"sampling.smile: no group holds both of {', '.join(SMILE_CORNERS)}")
         if self.wav2vec2 is not None and self.audio != "wav2vec2":
@@ -248,6 +250,12 @@ class Sfms(Listener):
     def smiling_group(self) -> str | None:
         """The group that holds both corners of the mouth; None: there is none."""
         return next((name for name, group in self.groups.items() if {*SMILE_CORNERS} <= {*group.channels}), None)
+
+    @property
+    def nodding_group(self) -> str:
+        """The group that turns the head up and down."""
+        pitch = PITCH_CHANNEL[self.motion_space]
+        return next(name for name, group in self.groups.items() if pitch in group.channels)
 
     @property
     def hop_frames(self) -> int:

@@ -1,17 +1,16 @@
-"""The roll-out, brought to the data by what both can be counted on: keyframes, how large nods are, and how smiles go.
+"""The roll-out, brought to the data by what both can be counted on: keyframes, and how nods and smiles go.
 
 Teacher forcing never shows the model its own mistakes, so left to itself it places keyframes somewhat too often or
 too rarely, and looks restless or frozen. A bias on class 0 per group moves that rate.
 
-Nods that are told come out nearer to the usual size than they are told to be: a small network hears a size less well
-than that there is a nod. How much nearer is a line, fitted to nods that were told and what was made of them; a stream
-is told the size that the line turns into the one asked for. How smiles go is taken from the data as it is.
+How the nods and smiles of the data go, for a listener that keeps to their course, is taken from them as it is.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,12 +34,8 @@ from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
 
 DYADS = 8  # that are listened to
-NOD_DYADS = 32  # likewise, for their nods
-LEAST_NODS = 20
-SMILE_DYADS = 128  # likewise, for their smiles: nothing is rolled out
-LEAST_SMILES = 10
-GAINS = (0.4, 2.0)  # what is not between them is no answer to what was told
-AROUND_FRAMES = 2  # of a nod, which are looked at
+COURSE_DYADS = 128  # likewise, for their nods and smiles: nothing is rolled out
+LEAST = 10  # of a kind, to tell its course
 LARGEST_STEP = 1.0  # of a bias, per round
 STREAMS = 4  # of every dyad, side by side
 
@@ -61,8 +56,7 @@ def calibrate(
     some = _some(every, settings.window_frames)
     found = calibrated(corrected(training), model, some, training.predictor, each=each)
     if found.events and training.predictor.calibration_rounds:
-        found = coursed(found, _some(every, settings.window_frames, SMILE_DYADS))
-        found = sized(found, model, _some(every, settings.window_frames, NOD_DYADS))
+        found = coursed(found, _some(every, settings.window_frames, COURSE_DYADS))
         each()
     checkpoint.save_config(out, found)
 
@@ -108,66 +102,36 @@ def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed
     return settings.model_copy(update={"groups": groups})
 
 
-def sized(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: int = 1) -> config.Sfms:
-    """`settings` that know how large nods come out, found on `dyads` whose nods are told at their own sizes.
-
-    Left as they are where the dyads hold fewer than `LEAST_NODS`, or all of one size.
-    """
-    plain = _sampling(settings, nod_size=config.MadeSize())
-    listener = SfmsListener(plain, torch_engine(plain, model.eval()))
-    rolled = _rolled_out(listener, dyads, seed)
-    told, made = np.concatenate([_nods(listener, *each) for each in zip(dyads, rolled, strict=True)]).T
-    if len(told) < LEAST_NODS * STREAMS or np.ptp(told) < 1.0:
-        return settings
-    return _sampling(settings, nod_size=made_size(told, made))
-
-
-def _sampling(settings: config.Sfms, **changes: config.MadeSize | config.SmileCourse) -> config.Sfms:
-    """`settings` that sample otherwise."""
-    return settings.model_copy(update={"sampling": settings.sampling.model_copy(update=changes)})
-
-
-def made_size(told_deg: Doubles, made_deg: Doubles) -> config.MadeSize:
-    """The line, by least squares, from sizes told (K,) to sizes made (K,): all the error is in what is made."""
-    gain, offset_deg = np.polyfit(told_deg, made_deg, 1)
-    kept = float(np.clip(gain, *GAINS))
-    if kept != gain:
-        offset_deg = np.mean(made_deg) - kept * np.mean(told_deg)
-    return config.MadeSize(gain=round(kept, 3), offset_deg=round(float(offset_deg), 3))
-
-
-def _nods(listener: SfmsListener, dyad: Dyad, rolled: OfflineRollout) -> Doubles:
-    """(K, 2) of the nods of one dyad in every stream: degrees told, and made.
-
-    What else a head does meanwhile widens its way in a roll-out as in the dyad: only the difference of both counts.
-    """
-    streams, frames, _ = rolled.motion.shape
-    faces, _ = listener.space.decode(rolled.motion.flatten(0, 1).numpy())
-    ours = faces[:, CHANNEL_INDEX["pitch"]].reshape(streams, frames)
-    theirs = without_gaze(dyad).listener[:, CHANNEL_INDEX["pitch"]]
-    found = []
-    for nod in dyad.events or ():
-        first = max(0, round(nod.start_s / FRAME_S) - AROUND_FRAMES)
-        last = round(nod.end_s / FRAME_S) + AROUND_FRAMES
-        if nod.kind == "nod" and last <= frames:
-            more = np.ptp(ours[:, first:last], axis=1) - np.ptp(theirs[first:last])
-            found += [(nod.size, nod.size + float(each)) for each in more]
-    return np.degrees(np.array(found, np.float64).reshape(-1, 2))
-
-
 def coursed(settings: config.Sfms, dyads: Sequence[Dyad]) -> config.Sfms:
-    """`settings` with the median course of smiles of `dyads`, where smiles keep to one; as they are, if too few do."""
-    smile = settings.sampling.smile
-    if smile is None:
-        return settings
-    found = [np.array(rows) for rows in zip(*(row for dyad in dyads for row in _courses(dyad)), strict=True)]
-    if not found or len(found[0]) < LEAST_SMILES:
-        return settings
-    rise, fall = (np.clip(np.median(rows, axis=0), 0, 1).round(3).tolist() for rows in found)
-    return _sampling(settings, smile=config.SmileCourse(spread=smile.spread, rise=tuple(rise), fall=tuple(fall)))
+    """`settings` with the median course of nods and smiles of `dyads`, where they keep to one; as they are, if too few
+    of the kind do.
+    """
+    nod, smile = settings.sampling.nod, settings.sampling.smile
+    if nod is not None:
+        falls = [fall for dyad in dyads for fall in _falls(dyad)]
+        if len(falls) >= LEAST:
+            nod = config.NodCourse(spread=nod.spread, fall=round(float(np.clip(np.median(falls), 0, 1)), 3))
+    if smile is not None:
+        found = [np.array(rows) for rows in zip(*(row for dyad in dyads for row in _smiles(dyad)), strict=True)]
+        if found and len(found[0]) >= LEAST:
+            rise, fall = (np.clip(np.median(rows, axis=0), 0, 1).round(3).tolist() for rows in found)
+            smile = config.SmileCourse(spread=smile.spread, rise=tuple(rise), fall=tuple(fall))
+    sampling = settings.sampling.model_copy(update={"nod": nod, "smile": smile})
+    return settings.model_copy(update={"sampling": sampling})
 
 
-def _courses(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
+def _falls(dyad: Dyad) -> Iterator[float]:
+    """How large the second swing is beside the first, of each nod that has one."""
+    pitch = without_gaze(dyad).listener[:, CHANNEL_INDEX["pitch"]]
+    for event in dyad.events or ():
+        swing = event.duration_s / event.swings / FRAME_S
+        bounds = [round(event.start_s / FRAME_S + swing * number) for number in range(3)]
+        if event.kind == "nod" and event.swings > 1 and bounds[0] >= 0 and bounds[2] <= len(pitch):
+            first, second = (float(np.ptp(pitch[low:high])) for low, high in pairwise(bounds))
+            yield second / max(first, 1e-6)
+
+
+def _smiles(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
     """Shares of its size at `RISE_S` and `FALL_S` of each smile that is long enough for both, and of no laugh."""
     corners = dyad.listener[:, [CHANNEL_INDEX[name] for name in SMILE_CORNERS]].mean(axis=1)
     times_s = (1 + np.arange(len(corners))) * FRAME_S

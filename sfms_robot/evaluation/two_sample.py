@@ -54,8 +54,9 @@ class Told:
     high: float
 
 
-def windows(motion: Floats, rng: np.random.Generator) -> Floats:
-    """Motion (N, 58) -> (W, 50, 58): low-passed, with a tracker's noise, in windows of two seconds side by side.
+def windows(motion: Floats, rng: np.random.Generator, judged: NDArray[np.bool_] | None = None) -> Floats:
+    """Motion (N, 58) -> (W, 50, 58): low-passed, with a tracker's noise, in windows of two seconds side by side; those
+    of `judged` (N,) frames alone.
 
     A motion shorter than a window gives none.
     """
@@ -65,7 +66,8 @@ def windows(motion: Floats, rng: np.random.Generator) -> Floats:
     smooth = sosfiltfilt(sections, motion.astype(np.float64), axis=0)
     seen = smooth + NOISE * rng.standard_normal(smooth.shape)
     whole = len(seen) // WINDOW
-    return np.asarray(seen[: whole * WINDOW].reshape(whole, WINDOW, -1), np.float32)
+    cut = np.asarray(seen[: whole * WINDOW].reshape(whole, WINDOW, -1), np.float32)
+    return cut if judged is None else cut[judged[: whole * WINDOW].reshape(whole, WINDOW).all(axis=1)]
 
 
 def levelled(part: Floats) -> Floats:

@@ -2,7 +2,8 @@
 
 Both are cut into windows of two seconds in which nothing of the face is under way: no blink, no smile, no word. By band
 the covariance of people's channels less that of the listener's is what it lacks; its largest eigenvectors, region by
-region, are the patterns, and their powers by band the spectrum. The slowest band is what differs from window to window.
+region, are the patterns, and their powers by band the spectrum. The slowest band is what differs from window to window,
+and where people rest less where the listener does is what it lacks of the mean.
 """
 
 from __future__ import annotations
@@ -60,9 +61,11 @@ def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
     if not people or not listener:
         raise ValueError("no two seconds in which a face rests")
     lacking = covariances(people) - covariances(listener)  # (BANDS, C, C)
-    loadings, amplitudes = [], []
+    off = _mean(people) - _mean(listener)
+    rest, loadings, amplitudes = np.zeros(len(BLENDSHAPES), np.float32), [], []
     for prefixes in REGIONS.values():
         rows = np.array([at for at, name in enumerate(BLENDSHAPES) if name.startswith(prefixes)])
+        rest[rows] = off[rows]  # where eyes look is not the face's
         part = lacking[:, rows[:, None], rows]
         power, patterns = np.linalg.eigh(part.sum(0))
         for value, pattern in sorted(zip(power.tolist(), patterns.T, strict=True), key=lambda one: -one[0])[:PATTERNS]:
@@ -77,7 +80,13 @@ def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
         np.array(loadings, np.float32).reshape(-1, len(BLENDSHAPES)),
         np.array(amplitudes, np.float32).reshape(-1, BANDS).T,
         _spread(people),
+        rest,
     )
+
+
+def _mean(faces: Sequence[Floats]) -> Doubles:
+    """(C,) of all windows (W, 50, C)."""
+    return np.asarray(np.concatenate(faces).mean(axis=(0, 1), dtype=np.float64), np.float64)
 
 
 def covariances(faces: Sequence[Floats]) -> Doubles:

@@ -4,12 +4,12 @@ Keyframes pay for events: what moves by a hundredth is drawn as stillness, and a
 with the slow sway of a head there is nothing to predict in it, so it is drawn from what recorded faces do and tokens
 leave out (Shinozuka's spectral representation of a stationary Gaussian process),
 
-    x(t) = size * sum over k of  loadings[k] * sum over l of  amplitude[l, k] (a cos 2 pi f t + b sin 2 pi f t),
+    x(t) = rest + size * sum over k of  loadings[k] * sum over l of  amplitude[l, k] (a cos 2 pi f t + b sin 2 pi f t),
 
 components k, lines l, a, b ~ N(0, 1), `LINES` frequencies drawn from each of the `BANDS_HZ` per component, `size` a
-stream's own. Components are patterns of channels that move together. A function of the seed and of time alone: a plan
-may be made anew, or in other pieces, and shows the same. It sets in over the first `EASE_S`. Faces never go below 0 nor
-above 1.
+stream's own. Components are patterns of channels that move together; `rest` is how far from people the codes rest. A
+function of the seed and of time alone: a plan may be made anew, or in other pieces, and shows the same. It sets in over
+the first `EASE_S`. Faces never go below 0 nor above 1.
 """
 
 from __future__ import annotations
@@ -32,18 +32,20 @@ EASE_S: Final = 3.0
 LARGEST: Final = 0.5  # no resting face moves so far
 _SEED: Final = 0x1D1E  # apart from what else a stream draws by its seed
 _COUNT: Final = MOTION_DIM - SHAPES.start
+_TENSORS: Final = ("loadings", "amplitude", "spread", "rest")
 
 
 @dataclass(frozen=True)
 class IdleStream:
     """One stream's own: of every line, which is one cosine, frequency [rad/s], size and phase [rad], (L, K) each;
-    loadings (K, 52).
+    loadings (K, 52), rest (52,).
     """
 
     frequency: Doubles
     size: Doubles
     phase: Doubles
     loadings: Doubles
+    rest: Doubles
 
     def added(self, frames: Floats, times_s: Doubles) -> Floats:
         """Motion (N, 58) with the idle motion of times (N,) since the stream began: a new array."""
@@ -51,9 +53,9 @@ class IdleStream:
         turn -= self.phase
         parts = (self.size * np.cos(turn, out=turn)).sum(1)  # (N, K)
         begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
-        eased = parts * (begun**2 * (3 - 2 * begun))[:, None]
+        eased = (parts @ self.loadings + self.rest) * (begun**2 * (3 - 2 * begun))[:, None]
         out = frames.copy()
-        out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + eased @ self.loadings, 0), 1)
+        out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + eased, 0), 1)
         return out
 
 
@@ -65,11 +67,13 @@ class IdleMotion:
         loadings: (K, 52) how far each blendshape goes with a component, of deviation 1.
         amplitude: (BANDS, K) deviation of each component within each band; of all bands together about 1.
         spread: deviation of the logarithm of sizes between people.
+        rest: (52,) mean of people's resting faces less that of the listener's.
     """
 
     loadings: Floats
     amplitude: Floats
     spread: float
+    rest: Floats
 
     def start(self, seed: int) -> IdleStream:
         """A stream's own, by lot of its seed."""
@@ -82,14 +86,14 @@ class IdleMotion:
         cosine, sine = factors.reshape(2, bands * LINES, parts)
         size, phase = np.hypot(cosine, sine), np.arctan2(sine, cosine)
         frequency = 2 * math.pi * frequency_hz.reshape(-1, parts)
-        return IdleStream(frequency, size, phase, self.loadings.astype(np.float64))
+        return IdleStream(frequency, size, phase, self.loadings.astype(np.float64), self.rest.astype(np.float64))
 
     def save(self, file: Path) -> None:
         """Raises ModelError where it cannot be written."""
         from safetensors import SafetensorError
         from safetensors.numpy import save_file
 
-        tensors = {"loadings": self.loadings, "amplitude": self.amplitude, "spread": np.float32(self.spread)}
+        tensors = {name: getattr(self, name) for name in _TENSORS}
         try:
             save_file({name: np.ascontiguousarray(value, np.float32) for name, value in tensors.items()}, file)
             file.chmod(0o644)
@@ -106,21 +110,23 @@ class IdleMotion:
             found = load_file(file)
         except (OSError, SafetensorError) as error:
             raise ModelError(f"{file}: not a readable safetensors file: {error}") from error
-        if set(found) != {"loadings", "amplitude", "spread"}:
-            raise ModelError(f"{file}: holds {', '.join(sorted(found))}, not loadings, amplitude and spread")
-        loadings, amplitude, spread = found["loadings"], found["amplitude"], found["spread"]
+        if set(found) != {*_TENSORS}:
+            raise ModelError(f"{file}: holds {', '.join(sorted(found))}, not {', '.join(_TENSORS)}")
+        loadings, amplitude, spread, rest = (found[name] for name in _TENSORS)
         parts = len(loadings) if loadings.ndim else 0
-        if loadings.shape != (parts, _COUNT) or amplitude.shape != (BANDS, parts) or spread.size != 1:
+        shapes = [(parts, _COUNT), (BANDS, parts), (_COUNT,)]
+        if [one.shape for one in (loadings, amplitude, rest)] != shapes or spread.size != 1:
             raise ModelError(
-                f"{file}: loadings {loadings.shape}, amplitude {amplitude.shape}, spread {spread.shape}; "
-                f"idle motion has (K, {_COUNT}), ({BANDS}, K) and one number"
+                f"{file}: loadings {loadings.shape}, amplitude {amplitude.shape}, spread {spread.shape}, rest "
+                f"{rest.shape}; idle motion has (K, {_COUNT}), ({BANDS}, K), one number and ({_COUNT},)"
             )
         if not all(np.isfinite(value).all() for value in found.values()):
             raise ModelError(f"{file}: holds values that are not finite")
         largest = float(np.abs(loadings).max(initial=0.0) * np.linalg.norm(amplitude, axis=0).max(initial=0.0))
+        largest = max(largest, float(np.abs(rest).max()))
         if largest > LARGEST or not 0 <= float(spread.item()) <= 1:
             raise ModelError(
                 f"{file}: moves a face by {largest:.3g}, with a spread of {float(spread.item()):.3g}; "
                 f"at rest none moves by more than {LARGEST:g}, nor differ people by more than 1"
             )
-        return cls(loadings, amplitude, float(spread.item()))
+        return cls(loadings, amplitude, float(spread.item()), rest)

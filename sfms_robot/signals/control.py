@@ -63,18 +63,6 @@ def _tell(out: Floats, rows: slice, since_s: np.typing.NDArray[np.float64], even
         out[rows, at], out[rows, at + 1] = np.sin(turn), np.cos(turn)
 
 
-def resized(rows: Floats, kind: str, gain: float, offset: float) -> Floats:
-    """Rows (..., len(COLUMNS)) with sizes for a model that makes events of `kind` `gain * size + offset` large, so that
-    they come out as `rows` ask for. `offset` in the unit of the kind's size; no size is told below 0.
-    """
-    at = _EACH * KINDS.index(kind)
-    full = FULL_SIZE.get(kind, 1.0)
-    out = rows.copy()
-    wanted = (rows[..., at + 3] - np.float32(offset / full)) / np.float32(gain)
-    out[..., at + 3] = np.where(rows[..., at] > 0, np.clip(wanted, 0.0, BOUND), rows[..., at + 3])
-    return out
-
-
 def since_s(told: Floats) -> Doubles:
     """Column `since` (...,) -> how long the event is under way, seconds; the longest that is told is 10.7."""
     return np.asarray(_SOFT_S * np.expm1(told.astype(np.float64)))

@@ -8,13 +8,13 @@ import pytest
 from ami_tables import write_tables
 from tiny_arig_training import dyad
 
-from sfms_robot.app.evaluate.naturalness import asked_for, figures, notes, of_training
+from sfms_robot.app.evaluate.naturalness import asked_for, figures, listening, notes, of_training
 from sfms_robot.corpora import clips
 from sfms_robot.evaluation import two_sample
 from sfms_robot.evaluation.manners import manners
 from sfms_robot.evaluation.robustness import RANGES, Speaker, cases
 from sfms_robot.evaluation.two_sample import FOLDS, REGIONS
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ
+from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES
 
 LEAST = 2 * FOLDS
 SERIES = {"train": "ES2008a", "validation": "IS1000a", "test": "ES2003a"}
@@ -54,7 +54,7 @@ def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tm
     found = command_line("evaluate", "naturalness", "--data", data, "--drift", 30, "--json").told
     assert found["listener"] == "sfms-small" and found["split"] == "test" and found["dyads"] == LEAST
     assert found["minutes"] == pytest.approx(LEAST * 12 / 60, abs=0.05) and "onnx" in found["engine"]
-    rows = ("two_sample_auc", "person_two_sample_auc", "training_two_sample_auc")
+    rows = [f"{who}two_sample_auc" for who in ("", "person_", "training_", "imitated_")]
     for name in (*rows, *(f"levelled_{row}" for row in rows)):
         assert set(found[name]) == set(found["interval"][name]) == set(REGIONS)
         for region, auc in found[name].items():
@@ -62,6 +62,16 @@ def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tm
             assert 0 <= low <= high <= 1 and 0 <= auc <= 1
     assert found["people_smile_s"] == pytest.approx(3.0, abs=0.3) and found["people_gaze_on_person"] > 0.9
     assert found["drift_deg"] >= 0 and set(found["people_pose_deg"]) == {"roll", "pitch", "yaw"}
+
+
+def test_windows_in_which_the_listener_talks_himself_are_not_judged(tmp_path):
+    (dyads,) = [clips.load(people(tmp_path, ("validation",), count=1) / "validation")]
+    one = replace(dyads[0], agent_audio=None)
+    (every,) = listening([one], [one.listener])
+    audio = np.zeros(len(one.listener) * FRAME_SAMPLES, np.float32)
+    audio[3 * AUDIO_HZ : 5 * AUDIO_HZ] = np.random.default_rng(0).normal(0, 0.1, 2 * AUDIO_HZ)
+    (some,) = listening([replace(one, agent_audio=audio)], [one.listener])
+    np.testing.assert_array_equal(some, np.delete(every, [1, 2], axis=0))
 
 
 def test_people_who_do_nothing_and_whose_gaze_nobody_knows_leave_figures_out(tmp_path):

@@ -1,18 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from sfms_robot import config
 from sfms_robot.corpora.clips import Dyad
-from sfms_robot.evaluation.sampling_calibration import (
-    GAINS,
-    LEAST_NODS,
-    LEAST_SMILES,
-    coursed,
-    made_size,
-    placing,
-    sized,
-)
+from sfms_robot.evaluation.sampling_calibration import LEAST, coursed, placing
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
 from sfms_robot.listeners.sfms.model import SfmsModel
 
@@ -59,30 +53,15 @@ def test_rounds_come_to_rest(model):
     assert (abs(np.diff(bias, axis=0))[-1] < 0.5).all()
 
 
-def test_the_line_from_sizes_told_to_sizes_made_is_found_in_scatter():
-    rng = np.random.default_rng(0)
-    told = rng.uniform(2, 10, 400)
-    found = made_size(told, 0.7 * told + 0.9 + rng.normal(0, 1, 400))
-    assert found.gain == pytest.approx(0.7, abs=0.06) and found.offset_deg == pytest.approx(0.9, abs=0.4)
-
-
-@pytest.mark.parametrize("gain", [-0.2, 0.0, 0.1, 5.0])
-def test_a_model_that_does_not_heed_sizes_is_told_none_beyond_reason(gain: float):
-    """The usual size still comes out as asked."""
-    told = np.linspace(2, 10, 50)
-    found = made_size(told, gain * (told - 6) + 6)
-    assert found.gain in GAINS
-    assert found.gain * 6 + found.offset_deg == pytest.approx(6, abs=1e-3)
-
-
 def nodding(sizes_rad) -> Dyad:
-    """One that is told of its nods, each of its size."""
+    """One that is told of its nods, each of its size, in two swings of which the second is 0.6 of the first."""
     motion = np.zeros((50 * (len(sizes_rad) + 1), 58), np.float32)
+    swing = 0.5 - 0.5 * np.cos(np.linspace(0, 2 * np.pi, 21))[1:]
     nods = []
     for number, size in enumerate(sizes_rad):
         at = 25 + 50 * number
-        motion[at : at + 20, CHANNEL_INDEX["pitch"]] = size * (0.5 - 0.5 * np.cos(np.linspace(0, 2 * np.pi, 20)))
-        nods.append(ListenerEvent("nod", at * 0.04, 0.8, float(size)))
+        motion[at : at + 40, CHANNEL_INDEX["pitch"]] = size * np.concatenate([swing, 0.6 * swing])
+        nods.append(ListenerEvent("nod", at * 0.04, 1.6, float(size), swings=2))
     frames = len(motion)
     audio = np.random.default_rng(0).normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
     return Dyad("a", audio, motion * 0, motion, np.ones(frames, bool), events=tuple(nods))
@@ -97,24 +76,17 @@ def told_settings(**changes) -> config.Sfms:
     return settings(events=True, sway=True, placement="penalised", groups=groups, **changes)
 
 
-@pytest.fixture(scope="module")
-def told_model() -> SfmsModel:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return SfmsModel(told_settings()).eval()
+def test_how_nods_die_away_is_found_at_every_size():
+    asked = told_settings(sampling={"nod": {"spread": 0.1}})
+    found = coursed(asked, [nodding(np.linspace(0.04, 0.2, LEAST))]).sampling.nod
+    assert found.fall == pytest.approx(0.6, abs=0.02) and found.spread == 0.1
 
 
-def test_sizes_are_found_whatever_was_found_before(told_model):
-    """An untrained model nods at nothing: as little heed of sizes as is taken for an answer."""
-    dyads = [nodding(np.linspace(0.04, 0.2, LEAST_NODS))]
-    once = sized(told_settings(), told_model, dyads)
-    assert once.sampling.nod_size.gain == GAINS[0]
-    assert sized(once, told_model, dyads) == once
-
-
-@pytest.mark.parametrize("sizes_rad", [[0.04, 0.1], [0.1] * LEAST_NODS, []])
-def test_too_few_nods_or_all_of_a_size_tell_nothing(told_model, sizes_rad):
-    assert sized(told_settings(), told_model, [nodding(sizes_rad)]) == told_settings()
+def test_single_swings_tell_nothing_of_how_nods_die_away():
+    asked = told_settings(sampling={"nod": {"spread": 0.1}})
+    single = nodding([0.1] * LEAST)
+    single = replace(single, events=tuple(replace(event, swings=1) for event in single.events))
+    assert coursed(asked, [single]) == asked
 
 
 def smiling(count: int) -> Dyad:
@@ -135,7 +107,7 @@ def smiling(count: int) -> Dyad:
 
 def test_the_course_of_smiles_is_found_at_every_size():
     asked = told_settings(sampling={"smile": {"spread": 0.1}})
-    found = coursed(asked, [smiling(LEAST_SMILES)]).sampling.smile
+    found = coursed(asked, [smiling(LEAST)]).sampling.smile
     np.testing.assert_allclose(found.rise, np.array(found.RISE_S) / 0.96, atol=2e-3)
     np.testing.assert_allclose(found.fall, np.array(found.FALL_S) / 0.96, atol=2e-3)
     assert found.spread == 0.1
@@ -143,6 +115,6 @@ def test_the_course_of_smiles_is_found_at_every_size():
 
 def test_too_few_smiles_tell_no_course_and_a_listener_without_gets_none():
     asked = told_settings(sampling={"smile": {"spread": 0.1}})
-    assert coursed(asked, [smiling(LEAST_SMILES - 1)]) == asked
+    assert coursed(asked, [smiling(LEAST - 1)]) == asked
     assert coursed(asked, []) == asked
-    assert coursed(told_settings(), [smiling(LEAST_SMILES)]) == told_settings()
+    assert coursed(told_settings(), [smiling(LEAST)]) == told_settings()

@@ -70,6 +70,14 @@ def test_windows_lie_side_by_side_and_short_motion_gives_none():
     assert still.reshape(-1, MOTION_DIM).std(axis=0) == pytest.approx(NOISE, rel=0.1)
 
 
+def test_windows_that_are_not_judged_as_a_whole_are_left_out():
+    motion = sway(np.random.default_rng(0), 0.6, frames=4 * WINDOW + 7)
+    judged = np.ones(len(motion), bool)
+    judged[[WINDOW, 4 * WINDOW + 3]] = False
+    every, some = (windows(motion, np.random.default_rng(1), which) for which in (None, judged))
+    np.testing.assert_array_equal(some, every[[0, 2, 3]])
+
+
 def test_regions_hold_every_channel_once():
     assert sorted(index for channels in REGIONS.values() for index in channels) == list(range(MOTION_DIM))
 

@@ -1,5 +1,7 @@
 """What a listener lacks is found again: patterns, their sizes and their spectra, of stretches in which a face rests."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ def learned():
     loadings[1, FROWN] = 0.02
     amplitude = np.zeros((BANDS, 2), np.float32)
     amplitude[:3, 0] = amplitude[2:5, 1] = 3**-0.5
-    return IdleMotion(loadings, amplitude, 0.0)
+    return IdleMotion(loadings, amplitude, 0.0, np.zeros(len(BLENDSHAPES), np.float32))
 
 
 def people(idle, count=16, frames=3000):
@@ -38,10 +40,18 @@ def test_what_is_lacking_is_found_again():
 
 
 def test_what_a_listener_shows_already_is_not_added_twice():
-    half = IdleMotion(learned().loadings * 0.5**0.5, learned().amplitude, 0.0)
+    half = replace(learned(), loadings=learned().loadings * 0.5**0.5)
     added = explained(fit_idle(people(learned()), people(half)))
     np.testing.assert_allclose(added[SMILES], 0.03 * 0.5**0.5, rtol=0.2)
     assert explained(fit_idle(people(half), people(learned()))).max() < 0.005
+
+
+def test_where_people_rest_elsewhere_is_found():
+    elsewhere = replace(learned(), rest=np.linspace(-0.1, 0.1, len(BLENDSHAPES)).astype(np.float32))
+    found = fit_idle(people(elsewhere), people(None)).rest
+    looks = np.array([name.startswith("eyeLook") for name in BLENDSHAPES])
+    np.testing.assert_allclose(found[~looks], elsewhere.rest[~looks], atol=0.005)
+    assert not found[looks].any()
 
 
 def test_a_face_that_smiles_blinks_or_talks_does_not_rest():

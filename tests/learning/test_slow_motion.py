@@ -44,16 +44,36 @@ def test_a_head_that_nods_all_the_time_has_some_slow_part():
     assert np.isfinite(slow_part(nodded(), [ListenerEvent("nod", -1.0, 100.0, 0.1)])).all()
 
 
+def swaying(mixture: torch.Tensor, count: int, lateral=()) -> list[torch.Tensor]:
+    times_s = 5 + np.arange(6000) * 0.04
+    every = (draw_sway(mixture.numpy(), 0.3, seed, lateral) for seed in range(count))
+    return [torch.from_numpy(sway_at(one, times_s)) for one in every]
+
+
+def powers(mixture: torch.Tensor) -> torch.Tensor:
+    return (mixture @ mixture.mT).diagonal(dim1=-2, dim2=-1)
+
+
 def test_what_is_fitted_on_sway_is_its_amplitudes():
     hz = torch.tensor(BANDS_HZ)
     amplitude = torch.linspace(0.02, 0.004, len(hz) - 1)[:, None] * torch.tensor([1.0, 0.5])
-    people = [
-        torch.from_numpy(sway_at(draw_sway(amplitude.numpy(), 0.3, seed), 5 + np.arange(6000) * 0.04))
-        for seed in range(80)
-    ]
+    people = swaying(torch.diag_embed(amplitude), 80)
     found, spread = fit_sway(people)
-    torch.testing.assert_close(found[1:], amplitude[1:], rtol=0.25, atol=1e-3)
+    torch.testing.assert_close(powers(found)[1:], amplitude[1:].square(), rtol=0.5, atol=2e-6)
     assert 0.2 < float(spread) < 0.5  # that of 0.3, and of how much each is seen to sway in four minutes
+
+
+@pytest.mark.parametrize("lateral", [(), (1,)])
+def test_what_channels_do_together_is_found_on_either_side_of_the_mirror(lateral):
+    """Two channels that go opposite ways, the second one lateral or not; the third by itself."""
+    together = torch.tensor([[0.01, 0.0, 0.0], [-0.008, 0.006, 0.0], [0.0, 0.0, 0.005]])
+    people = swaying(together.expand(len(BANDS_HZ) - 1, 3, 3), 60, lateral)
+    found, _ = fit_sway(people, lateral)
+    covariance = (found @ found.mT).sum(0)
+    r = covariance / covariance.diagonal().sqrt() / covariance.diagonal().sqrt()[:, None]
+    assert abs(float(r[0, 1])) == pytest.approx(0.8, abs=0.1) and abs(float(r[0, 2])) < 0.15
+    if not lateral:
+        assert float(r[0, 1]) < 0
 
 
 def test_a_border_between_dyads_is_no_motion():

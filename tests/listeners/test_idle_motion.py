@@ -15,10 +15,18 @@ from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, EASE_S, IdleMotion
 BROW = BLENDSHAPES.index("browInnerUp")
 
 
-def made(size=0.02, spread=0.0):
+def made(size=0.02, spread=0.0, rest=0.0):
     loadings = np.zeros((2, len(BLENDSHAPES)), np.float32)
     loadings[0, BROW], loadings[1, BROW + 1] = size, size
-    return IdleMotion(loadings, np.full((BANDS, 2), BANDS**-0.5, np.float32), spread)
+    amplitude = np.full((BANDS, 2), BANDS**-0.5, np.float32)
+    return IdleMotion(loadings, amplitude, spread, np.full(len(BLENDSHAPES), rest, np.float32))
+
+
+def test_where_it_rests_is_added_once_it_has_set_in_and_no_face_leaves_its_range():
+    stream = made(size=0.0, rest=-0.1).start(1)
+    shown = stream.added(faces(3), np.array([0.0, EASE_S, 60.0]))[:, SHAPES]
+    np.testing.assert_allclose(shown, np.array([0.5, 0.4, 0.4])[:, None] * np.ones((3, 52)), atol=1e-6)
+    assert not stream.added(faces(1, 0.05), np.array([60.0]))[:, SHAPES].any()
 
 
 def faces(frames, level=0.5):
@@ -76,6 +84,8 @@ BROKEN = {
     "holds": {"spread": None},
     "not finite": {"loadings": np.full((2, 52), np.nan, np.float32)},
     "has \\(K, 52\\)": {"loadings": np.zeros((2, 51), np.float32)},
+    "and \\(52,\\)": {"rest": np.zeros(51, np.float32)},
+    "by 0.6": {"rest": np.full(52, -0.6, np.float32)},
     "amplitude": {"amplitude": np.zeros((BANDS, 3), np.float32)},
     "moves a face by": {"loadings": np.ones((2, 52), np.float32)},
     "a spread of": {"spread": np.float32([7.0])},
@@ -85,7 +95,8 @@ BROKEN = {
 @pytest.mark.parametrize("problem", BROKEN)
 def test_a_broken_file_is_one_line(tmp_path, problem):
     file, good = tmp_path / "a.safetensors", made()
-    tensors = {"loadings": good.loadings, "amplitude": good.amplitude, "spread": np.float32([0.0])} | BROKEN[problem]
+    tensors = {"loadings": good.loadings, "amplitude": good.amplitude, "spread": np.float32([0.0])}
+    tensors |= {"rest": good.rest} | BROKEN[problem]
     save_file({name: np.ascontiguousarray(value) for name, value in tensors.items() if value is not None}, file)
     with pytest.raises(ModelError, match=problem) as raised:
         IdleMotion.load(file)

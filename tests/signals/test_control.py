@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, ListenerEvent
-from sfms_robot.signals.control import BOUND, COLUMNS, FULL_SIZE, KINDS, SWINGING, control_track, resized
+from sfms_robot.signals.control import BOUND, COLUMNS, KINDS, SWINGING, control_track
 
 EVENT = st.builds(
     ListenerEvent,
@@ -82,23 +82,3 @@ def test_every_kind_has_its_columns_and_swinging_ones_two_more():
         row = control_track([ListenerEvent(kind, 0.0, 1.0, 1.0)], 5, 1)[0]
         told = {name.split(".")[0] for name, value in zip(COLUMNS, row, strict=True) if value}
         assert told == {kind} and row[column(f"{kind}.active")] == 1
-
-
-@settings(max_examples=60, deadline=None)
-@given(EVENTS)
-def test_sizes_that_come_out_as_told_are_told_as_they_are(events):
-    rows = control_track(events, 0, 100)
-    np.testing.assert_array_equal(resized(rows, "nod", 1.0, 0.0), rows)
-
-
-@settings(max_examples=60, deadline=None)
-@given(EVENTS, st.floats(0.4, 2), st.floats(-0.05, 0.05))
-def test_what_is_resized_comes_out_as_asked_and_nothing_else_is_told(events, gain: float, offset_rad: float):
-    asked = control_track(events, 0, 100)
-    told = resized(asked, "nod", gain, offset_rad)
-    size, active = column("nod.size"), asked[:, column("nod.active")] > 0
-    np.testing.assert_array_equal(np.delete(told, size, 1), np.delete(asked, size, 1))
-    assert not told[~active, size].any() and (told[:, size] >= 0).all() and told.max() <= BOUND
-    within = active & (told[:, size] > 0) & (told[:, size] < BOUND)
-    made = gain * told[within, size] + offset_rad / FULL_SIZE["nod"]
-    np.testing.assert_allclose(made, asked[within, size], atol=1e-5)

@@ -26,6 +26,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, load_listener, one_thread
 from sfms_robot.ports import Listener
+from sfms_robot.signals.events import voice_activity
 
 DRIFT_S: Final = 600.0
 _FIGURES: Final = ("nod_deg", "nod_s", "nod_swings", "blink_s", "smile_s", "look_s")
@@ -57,8 +58,8 @@ def evaluate_naturalness(
         drift = long_run(listener, heard, drift_s, seed)
         progress.advance(playing)
         theirs, taught = [dyad.listener for dyad in dyads], of_training(data, len(dyads))
-        judging = progress.add_task("telling apart", total=2 * (3 if taught else 2) * len(REGIONS) * FOLDS)
-        told = two_samples(ours, theirs, taught, lambda: progress.advance(judging))
+        judging = progress.add_task("telling apart", total=2 * (4 if taught else 2) * len(REGIONS) * FOLDS)
+        told = two_samples(listening(dyads, ours), listening(dyads, theirs), taught, lambda: progress.advance(judging))
     addressed = [asked_for(dyad) for dyad in dyads]
     return {
         "listener": name,
@@ -82,14 +83,31 @@ def notes(dyads: Sequence[Dyad], taught: Sequence[Floats]) -> Iterator[str]:
         yield "too few dyads of training: how well its people are told from these is not known"
 
 
+def listening(dyads: Sequence[Dyad], motions: Sequence[Floats]) -> list[Floats]:
+    """Windows (W, 50, 58) of each motion (N, 58) in which the dyad's listener says nothing: a mouth that talks is
+    judged by its words (`evaluate interaction`).
+    """
+    rng = np.random.default_rng(0)
+    return [windows(motion, rng, silent(dyad)[: len(motion)]) for dyad, motion in zip(dyads, motions, strict=True)]
+
+
+def silent(dyad: Dyad) -> NDArray[np.bool_]:
+    """(N,) frames in which the dyad's listener says nothing."""
+    out = np.ones(len(dyad.listener), bool)
+    if dyad.agent_audio is not None:
+        said = voice_activity(dyad.agent_audio)[: len(out)]
+        out[: len(said)] = ~said
+    return out
+
+
 def of_training(data: Path, count: int) -> list[Floats]:
-    """Motion of as many listeners of the training part; none where there are not so many."""
+    """Windows, as of `listening`, of as many listeners of the training part; none where there are not so many."""
     if "train" not in split_names(*detect(data, "auto")):
         return []
     every = open_for("arkit58", data, "train")
     rows = np.linspace(0, len(every) - 1, min(count, len(every))).round().astype(int).tolist()
     some = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(every.clips[row] for row in rows)))]
-    return [dyad.listener for dyad in some] if len(some) == count else []
+    return listening(some, [dyad.listener for dyad in some]) if len(some) == count else []
 
 
 def _spread(dyads: Sequence[Dyad], most: int | None) -> list[Dyad]:
@@ -124,20 +142,20 @@ def _at(frame: SpeakerFrame, time_s: float) -> SpeakerFrame:
 def two_samples(
     ours: Sequence[Floats], theirs: Sequence[Floats], taught: Sequence[Floats], each: Callable[[], object]
 ) -> dict[str, Any]:
-    """By region, `two_sample_auc`, each with its interval over dyads; and for scale two others.
+    """By region, `two_sample_auc` of windows by dyad, each with its interval over dyads; and for scale others.
 
-    People against other people of the same part, and, where `taught` are given, people of training against them: who
-    imitates those without a flaw is told from these as often. `levelled_`: each motion by its own mean and deviation.
+    People against other people of the same part, and, where those `taught` are given, people of training against them:
+    who imitates those without a flaw is told from these as often. How well it does is `imitated_two_sample_auc`, ours
+    against people of training. `levelled_`: each motion by its own mean and deviation.
     """
-    rng = np.random.default_rng(0)
-    made, real = ([windows(motion, rng) for motion in motions] for motions in (ours, theirs))
-    half = 2 * (len(real) // 2)
+    half = 2 * (len(theirs) // 2)
     pairs: dict[str, tuple[Sequence[Floats], ...]] = {
-        "two_sample_auc": (made, real),
-        "person_two_sample_auc": (real[0:half:2], real[1:half:2]),
+        "two_sample_auc": (ours, theirs),
+        "person_two_sample_auc": (theirs[0:half:2], theirs[1:half:2]),
     }
     if taught:
-        pairs["training_two_sample_auc"] = [windows(motion, rng) for motion in taught], real
+        pairs["training_two_sample_auc"] = taught, theirs
+        pairs["imitated_two_sample_auc"] = ours, taught
     pairs |= {f"levelled_{name}": tuple([*map(levelled, one)] for one in pair) for name, pair in pairs.items()}
     found = {
         name: {region: told_apart(one, other, region, each) for region in REGIONS}

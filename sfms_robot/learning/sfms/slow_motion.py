@@ -17,6 +17,7 @@ HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head
 MARGIN_FRAMES: Final = 2  # around an event that may still be it
 UNKNOWN: Final = 1e-4  # weight of a frame in which sway cannot be seen: below 0.1 Hz it still counts
 LONGEST: Final = 2048  # frames of a spectrum
+ROUNDS: Final = 8  # to choose between people and mirror images, at most
 
 
 def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
@@ -48,10 +49,11 @@ def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
     return slow.astype(np.float32)
 
 
-def fit_sway(slow: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Amplitudes (BANDS, S) and spread () of sizes, of slow motion (N, S) of people.
+def fit_sway(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+    """Mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, of slow motion (N, S) of people.
 
-    Each person is brought to the mean size before powers are taken: how much somebody sways is `spread`'s.
+    Each person is brought to the mean size before powers are taken: how much somebody sways is `spread`'s. Of a person
+    and his mirror image, which turns the `lateral` channels around, the one counts who is more like the others.
     """
     tracks = [one.double() - one.double().mean(0) for one in slow if len(one) >= 2 * FRAME_HZ]
     if not tracks:
@@ -63,16 +65,41 @@ def fit_sway(slow: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     powers = torch.stack(
         [band_powers(track / one.exp()) * weight_ for track, one, weight_ in zip(tracks, common, weight, strict=True)]
     )
-    return (powers.sum(0) / weight.sum()).sqrt().float(), spread.float()
+    powers = _one_side(powers, lateral).sum(0) / weight.sum()
+    value, vector = torch.linalg.eigh(powers)
+    root = vector * value.clamp(min=0).sqrt()[:, None] @ vector.mT  # symmetric
+    return root.float(), spread.float()
+
+
+def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
+    """Powers (K, BANDS, S, S) of people or of their mirror images, whichever are more alike."""
+    turned = torch.ones(powers.shape[-1], dtype=powers.dtype)
+    turned[list(lateral)] = -1
+    mirror = turned[:, None] * turned
+    size = powers.sum((0, 1)).diagonal().clamp(min=1e-30).sqrt()
+    alike = powers.sum(1) / size / size[:, None]  # (K, S, S), every channel as much as any other
+    sides = torch.ones(len(powers), 1, 1, 1, dtype=powers.dtype)
+    for _ in range(ROUNDS):
+        mean = (alike * torch.where(sides[..., 0] > 0, 1.0, mirror)).sum(0)
+        likeness = (alike * mean * (1 - mirror)).sum((1, 2))  # of what a mirror changes, as each stands
+        after = torch.where(likeness < 0, -1.0, 1.0).to(powers)[:, None, None, None]
+        if torch.equal(after, sides):
+            break
+        sides = after
+    return powers * torch.where(sides > 0, 1.0, mirror)
 
 
 def band_powers(track: Tensor) -> Tensor:
-    """Mean square (BANDS, S) of a track (N, S) within each of `BANDS_HZ`; what is slower counts in the first."""
+    """Co-spectrum (BANDS, S, S) of a track (N, S): what its channels do together within each of `BANDS_HZ`; what is
+    slower counts in the first.
+    """
     from scipy import signal
 
     length = min(len(track), LONGEST)
-    frequency_hz, density = signal.welch(track.numpy(), FRAME_HZ, nperseg=length, axis=0, detrend="constant")
+    values = track.numpy()
+    how = {"fs": FRAME_HZ, "nperseg": length, "detrend": "constant"}
+    frequency_hz, density = signal.csd(values.T[:, None], values.T[None], **how)
     band = np.clip(np.searchsorted(BANDS_HZ, frequency_hz, side="right") - 1, 0, BANDS)
-    powers = np.zeros((BANDS + 1, track.shape[1]))
-    np.add.at(powers, band, density * (frequency_hz[1] - frequency_hz[0]))
+    powers = np.zeros((BANDS + 1, *density.shape[:2]))
+    np.add.at(powers, band, np.moveaxis(density.real, -1, 0) * (frequency_hz[1] - frequency_hz[0]))
     return torch.from_numpy(powers[:BANDS])

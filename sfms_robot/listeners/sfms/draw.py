@@ -27,9 +27,9 @@ from sfms_robot import config
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.listeners.engine import Engine
 from sfms_robot.listeners.lots import Use, uniforms
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED, LastKeyframes, Tokens, last_keyframes
+from sfms_robot.listeners.sfms.courses import ToldCourse
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED, LastKeyframes, Tokens, anchored, last_keyframes
 from sfms_robot.listeners.sfms.reachable import Reach
-from sfms_robot.listeners.sfms.smiles import ToldSmiles
 from sfms_robot.signals.phase import PHRASE_KNOTS_S, SILENCE_KNOTS_S, SPEECH_KNOTS_S
 
 # 1 at the hats of `phase.features` that stand for silence up to 1.6 s: their sum falls from 1 there to 0 at 3.2 s.
@@ -56,9 +56,9 @@ class Seen:
 class Sampler:
     """How the tokens of one listener are drawn: its predictor, and what its settings say of every group."""
 
-    def __init__(self, settings: config.Sfms, engine: Engine, reach: Reach, smiles: ToldSmiles | None = None) -> None:
+    def __init__(self, settings: config.Sfms, engine: Engine, reach: Reach, courses: Sequence[ToldCourse] = ()) -> None:
         groups, common = list(settings.groups.values()), settings.sampling
-        self._engine, self._reach, self._smiles = engine, reach, smiles
+        self._engine, self._reach, self._courses = engine, reach, courses
         self._temperature = np.float32(common.temperature)
         self._bias = np.array([group.transition_bias for group in groups], np.float32)
         nucleus = [group.nucleus or common.nucleus for group in groups]
@@ -67,6 +67,7 @@ class Sampler:
         self._nucleus_in_silence = np.array(alone, np.float32)
         self._guidance = np.array([group.guidance for group in groups], np.float32)[:, None]
         self._classes = [group.codes + 1 for group in groups]
+        self._now, self._ramp = settings.past_frames - 1, settings.ramp_frames or 0
 
     def draw(self, seen: Seen, seeds: Sequence[int], frames: Sequence[int]) -> Tokens:
         """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b has `seeds[b]` and draws for frames up
@@ -86,15 +87,18 @@ class Sampler:
         guidance = 1 + (self._guidance - 1) * lately[:, None, None]  # (1 or B, G, 1)
         nucleus = self._nucleus_in_silence + (self._nucleus - self._nucleus_in_silence) * lately[:, None]
         chances = self._chances(seeds, frames, window - first)
-        corners = None if self._smiles is None else self._smiles.wanted(seen.control[:, first:])
+        rows = seen.control[:, first - 1 :]  # the row before says when a swing ends
+        courses = [(told, one) for told in self._courses if (one := told.course(rows)) is not None]
         for frame in range(first, window):
             (flat,) = self._engine.run("next", slots[..., frame - window, :], *last, np.array([frame - 1]))
-            wanted = None if corners is None else corners[:, frame - first]
-            drawn = self._drawn(flat, last, frame, guidance, nucleus, chances[:, frame - window], wanted)
+            at = frame - first + 1
+            now = [(told, one.wanted[:, at], one.spread[:, at]) for told, one in courses]
+            since = frame - np.maximum(last.at[..., 0], self._now if self._ramp else -1)  # no ramp began before that
+            drawn = self._drawn(flat, last, since, guidance, nucleus, chances[:, frame - window], now)
             known = tokens[:, frame]
             tokens[:, frame] = np.where(known == UNDECIDED, drawn, known)
             last = last.then(tokens[:, frame], frame)
-        return tokens
+        return anchored(tokens, seen.tokens == UNDECIDED, self._now, self._ramp) if self._ramp else tokens
 
     def _chances(self, seeds: Sequence[int], frames: Sequence[int], count: int) -> Doubles:
         """(B, count, G) in 0..1 for each stream's last `count` frames."""
@@ -109,25 +113,26 @@ class Sampler:
         self,
         flat: Floats,
         last: LastKeyframes,
-        frame: int,
+        since: Tokens,
         guidance: Floats,
         nucleus: Floats,
         chance: Doubles,
-        corners: Doubles | None,
+        courses: Sequence[tuple[ToldCourse, Doubles, Doubles]],
     ) -> Tokens:
-        """Tokens (B, G) of `frame` from the logits (B, N, classes of all groups) of the network `next`.
+        """Tokens (B, G) of a frame from the logits (B, N, classes of all groups) of the network `next`.
 
-        `corners` (B,): of smiles that are told (`ToldSmiles.wanted`); None: smiles are left to the network.
+        `since` (B, G): frames in which each group may have got there from its last keyframe.
+
+        `courses`: those that are told, each with the row (B,) of what is wanted, and its spread.
         """
         logits = by_group(flat, self._classes)  # (B, N, G, V)
         possible: Floats = guided(logits[:, 0], logits[:, 1], guidance) if logits.shape[1] > 1 else logits[:, 0]
-        too_soon = self._reach.too_soon(last.tokens[..., 0], frame - last.at[..., 0])
+        too_soon = self._reach.too_soon(last.tokens[..., 0], since)
         np.copyto(possible, np.float32(-np.inf), where=too_soon)
         possible /= self._temperature
-        if self._smiles is not None and corners is not None:
-            group = self._smiles.group
-            smiling, lost = self._smiles.penalties(corners, last.tokens[:, group, 0])
-            possible[smiling, group, : lost.shape[1]] -= lost
+        for told, wanted, spread in courses:
+            streams, lost = told.penalties(wanted, spread, last.tokens[:, told.group, 0])
+            possible[streams, told.group, : lost.shape[1]] -= lost
         return sample(possible, self._bias, nucleus, chance)
 
     def _lately(self, seen: Seen) -> Floats:

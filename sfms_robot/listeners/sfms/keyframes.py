@@ -98,6 +98,21 @@ def _newest(tokens: Tokens) -> Tokens:
     return out
 
 
+def anchored(tokens: Tokens, drawn: NDArray[np.bool_], now: int, ramp: int) -> Tokens:
+    """Tokens (B, T, G) in which no ramp to a keyframe just `drawn`, (B, T, G), begins before `now`, the newest frame
+    that was shown: what a group held until then is a keyframe there.
+
+    Without it, motion that was shown already would have been on its way to a keyframe that nobody knew of.
+    """
+    ahead = tokens[:, now + 1 : now + ramp] > 0
+    first = ahead.argmax(1)  # the next keyframe of each group, if there is any
+    new = np.take_along_axis(drawn[:, now + 1 : now + ramp], first[:, None], axis=1)[:, 0]
+    held = _newest(tokens[:, : now + 1])
+    out = tokens.copy()
+    out[:, now] = np.where(ahead.any(1) & new, held, tokens[:, now])
+    return out
+
+
 def later(control: Floats, frames: int = 1) -> Floats:
     """Control (B, P + H, K) of `frames` later; of frames that nothing was told of yet it is 0."""
     return np.concatenate([control[:, frames:], np.zeros_like(control[:, :frames])], axis=1)

@@ -113,7 +113,7 @@ class SfmsModel(nn.Module):
     motion_speed: Tensor
     sound_mean: Tensor
     sound_std: Tensor
-    sway_amplitude: Tensor
+    sway_mixture: Tensor
     sway_spread: Tensor
 
     def __init__(self, settings: config.Sfms) -> None:
@@ -128,7 +128,7 @@ class SfmsModel(nn.Module):
         self.register_buffer("sound_std", torch.ones(bins))
         self.head = head_channels(settings.channels) if settings.sway else []
         if settings.sway:
-            self.register_buffer("sway_amplitude", torch.zeros(BANDS, len(self.head)))
+            self.register_buffer("sway_mixture", torch.zeros(BANDS, len(self.head), len(self.head)))
             self.register_buffer("sway_spread", torch.zeros(()))
         self.tokenizer = Tokenizer(settings)
         inner, heads = settings.predictor_width, settings.heads

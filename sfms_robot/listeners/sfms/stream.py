@@ -14,7 +14,6 @@ Between plans nothing is computed: frames are kept, and become features with the
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from sfms_robot import config
 from sfms_robot.frames import (
     AUDIO_HZ,
+    CHANNEL_INDEX,
     FRAME_S,
     FRAME_SAMPLES,
     MOTION_DIM,
@@ -37,14 +37,14 @@ from sfms_robot.frames import (
 )
 from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
-from sfms_robot.listeners.sfms.channels import HEAD, head_channels
+from sfms_robot.listeners.sfms.channels import HEAD, LATERAL, head_channels
+from sfms_robot.listeners.sfms.courses import ToldCourse
 from sfms_robot.listeners.sfms.draw import Sampler, Seen
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
 from sfms_robot.listeners.sfms.reachable import Reach
-from sfms_robot.listeners.sfms.smiles import ToldSmiles
 from sfms_robot.listeners.sfms.sway import draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.control import COLUMNS, resized
+from sfms_robot.signals.control import COLUMNS
 
 _NO_FACE: Final = np.full(MOTION_DIM, np.nan, np.float32)
 
@@ -122,17 +122,28 @@ class SfmsListener(RunsOnEngine):
         own = [[settings.channels.index(name) for name in group.channels] for group in groups]
         sizes, bounded = [group.codes for group in groups], settings.sampling.reach
         reach = Reach(codes[0], own, sizes, self._scales["motion_speed"], bounded)
-        self.sampler = Sampler(settings, engine, reach, self._told_smiles(codes[0]))
+        self.sampler = Sampler(settings, engine, reach, self._courses(codes[0]))
 
-    def _told_smiles(self, codes: Floats) -> ToldSmiles | None:
-        """Of the standardised motion (V, C) of every code; None: this listener's smiles keep to no course."""
-        smile, name = self.settings.sampling.smile, self.settings.smiling_group
-        if smile is None or name is None:
-            return None
-        at = [self.settings.channels.index(channel) for channel in SMILE_CORNERS]
-        corners = codes[:, at] * self._scales["motion_std"][at] + self._scales["motion_mean"][at]
-        own = corners[: self.settings.groups[name].codes].mean(axis=1)
-        return ToldSmiles(smile, list(self.settings.groups).index(name), own)
+    def _courses(self, codes: Floats) -> list[ToldCourse]:
+        """That this listener keeps to, of the standardised motion (V, C) of every code."""
+        sampling, found = self.settings.sampling, []
+        for how, name, shown in (
+            (sampling.nod, self.settings.nodding_group, ("pitch",)),
+            (sampling.smile, self.settings.smiling_group, SMILE_CORNERS),
+        ):
+            if how is not None and name is not None:
+                found.append(
+                    ToldCourse(how, list(self.settings.groups).index(name), self._shown_by(codes, name, shown))
+                )
+        return found
+
+    def _shown_by(self, codes: Floats, group: str, shown: Sequence[str]) -> Doubles:
+        """What every code (V, C) of a group makes of these channels of our motion, in the mean, on a face at rest."""
+        own = [self.settings.channels.index(name) for name in self.settings.groups[group].channels]
+        rows = self._still(self.settings.groups[group].codes)
+        rows[:, own] = codes[: len(rows), own]
+        motion, _ = self.space.decode(rows * self._scales["motion_std"] + self._scales["motion_mean"])
+        return np.asarray(motion[:, [CHANNEL_INDEX[name] for name in shown]].mean(axis=1), np.float64)
 
     @property
     def hop(self) -> int:
@@ -180,7 +191,8 @@ class SfmsListener(RunsOnEngine):
         """A stream's own sway, as `sway_at` takes it; empty for a listener whose tokens hold it."""
         if not self._head:
             return np.zeros((3, 0, 0))
-        return draw_sway(self._scales["sway_amplitude"], float(self._scales["sway_spread"]), seed)
+        lateral = [at for at, channel in enumerate(self._head) if self.settings.channels[channel] in LATERAL]
+        return draw_sway(self._scales["sway_mixture"], float(self._scales["sway_spread"]), seed, lateral)
 
     def at_rest(self) -> tuple[Tokens, Floats]:
         """Tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
@@ -274,7 +286,7 @@ class SfmsListener(RunsOnEngine):
         return tokens, path, control
 
     def told(self, controls: Sequence[Floats | None]) -> Floats:
-        """What the predictor is told of controls as of `step`, (B, P + H, K): nods so that they come out as asked.
+        """What the predictor is told of controls as of `step`, (B, P + H, K).
 
         Raises ValueError for another shape, and where nothing is told to one that must be.
         """
@@ -287,8 +299,7 @@ class SfmsListener(RunsOnEngine):
         if any(one.shape != (rows, self._columns) for one in told):
             shapes = ", ".join(str(one.shape) for one in told)
             raise ValueError(f"control has shape {shapes}, not {len(told)} times ({rows}, {self._columns})")
-        asked, made = _stacked(told).astype(np.float32), self.settings.sampling.nod_size
-        return resized(asked, "nod", made.gain, math.radians(made.offset_deg))
+        return _stacked(told).astype(np.float32)
 
     def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
         """Motion (..., N, C), standardised, of frames `first`, `first` + 1, ... -> in the model's space, with the slow

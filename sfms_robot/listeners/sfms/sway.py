@@ -5,18 +5,20 @@ are as far apart as its sway is wide. A slow group of its own would need hundred
 degree, and keyframes where nothing happens; and there is nothing to predict, since sway answers to nobody. So it is
 drawn from what recorded heads do (Shinozuka's spectral representation of a stationary Gaussian process),
 
-    x(t) = size * sum over lines l of  amplitude[l] * (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a, b ~ N(0, 1)
+    x(t) = size * sum over lines l of  M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l ~ N(0, 1)^S
 
-of which every line is one cosine, |(a, b)| cos(2 pi f t - atan2(b, a)): as such it is kept.
+of which every line is one cosine a channel, |(Ma, Mb)| cos(2 pi f t - atan2(Mb, Ma)): as such it is kept.
 
-`LINES` frequencies drawn from each of the `BANDS_HZ` per channel, amplitudes fitted to the bands' powers, `size` a
-stream's own manner. A function of time alone: any frame of the future is known, nothing adds up, and after an hour it
-is where it was. It sets in over the first `EASE_S`.
+`LINES` frequencies drawn from each of the `BANDS_HZ`, `M M^T` of each band what heads do together there: who leans
+forward also comes down. `size` is a stream's own manner, and every other stream is somebody seen in a mirror: people
+lean to either side alike. A function of time alone: any frame of the future is known, nothing adds up, and after an
+hour it is where it was. It sets in over the first `EASE_S`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,30 +28,34 @@ from sfms_robot.listeners.lots import Use, normals, uniforms
 
 BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1
-LINES = 3  # of each band
+LINES = 6  # of each band
 EASE_S = 3.0
 
 
-def draw_sway(amplitude: Floats, spread: float, seed: int) -> Doubles:
+def draw_sway(mixture: Floats, spread: float, seed: int, lateral: Sequence[int] = ()) -> Doubles:
     """What one stream's sway is made of.
 
     Args:
-        amplitude: (BANDS, S) deviation of each channel within each band.
+        mixture: (BANDS, S, S) M of each band: what (a, b) of a line become in each channel.
         spread: deviation of the logarithm of sizes between people.
         seed: of the stream.
+        lateral: channels that a mirror turns around.
 
     Returns:
         (3, BANDS * LINES, S) frequencies [rad/s], sizes in units of the motion, and phases [rad].
     """
-    bands, channels = amplitude.shape
+    bands, channels, _ = mixture.shape
     edges = np.array(BANDS_HZ)
-    uniform = uniforms(seed, 0, Use.SWAY, bands * LINES * channels).reshape(bands, LINES, channels)
-    frequency_hz = edges[:-1, None, None] + uniform * (edges[1:] - edges[:-1])[:, None, None]
+    uniform = uniforms(seed, 0, Use.SWAY, 1 + bands * LINES)
+    frequency_hz = edges[:-1, None] + uniform[1:].reshape(bands, LINES) * np.diff(edges)[:, None]
     drawn = normals(seed, 1, Use.SWAY, 1 + 2 * bands * LINES * channels).astype(np.float64)
-    factors = math.exp(spread * drawn[0]) * drawn[1:].reshape(2, bands, LINES, channels)
-    factors *= (amplitude.astype(np.float64) / math.sqrt(LINES))[:, None]
+    factors = np.einsum("bsc,pblc->pbls", mixture.astype(np.float64), drawn[1:].reshape(2, bands, LINES, channels))
+    factors *= math.exp(spread * drawn[0]) / math.sqrt(LINES)
+    if uniform[0] < 0.5:
+        factors[..., list(lateral)] *= -1
     size, phase = np.hypot(*factors), np.arctan2(factors[1], factors[0])
-    return np.stack([2 * math.pi * frequency_hz, size, phase]).reshape(3, bands * LINES, channels)
+    turns = np.broadcast_to(2 * math.pi * frequency_hz[..., None], size.shape)
+    return np.stack([turns, size, phase]).reshape(3, bands * LINES, channels)
 
 
 def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:

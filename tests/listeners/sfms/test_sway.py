@@ -7,7 +7,7 @@ from sfms_robot.listeners.sfms.sway import BANDS, BANDS_HZ, EASE_S, draw_sway, s
 
 
 def made(seed: int = 0, amplitude: float = 0.01, spread: float = 0.0) -> np.ndarray:
-    return draw_sway(np.full((BANDS, 6), amplitude, np.float32), spread, seed)
+    return draw_sway(np.tile(amplitude * np.eye(6, dtype=np.float32), (BANDS, 1, 1)), spread, seed)
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 100])
@@ -43,6 +43,15 @@ def test_it_is_slow_and_does_not_step():
     hz = np.fft.rfftfreq(5000, 0.04)
     assert float(power[hz > BANDS_HZ[-1] + 0.05].sum() / power.sum()) < 0.01
     assert np.abs(np.diff(motion, axis=0)).max() < 0.2 * np.abs(motion).max()  # 2 pi 0.8 Hz 0.04 s
+
+
+def test_channels_go_together_as_they_are_mixed_and_every_other_stream_is_mirrored():
+    times_s = 10 + np.arange(3000) * 0.2
+    mixture = np.tile(np.array([[0.01, 0.0], [-0.009, 0.004]], np.float32), (BANDS, 1, 1))
+    r = [np.corrcoef(sway_at(draw_sway(mixture, 0.0, seed), times_s).T)[0, 1] for seed in range(30)]
+    assert np.mean(r) == pytest.approx(-0.91, abs=0.05) and max(r) < -0.6
+    r = [np.corrcoef(sway_at(draw_sway(mixture, 0.0, seed, [1]), times_s).T)[0, 1] for seed in range(30)]
+    assert np.mean(np.abs(r)) == pytest.approx(0.91, abs=0.05) and min(r) < -0.6 and max(r) > 0.6
 
 
 def test_streams_and_channels_go_their_own_ways():

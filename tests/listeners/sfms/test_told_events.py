@@ -42,21 +42,6 @@ def test_a_stream_that_is_told_equals_offline(hop: int):
         np.testing.assert_allclose(listener.space.decode(whole[row].numpy())[0], streamed[row], atol=2e-4)
 
 
-def test_a_stream_makes_up_for_the_size_that_nods_come_out_with():
-    """Half as large as told: told twice as large. In a stream and offline."""
-    half = told_listener(hop=2, sampling={"nod_size": {"gain": 0.5}})
-    plain, one = told_listener(hop=2), dyad()
-    twice = replace(one, events=(replace(NOD, size=2 * NOD.size), SMILE))
-    for listener in (half, plain):
-        listener.model.predictor.control_in[2].weight.data.mul_(50)
-    wanted = offline_rollout(plain, twice, [3]).motion
-    np.testing.assert_array_equal(offline_rollout(half, one, [3]).motion, wanted)
-    assert not np.array_equal(offline_rollout(plain, one, [3]).motion, wanted)
-    speaker = frames_of_dyad(one)
-    shown = [rollout(how, speaker, [3], which.events).motion for how, which in ((half, one), (plain, twice))]
-    np.testing.assert_array_equal(*shown)
-
-
 def test_streams_told_of_different_events_do_what_each_does_alone(told):
     speaker, seeds, events = speech(40), (1, 2, 3), ((NOD,), (), (SMILE, replace(NOD, start_s=0.3)))
     alone = [plans_of(told, speaker, seed, own) for seed, own in zip(seeds, events, strict=True)]

@@ -1,4 +1,4 @@
-"""Laws of the course that a smile keeps to when it is told."""
+"""Laws of the courses that smiles and nods keep to when they are told."""
 
 import numpy as np
 import pytest
@@ -6,21 +6,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_sfms import plans_of, speech, tiny_listener, told_listener
 
-from sfms_robot.config import SmileCourse
+from sfms_robot.config import NodCourse, SmileCourse
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, SMILE_CORNERS, ListenerEvent
-from sfms_robot.listeners.sfms.smiles import ToldSmiles, course
+from sfms_robot.listeners.sfms.courses import ToldCourse, nod_course, smile_course, smile_share
 from sfms_robot.signals.control import COLUMNS, control_track
 
 SMILE = ListenerEvent("smile", 0.6, 2.4, 0.5)
 LAUGH = ListenerEvent("laugh", 1.0, 1.0, 0.8)
 CODES = np.linspace(0, 1, 11)
 HOW = SmileCourse(spread=0.1)
+NOD = ListenerEvent("nod", 0.9, 1.2, 0.1, swings=3)
+NODDING = NodCourse(spread=0.06)
 FACE = [name for name in BLENDSHAPES if not name.startswith("eyeLook")]
 
 
 def told(*events, how: SmileCourse = HOW):
-    return ToldSmiles(how, 1, CODES).wanted(control_track(events, 0, 90))
+    return smile_course(how, control_track(events, 0, 90)).wanted
 
 
 def test_a_smile_rises_to_its_size_and_is_over_when_it_is_over():
@@ -36,7 +38,7 @@ def test_a_smile_rises_to_its_size_and_is_over_when_it_is_over():
 
 @given(st.floats(0, 12), st.floats(0, 12))
 def test_a_course_is_a_share(since_s: float, left_s: float):
-    assert 0 <= float(course(HOW, np.float64(since_s), np.float64(left_s))) <= 1
+    assert 0 <= float(smile_share(HOW, np.float64(since_s), np.float64(left_s))) <= 1
 
 
 def test_without_a_smile_and_in_a_laugh_nothing_is_wanted():
@@ -50,10 +52,37 @@ def test_without_a_smile_and_in_a_laugh_nothing_is_wanted():
 def test_a_code_loses_the_more_the_further_it_lies_from_the_course():
     """The transition as much as the code that is held; with none held, as one at rest."""
     wanted = np.array([np.nan, 0.5, 0.5, 0.2])
-    smiling, lost = ToldSmiles(HOW, 1, CODES).penalties(wanted, np.array([0, 6, 0, 3]))
+    smiling, lost = ToldCourse(HOW, 1, CODES).penalties(wanted, np.full(4, 0.1), np.array([0, 6, 0, 3]))
     assert smiling.tolist() == [1, 2, 3] and lost.shape == (3, 12) and (lost >= 0).all()
     np.testing.assert_allclose(lost[0, 1:], (CODES - 0.5) ** 2 / 0.02, rtol=1e-5)
     np.testing.assert_allclose(lost[:, 0], [lost[0, 6], lost[1, 1], lost[2, 3]])
+
+
+@given(st.floats(0.2, 2), st.integers(1, 4), st.floats(0.3, 0.66), st.floats(0.03, 0.2))
+def test_a_nod_goes_to_its_size_at_each_swing_less_and_comes_back(start_s: float, swings: int, each_s: float, size):
+    nod = ListenerEvent("nod", start_s, swings * each_s, size, swings)
+    course = nod_course(NODDING, control_track([nod], 0, 150))
+    rows = np.flatnonzero(np.isfinite(course.wanted))
+    since_s = (rows + 1) * 0.04 - start_s
+    assert since_s.min() > 0 and since_s.max() < nod.duration_s + 0.04
+    turns = course.wanted[rows]
+    assert turns.max() == pytest.approx(size, rel=1e-3) and turns.min() == 0
+    for swing in range(swings):
+        lowest = turns[(since_s > swing * each_s) & (since_s <= (swing + 1) * each_s)].max()
+        assert lowest == pytest.approx(size * NODDING.fall**swing, rel=1e-3)
+    back_s = since_s[turns == 0]
+    off_s = np.abs(back_s[:, None] - each_s * np.arange(1, swings + 1))
+    assert off_s.min(axis=1).max() <= 0.0201 and off_s.min(axis=0).max() <= 0.0201
+    np.testing.assert_allclose(course.spread[rows], NODDING.spread * size, rtol=1e-5)
+
+
+def test_streams_and_windows_see_one_course_and_nothing_is_wanted_without_a_nod():
+    rows = control_track([NOD, SMILE], 0, 90)
+    both = nod_course(NODDING, np.stack([rows, control_track([SMILE], 0, 90)])).wanted
+    np.testing.assert_array_equal(both[0], nod_course(NODDING, rows).wanted)
+    assert np.isnan(both[1]).all() and np.isfinite(both[0]).any()
+    later = nod_course(NODDING, control_track([NOD, SMILE], 30, 60)).wanted
+    np.testing.assert_allclose(later[2:], both[0, 32:], atol=1e-4)
 
 
 def corners(plans) -> np.ndarray:
@@ -109,8 +138,9 @@ def test_a_course_that_is_none_is_refused(smile, text):
 
 
 def test_a_listener_that_cannot_keep_to_one_says_so():
-    with pytest.raises(ConfigError, match="sampling.smile: without events no smile is told"):
-        tiny_listener(sampling={"smile": {"spread": 0.1}})
+    for kind in ("nod", "smile"):
+        with pytest.raises(ConfigError, match=f"sampling.{kind}: without events no {kind} is told"):
+            tiny_listener(sampling={kind: {"spread": 0.1}})
     apart = {
         "one": {"channels": [*POSE_CHANNELS, SMILE_CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
         "other": {
