@@ -87,11 +87,12 @@ class Sampler:
         guidance = 1 + (self._guidance - 1) * lately[:, None, None]  # (1 or B, G, 1)
         nucleus = self._nucleus_in_silence + (self._nucleus - self._nucleus_in_silence) * lately[:, None]
         chances = self._chances(seeds, frames, window - first)
-        rows = seen.control[:, first - 1 :]  # the row before says when a swing ends
+        before = min(first, 2)  # rows that say how fast a swing is, and that it has just ended
+        rows = seen.control[:, first - before :]
         courses = [(told, one) for told in self._courses if (one := told.course(rows)) is not None]
         for frame in range(first, window):
             (flat,) = self._engine.run("next", slots[..., frame - window, :], *last, np.array([frame - 1]))
-            at = frame - first + 1
+            at = frame - first + before
             now = [(told, one.wanted[:, at], one.spread[:, at]) for told, one in courses]
             since = frame - np.maximum(last.at[..., 0], self._now if self._ramp else -1)  # no ramp began before that
             drawn = self._drawn(flat, last, since, guidance, nucleus, chances[:, frame - window], now)
