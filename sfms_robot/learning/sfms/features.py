@@ -20,7 +20,7 @@ from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, some_sou
 from sfms_robot.learning.sfms.slow_motion import fit_sway, slow_part
 from sfms_robot.learning.staged_frames import Scratch
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.channels import LATERAL, head_channels
+from sfms_robot.listeners.sfms.channels import head_channels, lateral_channels
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import Context
@@ -157,8 +157,8 @@ def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) ->
     steps = (corpus.steps(corpus.frames.motion) / model.motion_std).abs().sort(dim=0).values
     model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
     if model.head:
-        lateral = [at for at, channel in enumerate(model.head) if channels[channel] in LATERAL]
-        mixture, sizes = fit_sway(torch.split(corpus.frames.sway, list(corpus.lengths)), lateral)
+        slow = torch.split(corpus.frames.sway, list(corpus.lengths))
+        mixture, sizes = fit_sway(slow, lateral_channels(channels))
         model.sway_mixture.copy_(mixture)
         model.sway_spread.copy_(sizes)
 

@@ -78,15 +78,14 @@ def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
     mirror = turned[:, None] * turned
     size = powers.sum((0, 1)).diagonal().clamp(min=1e-30).sqrt()
     alike = powers.sum(1) / size / size[:, None]  # (K, S, S), every channel as much as any other
-    sides = torch.ones(len(powers), 1, 1, 1, dtype=powers.dtype)
+    mirrored = torch.zeros(len(powers), 1, 1, dtype=torch.bool)
     for _ in range(ROUNDS):
-        mean = (alike * torch.where(sides[..., 0] > 0, 1.0, mirror)).sum(0)
+        mean = torch.where(mirrored, alike * mirror, alike).sum(0)
         likeness = (alike * mean * (1 - mirror)).sum((1, 2))  # of what a mirror changes, as each stands
-        after = torch.where(likeness < 0, -1.0, 1.0).to(powers)[:, None, None, None]
-        if torch.equal(after, sides):
+        before, mirrored = mirrored, (likeness < 0)[:, None, None]
+        if torch.equal(before, mirrored):
             break
-        sides = after
-    return powers * torch.where(sides > 0, 1.0, mirror)
+    return torch.where(mirrored[:, None], powers * mirror, powers)
 
 
 def band_powers(track: Tensor) -> Tensor:

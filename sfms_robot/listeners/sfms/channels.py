@@ -17,3 +17,8 @@ LATERAL = frozenset(("roll", "yaw", "y", "rotation_y", "rotation_z", "translatio
 def head_channels(channels: Sequence[str]) -> list[int]:
     """Which of the channels move the head."""
     return [index for index, name in enumerate(channels) if name in HEAD]
+
+
+def lateral_channels(channels: Sequence[str]) -> list[int]:
+    """Which of the `head_channels` a mirror turns around, by their place among those."""
+    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in LATERAL]

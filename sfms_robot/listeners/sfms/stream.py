@@ -37,7 +37,7 @@ from sfms_robot.frames import (
 )
 from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
-from sfms_robot.listeners.sfms.channels import HEAD, LATERAL, head_channels
+from sfms_robot.listeners.sfms.channels import HEAD, head_channels, lateral_channels
 from sfms_robot.listeners.sfms.courses import ToldCourse
 from sfms_robot.listeners.sfms.draw import Sampler, Seen
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
@@ -191,8 +191,8 @@ class SfmsListener(RunsOnEngine):
         """A stream's own sway, as `sway_at` takes it; empty for a listener whose tokens hold it."""
         if not self._head:
             return np.zeros((3, 0, 0))
-        lateral = [at for at, channel in enumerate(self._head) if self.settings.channels[channel] in LATERAL]
-        return draw_sway(self._scales["sway_mixture"], float(self._scales["sway_spread"]), seed, lateral)
+        spread = float(self._scales["sway_spread"])
+        return draw_sway(self._scales["sway_mixture"], spread, seed, lateral_channels(self.settings.channels))
 
     def at_rest(self) -> tuple[Tokens, Floats]:
         """Tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
