@@ -24,6 +24,7 @@ AUDIO_HZ: Final = 16_000
 FRAME_SAMPLES: Final = AUDIO_HZ // FRAME_HZ  # 640
 
 POSE_CHANNELS: Final = ("roll", "pitch", "yaw", "x", "y", "z")
+LATERAL_POSE: Final = ("roll", "yaw", "y")  # those of them that a mirror turns around
 
 # ARKit names, alphabetical with tongueOut last: also FaceVerse's working order (identity permutation).
 BLENDSHAPES: Final = (

@@ -80,9 +80,6 @@ class Arig(Listener):
             is small where a face is still, and with it what the sampler gets wrong, but that stays; or the
             `innovation` of a first-order autoregression fitted on the data, a step that is forgotten as fast as
             people's motion returns to its mean.
-        own_head: is the network told how its own head was? What feeds on itself may grow: false leaves what the head
-            does of itself to an autoregression of second order, which dies away. Beyond the paper; of innovations,
-            with events.
         precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
     """
 
@@ -105,7 +102,6 @@ class Arig(Listener):
     discrete: bool = False
     code_levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] = (8, 5, 5, 5)
     draws: Literal["motion", "step", "innovation"] = "motion"
-    own_head: bool = True
     diffusion: Diffusion = Diffusion()
     precision: Literal["auto", "fp32", "int8"] = "auto"
 
@@ -130,12 +126,6 @@ class Arig(Listener):
     def _events_fit(self) -> Arig:
         if self.events and self.motion_space != "arkit58":
             raise ValueError(f"events: true needs motion_space arkit58, not {self.motion_space}")
-        return self
-
-    @model_validator(mode="after")
-    def _head_is_carried(self) -> Arig:
-        if not self.own_head and not (self.events and self.draws == "innovation"):
-            raise ValueError("own_head: false needs events: true and draws: innovation")
         return self
 
     @model_validator(mode="after")

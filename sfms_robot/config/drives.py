@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
 
 from sfms_robot.config.head import Head
 from sfms_robot.config.mapping import Expression
-
-ODD: Final = ("roll", "yaw", "y")  # channels for both sides: their mirror image is their negative
+from sfms_robot.frames import LATERAL_POSE
 
 
 def drives(head: Head) -> dict[str, Expression | None]:
@@ -44,7 +42,7 @@ def inlined(node: Expression, expressions: Mapping[str, Expression]) -> Expressi
 
 def mirrored(node: Expression) -> Expression:
     """The expression of the other side of the face."""
-    if node.channel in ODD:
+    if node.channel in LATERAL_POSE:
         turned = Expression(channel=node.channel, gain=-1)
         return node.model_copy(update={"channel": None, "sum": (turned,)})
     if node.channel is not None:

@@ -125,6 +125,7 @@ class Listener(Model):
         flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
         events: is it told of nods, smiles and blinks that were decided elsewhere (`signals.control`)? Then it draws
             everything but gaze: not the eyes' direction, nor the head's part of it, which follow it by kinematics.
+        sway: is slow motion of the head a process of its own (`listeners.sway`), not drawn by the model? Needs events.
     """
 
     kind: str
@@ -134,6 +135,7 @@ class Listener(Model):
     metres_per_unit: Positive | None = None
     flame_matrix: str | None = None
     events: bool = False
+    sway: bool = False
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -150,6 +152,8 @@ class Listener(Model):
             raise ValueError(f"neutral: {len(self.neutral)} numbers, {self.motion_space} has {len(self.channels)}")
         if self.flame_matrix is not None and self.motion_space != "deca56":
             raise ValueError(f"flame_matrix: {self.motion_space} already is ARKit's expression (deca56 takes one)")
+        if self.sway and not self.events:
+            raise ValueError("sway: without events a nod cannot be told from it")
         return self
 
 
@@ -169,7 +173,6 @@ class Sfms(Listener):
         placement: where keyframes go (`listeners.sfms.placement`); max_gap_frames bounds `exact` and `penalised`.
         ramp_frames: motion toward a keyframe begins so many frames before it at most; the one before is held till then;
             None: a straight line all the way, the paper's, which a stream cannot know beyond its plan.
-        sway: is slow motion of the head a process of its own (`listeners.sfms.sway`), not in the tokens? Needs events.
         quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq); either has a group's number of
             codes, the product of its levels.
         inpainter: added to straight lines (residual), or all by itself (paper).
@@ -187,7 +190,6 @@ class Sfms(Listener):
     placement: Placement = "exact"
     max_gap_frames: Count = 24
     ramp_frames: Count | None = None
-    sway: bool = False
     groups: Annotated[dict[Name, ChannelGroup], Field(min_length=1)]
     scores: Scores = Scores()
     quantizer: Literal["fsq", "vq"] = "fsq"
@@ -230,8 +232,6 @@ class Sfms(Listener):
                 raise ValueError(f"groups.{name}: placement penalised takes keyframe_cost, not keyframes")
             if self.placement != "penalised" and (group.keyframes is None or group.keyframe_cost is not None):
                 raise ValueError(f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost")
-        if self.sway and not self.events:
-            raise ValueError("sway: without events a nod cannot be told from it")
         for kind in ("nod", "smile"):
             if getattr(self.sampling, kind) is not None and not self.events:
                 raise ValueError(f"sampling.{kind}: without events no {kind} is told")

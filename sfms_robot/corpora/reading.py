@@ -192,7 +192,7 @@ def dyad(
     frames = len(listener)
     listening = np.ones(frames, bool)
     if audio is not None and own is not None:
-        voices = [_speaks(voice, frames, fps) for voice in (audio, own)]
+        voices = [speaks(voice, frames, fps) for voice in (audio, own)]
         listening = np.asarray(listening_mask(voices[0], fps, voices[1]), bool)
     return Dyad(name, audio, speaker, listener, listening, space, fps, mel)
 
@@ -216,7 +216,8 @@ def voices_of(voices: Sequence[Path], frames: int, fps: float) -> dict[str, Floa
     return {"audio": sound(voices[0], frames, fps), "own": own}
 
 
-def _speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
+def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
+    """(frames,) in which somebody is heard to speak; a voice that is over says nothing."""
     active = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / fps), bool)[:frames]
     return np.pad(active, (0, frames - len(active)))
 

@@ -205,7 +205,7 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
         tokens, path = listener.plan(seen, path, seeds, [now] * streams)
         shown[:, now + 1 : now + 1 + ahead] = listener.shown(path)
         drawn[:, now + 1 : now + 1 + ahead] = tokens[:, -ahead:]
-    sway = np.stack([listener.draw_sway(seed) for seed in seeds])
+    sway = np.stack([listener.sway.start(seed) for seed in seeds])
     motion = listener.with_sway(shown[:, :frames], sway, 0)
     return OfflineRollout(torch.from_numpy(motion), torch.from_numpy(drawn[:, :frames]))
 

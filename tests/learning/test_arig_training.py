@@ -36,7 +36,7 @@ from sfms_robot.learning.arig.trainer import draw, starts_by_event, train_arig, 
 from sfms_robot.learning.job import Run
 from sfms_robot.listeners import arig, checkpoint
 from sfms_robot.listeners.arig import audio_frontend
-from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, WIDTHS, hear
+from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, hear
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sojourns import FIRST, NODDING
 from sfms_robot.listeners.arig.told import features
@@ -45,7 +45,8 @@ from sfms_robot.signals.mel import FLOOR, LN_PER_DB
 
 ARKIT = MotionSpace("arkit58", np.zeros(58))
 WINDOW = 24
-CARRIED = {"events": True, "draws": "innovation", "own_head": False}
+SWAYS = {"events": True, "draws": "innovation", "sway": True}
+A_LISTENER, A_TOLD = (settings(listener={"events": events}).listener for events in (False, True))
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def corpus(data):
-    return gather(open_scenes(data, "train"), WINDOW, ARKIT, WIDTHS["mel"])
+    return gather(open_scenes(data, "train"), WINDOW, ARKIT, A_LISTENER)
 
 
 def a_student(**changes) -> Student:
@@ -73,7 +74,7 @@ def quiet(**changes) -> config.ArigPhase:
 @pytest.mark.parametrize(
     "changes",
     [{}, {"state_guidance": False}, {"visual": False}, {"discrete": True}, {"interaction": "linear"},
-     {"context_chunks": 4}, {"draws": "step"}, {"events": True, "draws": "innovation"}, CARRIED],
+     {"context_chunks": 4}, {"draws": "step"}, {"events": True, "draws": "innovation"}, SWAYS],
     ids=lambda changes: "-".join(changes) or "full",
 )  # fmt: skip
 def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, changes):
@@ -287,7 +288,7 @@ def test_what_is_drawn_is_the_inverse_of_what_is_learned(corpus, draws):
     fit_scales(model, corpus, settings().listener.channels)
     motion = model.standardise(corpus.frames.agent_motion)
     last = motion.roll(1, 0)
-    assert torch.allclose(model.drawn(model.target(motion, last), last), motion, atol=1e-4)
+    assert torch.allclose(model.drawn(model.moved(motion, last), last), motion, atol=1e-4)
 
 
 def test_steps_from_one_dyad_into_the_next_are_no_steps(corpus):
@@ -324,12 +325,12 @@ def test_unlabelled_frames_have_no_state_loss(corpus):
 
 def test_only_short_dyads_are_refused(data):
     with pytest.raises(ConfigError, match=r"none of \d+ dyads can be used: \d+ are shorter than a window of 9000"):
-        gather(open_scenes(data, "train"), 9000, ARKIT, WIDTHS["mel"])
+        gather(open_scenes(data, "train"), 9000, ARKIT, A_LISTENER)
 
 
 def test_agent_and_user_keep_their_tracks():
     one = dyad("a", "speaking", 0)
-    found = gather({"speaking": [one]}, WINDOW, ARKIT, WIDTHS["mel"])
+    found = gather({"speaking": [one]}, WINDOW, ARKIT, A_LISTENER)
     frames = found.frames
     assert frames.agent_heard.all() and not frames.user_heard.any() and not frames.user_seen.any()
     assert frames.voiced[:, 0].any() and not frames.voiced[:, 1].any()
@@ -361,8 +362,8 @@ def test_what_is_wrong_in_a_training_file_is_said(raw, said):
 def test_a_dyad_whose_events_nobody_knows_cannot_teach_a_listener_with_events(data):
     blank = replace(dyad("blank", "listening", 0), events=None)
     with pytest.raises(ConfigError, match="blank: what the listener did is not known"):
-        gather({"listening": [blank]}, WINDOW, ARKIT, WIDTHS["mel"], events=True)
-    assert gather({"listening": [blank]}, WINDOW, ARKIT, WIDTHS["mel"]).frames.control.shape[-1] == 0
+        gather({"listening": [blank]}, WINDOW, ARKIT, A_TOLD)
+    assert gather({"listening": [blank]}, WINDOW, ARKIT, A_LISTENER).frames.control.shape[-1] == 0
 
 
 def test_gaze_is_not_among_what_is_learned_with_events():
@@ -372,15 +373,15 @@ def test_gaze_is_not_among_what_is_learned_with_events():
     motion = one.listener.copy()
     motion[:, :3] += looks
     motion[:, [CHANNELS.index("eyeLookInLeft"), CHANNELS.index("eyeLookUpRight")]] = 0.4
-    seen = gather({"a": [replace(one, listener=motion, head_of_gaze_rad=looks)]}, WINDOW, ARKIT, WIDTHS["mel"], True)
-    still = gather({"a": [one]}, WINDOW, ARKIT, WIDTHS["mel"], True)
+    seen = gather({"a": [replace(one, listener=motion, head_of_gaze_rad=looks)]}, WINDOW, ARKIT, A_TOLD)
+    still = gather({"a": [one]}, WINDOW, ARKIT, A_TOLD)
     assert torch.allclose(seen.frames.agent_motion, still.frames.agent_motion, atol=1e-6)
     assert torch.equal(seen.frames.control, still.frames.control) and seen.frames.control.any()
 
 
 def test_feedback_that_is_seen_has_states_of_its_own():
     one = dyad("a", "listening", 1)
-    found = gather({"a": [one]}, WINDOW, ARKIT, WIDTHS["mel"], True).frames
+    found = gather({"a": [one]}, WINDOW, ARKIT, A_TOLD).frames
     nods = found.control[:, 0] > 0
     listening = torch.from_numpy(one.states == STATES.index("listening"))
     assert torch.equal(found.states == NODDING, nods & listening) and bool((nods & listening).any())
@@ -391,7 +392,7 @@ def test_windows_of_events_have_every_kind_as_often_and_come_of_the_scene_that_w
     smile, nods = ListenerEvent("smile", 10.0, 1.0, 0.5), tuple(ListenerEvent("nod", at, 0.4, 0.05) for at in range(9))
     blinks = tuple(ListenerEvent("blink", at + 0.5, 0.2, 0.9) for at in range(11))
     said = {"listening": [replace(one, events=(*nods, smile, *blinks))], "speaking": [replace(other, events=blinks)]}
-    corpus = gather(said, WINDOW, ARKIT, WIDTHS["mel"], events=True)
+    corpus = gather(said, WINDOW, ARKIT, A_TOLD)
     starts = corpus.starts_by_scene(WINDOW)
     eventful = starts_by_event(corpus, starts, WINDOW)
     assert [len(eventful[scene]) for scene in said] == [2, 0]  # blinks do not count
@@ -440,47 +441,73 @@ def test_the_fitted_autoregression_is_that_of_the_motion():
 
 
 def of_motion(motion: np.ndarray) -> ArigModel:
-    """Scales of a model that is not told of its own head, fitted on motion (N, 58) of one dyad without events."""
+    """Scales of a model whose head sways apart, fitted on motion (N, 58) of one dyad without events."""
     one = dyad("a", "listening", 0)
     frames = len(one.listener)
     made = [
         replace(one, name=f"a{at}", listener=motion[at : at + frames].astype(np.float32), events=())
         for at in range(0, len(motion) - frames + 1, frames)
     ]
-    model = a_student(**CARRIED).model
-    fit_scales(model, gather({"listening": made}, WINDOW, ARKIT, WIDTHS["mel"], True), settings().listener.channels)
+    model = a_student(**SWAYS).model
+    fit_scales(model, gather({"listening": made}, WINDOW, ARKIT, model.settings), settings().listener.channels)
     return model
 
 
-def test_a_head_that_sways_is_carried_on_as_it_sways():
-    """A process of second order with poles 0.97 (cos 0.2 +- i sin 0.2) is found again, and what drives it is white."""
-    rng, (a, b) = np.random.default_rng(0), (2 * 0.97 * np.cos(0.2), -(0.97**2))
-    place = [np.zeros(58), np.zeros(58)]
-    for draw_ in rng.normal(0, 0.002, (9000, 58)):
-        place.append(a * place[-1] + b * place[-2] + draw_)
-    model = of_motion(np.stack(place))
-    rho, carried = model.rho[:6], model.step_rho[:6]
-    assert torch.allclose(rho + carried - carried * (1 - rho.square()), torch.tensor(a).float(), atol=0.02)
-    assert torch.allclose(-carried * rho, torch.tensor(b).float(), atol=0.02)
-    assert not model.step_rho[6:].any()
+def test_how_a_head_sways_is_apart_and_what_is_left_of_it_is_soon_forgotten():
+    """Sway of 0.1 and 0.4 Hz is fitted as sway; a residual with a memory of two frames is left beside it."""
+    rng, times_s = np.random.default_rng(0), np.arange(9000)[:, None] / HZ
+    slow = 0.02 * np.sin(2 * np.pi * 0.1 * times_s + np.arange(58)) + 0.01 * np.sin(2 * np.pi * 0.4 * times_s)
+    fast = [np.zeros(58)]
+    for draw_ in rng.normal(0, 0.004, (len(slow) - 1, 58)):
+        fast.append(0.5 * fast[-1] + draw_)
+    model = of_motion(slow + fast)
+    power = (model.sway_mixture @ model.sway_mixture.mT).diagonal(dim1=-2, dim2=-1).sum(0)
+    assert torch.allclose(power.sqrt(), torch.tensor((0.02**2 / 2 + 0.01**2 / 2) ** 0.5), rtol=0.15)
+    assert float(model.rho[:6].max()) < 0.6 and float(model.rho[6:].min()) > 0.9
+
+
+def test_who_speaks_is_no_model_of_how_a_listener_sways():
+    one, rng = dyad("a", "listening", 0), np.random.default_rng(0)
+    still, lively = (scale * np.cumsum(rng.normal(0, 1, one.listener.shape), axis=0) for scale in (1e-4, 1e-2))
+    of = {name: [replace(one, listener=motion.astype(np.float32), events=())]
+          for name, motion in (("listening", still), ("speaking", lively))}  # fmt: skip
+    both, alone = a_student(**SWAYS).model, a_student(**SWAYS).model
+    for model, scenes in ((both, of), (alone, {"listening": of["listening"]})):
+        fit_scales(model, gather(scenes, WINDOW, ARKIT, model.settings), model.settings.channels)
+    assert torch.equal(both.sway_mixture, alone.sway_mixture) and bool(alone.sway_mixture.any())
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_no_motion_can_be_fitted_by_a_head_that_grows(seed):
-    """Smooth, square, growing or constant: both poles are within the unit circle."""
+    """Smooth, square, growing or constant: what was drawn is less and less."""
     rng, time = np.random.default_rng(seed), np.arange(600)[:, None]
     kinds = [np.sin(time * rng.uniform(0.01, 3.0, 58)), np.sign(np.sin(time * rng.uniform(0.01, 1.0, 58))),
              np.exp(time / 200) * np.ones(58), time * np.ones(58), np.ones((600, 58))]  # fmt: skip
     model = of_motion(0.1 * kinds[seed] + 0.2)
-    rho, carried = (each[:6].double().numpy() for each in (model.rho, model.step_rho))
-    for first, second in zip(rho + carried * rho**2, -carried * rho, strict=True):
-        assert np.abs(np.roots([1, -first, -second])).max() < 1
+    assert 0 <= float(model.rho.min()) and float(model.rho.max()) < 1 and bool(model.sway_mixture.isfinite().all())
+
+
+def test_how_far_a_face_goes_at_rest_is_that_of_one_that_nothing_moves():
+    """Small where nothing happens, large while it raises its brows or talks: the small one counts."""
+    one, rng = dyad("a", "listening", 0), np.random.default_rng(0)
+    frames = len(one.listener)
+    half, sample = frames // 2, len(one.agent_audio) // frames
+    brows = ListenerEvent("brow_raise", half / HZ, half / HZ / 2, 0.5)
+    motion = rng.uniform(-0.01, 0.01, one.listener.shape)
+    motion[half:] *= 20
+    said = rng.normal(0, 0.2, len(one.agent_audio)).astype(np.float32)
+    said[: (half + 1) * sample] = 0
+    still = replace(one, listener=(0.2 + motion).astype(np.float32), events=(brows,), agent_audio=said)
+    model = a_student(**SWAYS).model
+    fit_scales(model, gather({"listening": [still] * 3}, WINDOW, ARKIT, model.settings), model.settings.channels)
+    rests = (model.rest_range * model.motion_std)[model.is_drawn & model.is_recalled]
+    assert float(rests.max()) < 0.05
 
 
 def test_a_head_whose_past_is_not_told_is_as_it_was(data):
-    corpus = gather(open_scenes(data, "train"), WINDOW, ARKIT, WIDTHS["mel"], True)
+    model = a_student(**SWAYS).model
+    corpus = gather(open_scenes(data, "train"), WINDOW, ARKIT, model.settings)
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:50], WINDOW)
-    model = a_student(**CARRIED).model
     fit_scales(model, corpus, settings().listener.channels)
     found, truth = augment(told, model, quiet(history_noise=1.0), torch.Generator().manual_seed(0))
     assert torch.equal(found.agent_motion[..., :6], told.agent_motion[..., :6])
@@ -495,7 +522,7 @@ def test_what_events_do_on_average_is_fitted_on_the_data_and_has_no_side():
     for event in one.events:
         at = round(event.start_s * HZ)
         motion[at : at + 15, :3] += 0.05 * bump[:, None]
-    corpus = gather({"a": [replace(one, listener=motion)]}, WINDOW, ARKIT, WIDTHS["mel"], True)
+    corpus = gather({"a": [replace(one, listener=motion)]}, WINDOW, ARKIT, A_TOLD)
     model = a_student(events=True, draws="innovation").model
     fit_scales(model, corpus, settings().listener.channels)
     found = features(corpus.frames.control) @ model.told

@@ -17,6 +17,7 @@ from sfms_robot.config import find
 from sfms_robot.corpora.clips import Dyad
 from sfms_robot.corpora.collection import usable
 from sfms_robot.corpora.formats import detect, open_for, split_names
+from sfms_robot.corpora.reading import speaks
 from sfms_robot.corpora.resampling import at_frame_rate
 from sfms_robot.errors import ConfigError
 from sfms_robot.evaluation import manners as manner
@@ -26,7 +27,6 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, load_listener, one_thread
 from sfms_robot.ports import Listener
-from sfms_robot.signals.events import voice_activity
 
 DRIFT_S: Final = 600.0
 _FIGURES: Final = ("nod_deg", "nod_s", "nod_swings", "blink_s", "smile_s", "look_s")
@@ -93,11 +93,8 @@ def listening(dyads: Sequence[Dyad], motions: Sequence[Floats]) -> list[Floats]:
 
 def silent(dyad: Dyad) -> NDArray[np.bool_]:
     """(N,) frames in which the dyad's listener says nothing."""
-    out = np.ones(len(dyad.listener), bool)
-    if dyad.agent_audio is not None:
-        said = voice_activity(dyad.agent_audio)[: len(out)]
-        out[: len(said)] = ~said
-    return out
+    frames = len(dyad.listener)
+    return np.ones(frames, bool) if dyad.agent_audio is None else ~speaks(dyad.agent_audio, frames, FRAME_HZ)
 
 
 def of_training(data: Path, count: int) -> list[Floats]:

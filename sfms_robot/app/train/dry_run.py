@@ -87,10 +87,7 @@ def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[s
         phase = settings.training
         student = Student(ArigModel(settings.listener))
         dyads = _made_up(phase.window_frames + FRAME_HZ, space, settings.listener.events)
-        corpus = arig.gather(
-            dict.fromkeys(arig.SCENES, dyads), phase.window_frames, space, student.model.sound_width,
-            settings.listener.events,
-        )  # fmt: skip
+        corpus = arig.gather(dict.fromkeys(arig.SCENES, dyads), phase.window_frames, space, settings.listener)
         arig.fit_scales(student.model, corpus, settings.listener.channels)
         yield "arig", arig_job(settings, student, corpus, corpus, cpu), phase.steps
         return

@@ -14,11 +14,14 @@ from typing import Final
 
 import numpy as np
 
+from sfms_robot.config.drives import other_side
 from sfms_robot.corpora.compose.motions import SHAPE, Motions, edges, slow
 from sfms_robot.frames import (
     BLENDSHAPES,
+    CHANNEL_INDEX,
     FRAME_HZ,
     FRAME_S,
+    LATERAL_POSE,
     MOTION_DIM,
     POSE,
     SHAPES,
@@ -35,14 +38,8 @@ NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay 
 _FADE: Final = FRAME_HZ
 _CORNERS: Final = [SHAPE[name] for name in SMILE_CORNERS]
 _LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
-_MIRROR: Final = [
-    BLENDSHAPES.index(
-        name.replace("Left", "\0").replace("Right", "Left").replace("\0", "Right")
-        if name.endswith(("Left", "Right"))
-        else name
-    )
-    for name in BLENDSHAPES
-]
+_MIRROR: Final = [BLENDSHAPES.index(other_side(name)) for name in BLENDSHAPES]
+_TURNED: Final = [CHANNEL_INDEX[name] for name in LATERAL_POSE]
 
 
 def _nothing(*shape: int) -> Doubles:
@@ -147,7 +144,7 @@ def mirrored(motion: Floats) -> Floats:
     """The same motion (N, 58) of the mirror image."""
     out = motion.copy()
     out[:, SHAPES] = motion[:, SHAPES][:, _MIRROR]
-    out[:, [0, 2, 4]] *= -1  # roll, yaw, y
+    out[:, _TURNED] *= -1
     return out
 
 

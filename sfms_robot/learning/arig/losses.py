@@ -88,7 +88,7 @@ def loss_parts(
     weights = channel_weights(model.settings, group_weights).to(truth.device) if group_weights else None
     found = model.condition(told, previous)
     target = model.standardise(truth[:, 1:])
-    to_draw = model.target(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told), found.moved)
+    to_draw = model.moved(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
     motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), draws, generator, weights).mean()
     coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
     known = states[:, 1:] >= 0

@@ -40,9 +40,9 @@ def train_arig(
     listener, phase = settings.listener, settings.training
     torch.manual_seed(settings.seed)
     student = Student(ArigModel(listener))
-    space, width = MotionSpace.of(listener), student.model.sound_width
+    space = MotionSpace.of(listener)
     corpus, held_out = (
-        gather(open_scenes(data, split), phase.window_frames, space, width, listener.events, run.staging(split))
+        gather(open_scenes(data, split), phase.window_frames, space, listener, run.staging(split))
         for split in ("train", "validation")
     )
     fit_scales(student.model, corpus, listener.channels)

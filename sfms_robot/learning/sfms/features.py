@@ -17,10 +17,10 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.learning import corpus as dyads
 from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, windows, without_gaze
-from sfms_robot.learning.sfms.slow_motion import fit_sway, slow_part
+from sfms_robot.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.learning.staged_frames import Scratch
+from sfms_robot.listeners.head_channels import lateral_channels
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.channels import head_channels, lateral_channels
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import Context
@@ -92,11 +92,7 @@ def frames_of(
     motion = in_space(dyad, dyad.listener, space)
     sway = torch.zeros(len(motion), 0)
     if settings is not None and settings.sway:
-        head = head_channels(settings.channels)
-        slow = torch.from_numpy(slow_part(motion[:, head].numpy(), dyad.events or ()))
-        sway = slow - torch.tensor(space.neutral, dtype=torch.float32)[head]
-        motion = motion.clone()
-        motion[:, head] -= sway
+        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
     return SfmsFrames(
         motion=motion,
         face=torch.where(known[:, None], face, 0.0),

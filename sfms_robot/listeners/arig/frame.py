@@ -127,15 +127,14 @@ class Draw(Part):
         standard: Tensor,
         motion_keys: Tensor,
         rows: Tensor | None = None,
-        sample: Tensor | None = None,
+        speaks: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """One frame.
 
         Args:
             z: of `Frame`; noise: (N, *model.noise_shape).
             standard: (N, C) standardised motion of the frame before; motion_keys: of `stream.Memory`.
-            rows: (N, 2K) of `Frame`, of a listener with events.
-            sample: (N, C) `model.moved` of the frame before, of one that is not told of its own head.
+            rows: (N, 2K) of `Frame`, of a listener with events; speaks: (N,) bool, the agent, likewise.
 
         Returns:
             Motion (N, C) in plain units, the same standardised (N, C), `model.moved` (N, C), embedded (N, D), and the
@@ -145,7 +144,7 @@ class Draw(Part):
         levels = self.levels
         if levels is None and self.places is not None and isinstance(model.head, Denoiser):
             levels = model.head.time(self.places)
-        made = model.drawn(model.sample(z, noise, levels), standard, rows, sample)
+        made = model.drawn(model.sample(z, noise, levels), standard, rows, speaks)
         motion = model.embed_own(made)
         keys = push(motion_keys, model.progress.temporal.keys(motion))
         return model.restore(made), made, model.moved(made, standard, rows), motion, keys
@@ -192,8 +191,7 @@ def examples(settings: config.Arig, streams: int) -> Mapping[str, dict[str, Tens
     }
     if settings.events:
         draw["rows"] = torch.zeros(n, CONTROL_ROWS * len(COLUMNS))
-    if not settings.own_head:
-        draw["sample"] = torch.zeros(n, channels)
+        draw["speaks"] = torch.zeros(n, dtype=torch.bool)
     return {"rest": {"still": torch.zeros(1, channels)}, "frame": frame, "draw": draw}
 
 

@@ -11,7 +11,7 @@ frame T. Offline everything is parallel over T. For training:
 `stream.ArigListener` computes frame by frame, the law its tests hold). Buffers that training sets from its data:
 `motion_mean`, `motion_std`, `sound_mean`, `sound_std`, and of the diffusion head `low`, `high`, the range of what it
 draws. Where that is steps (`draws: step`, ours), `step_std` and the range `motion_low`, `motion_high` that motion keeps
-to join them; `target` is what the sampler learns and `drawn` its inverse. Everything that goes in and out here is in
+to join them; `moved` is what the sampler learns and `drawn` its inverse. Everything that goes in and out here is in
 plain units: motion of the listener's motion space, sound features of `sound.track`.
 
 Beyond the paper, too:
@@ -22,15 +22,17 @@ Beyond the paper, too:
    what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
    the face moves is too fine for the few numbers of z. The mean of what is to be drawn is predicted, and the sampler
    draws what is left: an event that is told shows after few steps of training, whatever the sampler's temperature.
- - `own_head: false`: of the agent's head neither its past nor what was drawn last is told, and what it does of itself
-   is an autoregression of second order. With r = x - b (below) and its step v_t = r_t - rho r_(t-1), what is drawn is
-   v_t less step_rho (v_(t-1) - (1 - rho^2) r_(t-1)), the part of the last step that r does not tell yet: Burg's
-   autoregression of the data in two lags, which cannot grow. Driven by draws of bounded size
-   that know nothing of where the head is, it sways as far as people's do, and no weights can make it swing. Told of its
-   own past it learned to, from one end of its range to the other within a second.
+ - `sway: true`: slow motion of the head is made apart (`listeners.sway`) and is in no motion here: what is left of the
+   head is what it does, and soon over, so `rho` forgets it within frames. Carried on as slowly as a head sways, what
+   was drawn beside a nod left it some degrees off when the nod was over. Of what is left neither its past nor what was
+   drawn last is told: told of its own head, a network learned to swing it from one end of its range to the other.
  - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
    and told to the sampler beside z. Where the eyes look is not drawn: they rest. Innovations are of what is left beside
-   the motion b to be expected of the events (`told`): x_t = b_t + rho (x_(t-1) - b_(t-1)) + ...
+   the motion b to be expected of the events (`told`): x_t = b_t + rho f_t (x_(t-1) - b_(t-1)) + ..., with f_t < 1 while
+   an event moves the channel, so that by its end nothing is left of what was drawn beside it (`told.remains`). A face
+   that nothing moves, no event and no word of its own, is held to `rest_range`, how far such faces of the data are off
+   b, and beyond that comes back by rho a frame, whatever is drawn: told of its own past, a network holds a raised brow
+   up for good.
 
 B batch, N frames, C channels of the motion space, A sound features, D width, K numbers of a control row.
 """
@@ -44,7 +46,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.listeners.arig import told
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
 from sfms_robot.listeners.arig.codes import CodeHead
@@ -54,10 +55,13 @@ from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
 from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
 from sfms_robot.listeners.arig.pmp import Progressive
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST
+from sfms_robot.listeners.head_channels import head_channels
+from sfms_robot.listeners.sway import BANDS
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
 MEAN_WIDTH = 256
+UNBOUNDED = 1e3  # deviations
 MEAN_DELTA = 4.0  # deviations beyond which an error of the mean counts linearly: above, hardly any event is told
 
 
@@ -70,7 +74,7 @@ class Dyad:
         user_heard, agent_heard: (B, N) bool.
         user_motion: (B, N, C) motion of the listener's space; anything where not seen.
         user_seen: (B, N) bool.
-        agent_motion: (B, N, C).
+        agent_motion: (B, N, C), without its sway where that is apart.
         voiced: (B, N, 2) bool: speech of agent, user.
         control: (B, N, K) of the agent's events; any for a model without.
     """
@@ -138,8 +142,11 @@ class ArigModel(nn.Module):
     step_std: Tensor
     rho: Tensor
     spread: Tensor
-    step_rho: Tensor
     told: Tensor
+    moves: Tensor
+    rest_range: Tensor
+    sway_mixture: Tensor
+    sway_spread: Tensor
     is_drawn: Tensor
     is_recalled: Tensor
     sound_mean: Tensor
@@ -161,11 +168,16 @@ class ArigModel(nn.Module):
             self.register_buffer("spread", torch.ones(self.channels))
             if self.is_told:
                 self.register_buffer("told", torch.zeros(told.FEATURES, self.channels))
-            if not settings.own_head:
-                self.register_buffer("step_rho", torch.zeros(self.channels))
+                self.register_buffer("moves", told.moves(settings.channels), persistent=False)
+                self.register_buffer("rest_range", torch.full((self.channels,), UNBOUNDED))
         is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
         self.register_buffer("is_drawn", is_drawn, persistent=False)
-        is_recalled = torch.tensor([settings.own_head or name not in POSE_CHANNELS for name in settings.channels])
+        is_recalled = torch.ones(self.channels, dtype=torch.bool)
+        if settings.sway:
+            head = head_channels(settings.channels)
+            is_recalled[head] = False
+            self.register_buffer("sway_mixture", torch.zeros(BANDS, len(head), len(head)))
+            self.register_buffer("sway_spread", torch.zeros(()))
         self.register_buffer("is_recalled", is_recalled, persistent=False)
         self.register_buffer("sound_mean", torch.zeros(self.sound_width))
         self.register_buffer("sound_std", torch.ones(self.sound_width))
@@ -222,28 +234,26 @@ class ArigModel(nn.Module):
         step = (motion - self.expected(last, rows)) / self.step_std
         return self.companded(step) if self.settings.draws == "innovation" else step
 
-    def target(self, motion: Tensor, last: Tensor, rows: Tensor | None = None, moved: Tensor | None = None) -> Tensor:
-        """What the sampler is to draw: `moved`, less what the step before it, `moved` (..., C), leads to."""
-        found = self.moved(motion, last, rows)
-        if self.settings.own_head or moved is None:
-            return found
-        _, off = self._events(last, rows)
-        return self.companded(self.expanded(found) - self._carried(off, moved))
+    def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None, speaks: Tensor | None = None) -> Tensor:
+        """The inverse of `moved`; a step never leads out of the range of the motion, and what is not drawn rests.
 
-    def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None, moved: Tensor | None = None) -> Tensor:
-        """The inverse of `target`; a step never leads out of the range of the motion, and what is not drawn rests."""
+        `speaks` (...) bool, the agent in this frame; None: it may.
+        """
         if self.settings.draws == "motion":
             return self._at_rest(sample)
-        now, off = self._events(last, rows)
         step = self.expanded(sample) if self.settings.draws == "innovation" else sample
-        if not self.settings.own_head and moved is not None:
-            step = step + self._carried(off, moved)
-        made = torch.addcmul(self._begins(now, off), step, self.step_std).clamp(self.motion_low, self.motion_high)
-        return self._at_rest(made)
+        begins = self.expected(last, rows)
+        made = torch.addcmul(begins, step, self.step_std)
+        if self.is_told and rows is not None and speaks is not None:
+            made = self._held(made, begins, rows.chunk(2, dim=-1)[1], speaks)
+        return self._at_rest(made.clamp(self.motion_low, self.motion_high))
 
-    def _carried(self, off: Tensor, moved: Tensor) -> Tensor:
-        """What the step `moved` (..., C), which led so far `off`, leads to of the next one, in `step_std`."""
-        return self.step_rho * (self.expanded(moved) - (1 - self.rho.square()) / self.step_std * off)
+    def _held(self, made: Tensor, begins: Tensor, row: Tensor, speaks: Tensor) -> Tensor:
+        """Motion (..., C) that would begin at `begins`, where nothing moves the face not beyond where faces rest."""
+        course = told.features(row) @ self.told
+        free = speaks[..., None] | told.moved(row, self.moves)
+        most = torch.where(free, UNBOUNDED, torch.maximum(self.rest_range, (begins - course).abs()))
+        return course + torch.minimum(torch.maximum(made - course, -most), most)
 
     def companded(self, step: Tensor) -> Tensor:
         """Steps (..., C), in `step_std`, as they are drawn."""
@@ -262,20 +272,13 @@ class ArigModel(nn.Module):
 
         With events, to what is told of the frame, from what was told of the last: `rows` (..., 2K).
         """
-        return self._begins(*self._events(last, rows))
-
-    def _begins(self, now: Tensor | None, off: Tensor) -> Tensor:
-        """`expected` of what `_events` says."""
         if self.settings.draws != "innovation":
-            return off
-        return self.rho * off if now is None else now + self.rho * off
-
-    def _events(self, last: Tensor, rows: Tensor | None) -> tuple[Tensor | None, Tensor]:
-        """What is told of the frame (..., C), None for nothing, and how far `last` is off what was told of it."""
+            return last
         if not self.is_told or rows is None:
-            return None, last
-        before, now = (told.features(row) @ self.told for row in rows.chunk(2, dim=-1))
-        return now, last - before
+            return self.rho * last
+        before, now = rows.chunk(2, dim=-1)
+        off = last - told.features(before) @ self.told
+        return told.features(now) @ self.told + self.rho * told.remains(before, now, self.moves) * off
 
     def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
         """Of the sampler (N, C), the mean included: z (N, D and beside it), noise and levels of `Denoiser.sample`.
@@ -295,7 +298,10 @@ class ArigModel(nn.Module):
         generator: torch.Generator | None = None,
         weights: Tensor | None = None,
     ) -> Tensor:
-        """Equation (3) of `target` (N, C) at `draws` noise levels, or the loss of codes, and that of the mean, (N,)."""
+        """Equation (3) at `draws` noise levels, or the loss of codes, and that of the mean, (N,).
+
+        `wanted` (N, C): `moved` of the frame.
+        """
         mean = torch.zeros_like(wanted) if self.mean is None else self.mean(z)
         left, z = (each.repeat(draws, 1) for each in (wanted - mean.detach(), z))
         drawn = self.head.loss(z, left, generator, weights).view(draws, -1).mean(0)
@@ -406,9 +412,9 @@ class ArigModel(nn.Module):
         known = None if states is None else torch.where(states < 0, FIRST, states)
         found = self.condition(dyad, known)
         standard = self.standardise(dyad.agent_motion)
-        target = self.target(standard[:, 1:], standard[:, :-1], self.rows(dyad), found.moved)
-        motion = self.sample_loss(found.z.flatten(0, 1), target.flatten(0, 1), generator=generator)
-        motion = motion.view(target.shape[:2])
+        wanted = self.moved(standard[:, 1:], standard[:, :-1], self.rows(dyad))
+        motion = self.sample_loss(found.z.flatten(0, 1), wanted.flatten(0, 1), generator=generator)
+        motion = motion.view(wanted.shape[:2])
         if found.states is None or states is None:
             return Losses(motion, None)
         wrong = F.cross_entropy(found.states.transpose(1, 2), states[:, 1:], ignore_index=-1, reduction="none")
@@ -419,4 +425,4 @@ class ArigModel(nn.Module):
         found = self.condition(dyad, states)
         made = self.sample(found.z.flatten(0, 1), noise.flatten(0, 1)).view(found.moved.shape)
         last = self.standardise(dyad.agent_motion[:, :-1])
-        return self.restore(self.drawn(made, last, self.rows(dyad), found.moved))
+        return self.restore(self.drawn(made, last, self.rows(dyad), dyad.voiced[:, 1:, 0]))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_S, Floats, Plan, SpeakerFrame, changed
+from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.listeners.arig.audio_frontend import AudioState
 from sfms_robot.listeners.arig.rotary import rotary
@@ -30,6 +30,7 @@ from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST, Sojourn, dra
 from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.lots import Use, normals, uniforms
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import HeadSway
 from sfms_robot.signals.control import COLUMNS
 
 BEYOND = 1e3  # rad, m or of a blendshape: no face
@@ -48,9 +49,10 @@ class Memory:
         sound_keys: (3, 2D) of the agent's last sounds; motion_keys: (5, 2D) of its last motions.
         context: (2L, h, w - 1, D/h) keys and values of whole chunks, layer by layer, the newest last.
         motion: (D,) embedded motion of the agent's last frame; standard: (C,) the same, standardised; sample: (C,) the
-            step to it, as the sampler draws steps.
+            step to it, as the sampler draws steps; all without sway.
         state: conversational state of the last frame, of `settings.states`; sojourn: that which it is drawn from, of a
             listener with events.
+        sway: this stream's own (`HeadSway.start`).
     """
 
     seed: int
@@ -68,6 +70,7 @@ class Memory:
     sample: Floats
     state: int
     sojourn: Sojourn
+    sway: Doubles
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ class ArigListener(RunsOnEngine):
         self.engine = engine
         self.space = space or MotionSpace.of(settings)
         self._scales = engine.tensors
+        self.sway = HeadSway(settings, engine.tensors)
         self._noise_shape = (1, 1) if settings.discrete else (settings.diffusion.steps, len(settings.channels))
 
     @property
@@ -138,6 +142,7 @@ class ArigListener(RunsOnEngine):
             sample=np.zeros_like(still),
             state=FIRST,
             sojourn=Sojourn(FIRST, 0),
+            sway=self.sway.start(seed),
         )
 
     def step(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Plan, Memory]:
@@ -191,14 +196,14 @@ class ArigListener(RunsOnEngine):
         z, logits, now = self._conditions(heard, memories, rows)
         noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self._noise_shape) for memory in now])
         inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
-        told = [rows] if self.settings.events else []
-        if not self.settings.own_head:
-            told.append(_stacked(now, "sample"))
+        told = [rows, np.array([one.voiced[0] for one in heard])] if self.settings.events else []
         made, standard, sample, motion, keys = self.engine.run("draw", *inputs, *told)
+        newest = np.array([memory.frames for memory in now])
+        shown = self.sway.added(made[:, None].copy(), _stacked(now, "sway"), newest)
         sojourns, states = self._states(logits, now, rows, heard)
         out = []
         for index, (speaker, memory) in enumerate(zip(speakers, now, strict=True)):
-            frames, jaw_rad = self.space.decode(made[index, None])
+            frames, jaw_rad = self.space.decode(shown[index])
             plan = Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad)
             after = changed(
                 memory,

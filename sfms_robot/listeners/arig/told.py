@@ -6,15 +6,20 @@ one that was told, and a smile, which is rare, is not left to be learned from no
 
 Of every kind: hats over how much of it is over, and over how long it lasts already; of those that swing, the first two
 harmonics of where in a swing it is, and these as they die away. All times its size; and a 1, for rest.
+
+`remains` is what an event leaves of what was drawn beside it: nothing, once it is over. A nod that went too far has
+come back by its end, and a mouth that smiled more than it was told to is at rest again.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import torch
 from torch import Tensor
 
+from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.signals.control import COLUMNS, KINDS, SWINGING
 
 _OVER: Final = tuple(step / 8 for step in range(9))
@@ -22,6 +27,18 @@ _SINCE: Final = (0.0, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0, 4.0)  # on the axis of the c
 _AT: Final = {name: at for at, name in enumerate(COLUMNS)}
 FEATURES: Final = 1 + len(KINDS) * (len(_OVER) + len(_SINCE)) + 8 * len(SWINGING)
 RIDGE: Final = 1.0  # frames that speak for nothing happening
+LEAST: Final = 1e-3  # of an event that is left in any frame of it
+_SMILING: Final = ("mouth", "cheek", "nose", "eyeSquint")
+# Channels that are moved, by how their names begin; a jaw may speak while its mouth smiles.
+MOVES: Final[Mapping[str, tuple[str, ...]]] = {
+    "nod": POSE_CHANNELS,
+    "shake": POSE_CHANNELS,
+    "tilt": POSE_CHANNELS,
+    "smile": _SMILING,
+    "laugh": (*_SMILING, "jaw", "brow", "eyeWide"),
+    "brow_raise": ("brow", "eyeWide"),
+    "blink": ("eyeBlink",),
+}
 
 
 def features(row: Tensor) -> Tensor:
@@ -36,6 +53,31 @@ def features(row: Tensor) -> Tensor:
             waves = torch.cat([sine, cosine, 2 * sine * cosine, cosine.square() - sine.square()], dim=-1)
             found += [size * waves, size * over * waves]
     return torch.cat(found, dim=-1)
+
+
+def moves(channels: Sequence[str]) -> Tensor:
+    """(KINDS, C) bool: which of the channels each kind moves."""
+    return torch.tensor([[name.startswith(MOVES.get(kind, ())) for name in channels] for kind in KINDS])
+
+
+def moved(row: Tensor, moves: Tensor) -> Tensor:
+    """(..., C) bool: which channels an event of the control row (..., K) moves; `moves` (KINDS, C) as of `moves`."""
+    active = row[..., [_AT[f"{kind}.active"] for kind in KINDS]] > 0
+    return (active[..., None] & moves).any(-2)
+
+
+def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
+    """Share (..., C) of what was off after a frame of control row `before` (..., K) that is left at the row `now`.
+
+    1 where no event moves a channel. While one does, what is left of it over what was left a frame ago, which brings
+    anything to 0 by its end, however long it is: the drift of a Brownian bridge.
+    """
+    active, over = ([_AT[f"{kind}.{what}"] for kind in KINDS] for what in ("active", "over"))
+    left = 1 - now[..., over] * now[..., active]
+    left = torch.where((before[..., active] > 0) & (now[..., active] == 0), 0.0, left)
+    was = (1 - before[..., over] * before[..., active]).clamp(min=LEAST)
+    share: Tensor = torch.where(moves, (left / was).clamp(0, 1)[..., None], 1.0).prod(dim=-2)
+    return share
 
 
 def _hats(x: Tensor, knots: tuple[float, ...]) -> Tensor:

@@ -36,14 +36,14 @@ from sfms_robot.frames import (
     changed,
 )
 from sfms_robot.listeners.engine import Engine, RunsOnEngine
+from sfms_robot.listeners.head_channels import HEAD
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
-from sfms_robot.listeners.sfms.channels import HEAD, head_channels, lateral_channels
 from sfms_robot.listeners.sfms.courses import ToldCourse
 from sfms_robot.listeners.sfms.draw import Sampler, Seen
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
 from sfms_robot.listeners.sfms.reachable import Reach
-from sfms_robot.listeners.sfms.sway import draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import HeadSway
 from sfms_robot.signals.control import COLUMNS
 
 _NO_FACE: Final = np.full(MOTION_DIM, np.nan, np.float32)
@@ -82,7 +82,7 @@ class Memory:
         tokens: (P + H, G) own tokens up to then, those drawn for the future, UNDECIDED.
         control: (P + H, K) what was told of each of those frames when they were drawn.
         path: (2 + H, C) standardised: the frame before, the frame itself, then the plan in force.
-        sway: what `sway.draw_sway` made for this stream; empty without.
+        sway: this stream's own (`HeadSway.start`).
     """
 
     seed: int
@@ -109,7 +109,7 @@ class SfmsListener(RunsOnEngine):
         self.space = space or MotionSpace.of(settings)
         self.frontend = frontend or AudioFrontend.of(settings)
         self._scales = engine.tensors
-        self._head = head_channels(settings.channels) if settings.sway else []
+        self.sway = HeadSway(settings, engine.tensors)
         self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
         self._smoothing *= np.float32(settings.sampling.smoothing)
         self._columns = len(COLUMNS) if settings.events else 0
@@ -185,14 +185,7 @@ class SfmsListener(RunsOnEngine):
         )
         tokens, path = self.at_rest()
         control = np.zeros((len(tokens), self._columns), np.float32)
-        return Memory(seed, 0, speaker, tokens, control, path, self.draw_sway(seed))
-
-    def draw_sway(self, seed: int) -> Doubles:
-        """A stream's own sway, as `sway_at` takes it; empty for a listener whose tokens hold it."""
-        if not self._head:
-            return np.zeros((3, 0, 0))
-        spread = float(self._scales["sway_spread"])
-        return draw_sway(self._scales["sway_mixture"], spread, seed, lateral_channels(self.settings.channels))
+        return Memory(seed, 0, speaker, tokens, control, path, self.sway.start(seed))
 
     def at_rest(self) -> tuple[Tokens, Floats]:
         """Tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
@@ -306,10 +299,7 @@ class SfmsListener(RunsOnEngine):
         motion (..., 3, L, S) of each stream; `first` is of all streams, or (...) of each.
         """
         motion = shown * self._scales["motion_std"] + self._scales["motion_mean"]
-        if self._head:
-            frames = np.asarray(first)[..., None] + 1.0 + np.arange(shown.shape[-2])
-            motion[..., self._head] += sway_at(sway, FRAME_S * frames)
-        return motion
+        return self.sway.added(motion, sway, first)
 
     def shown(self, path: Floats) -> Floats:
         """Path (..., 2 + H, C) -> what is seen of its future (..., H, C), both standardised: the head is smoothed."""

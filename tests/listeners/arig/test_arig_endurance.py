@@ -1,17 +1,19 @@
 """Ten minutes of what conversations do not have: silence of both, and two clocks that drift apart."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from tiny_arig import arig_listener
 
 from sfms_robot.data import data_dir
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent, SpeakerFrame
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig import audio_frontend, load
 from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.control import control_track
+from sfms_robot.signals.control import COLUMNS, control_track
 
 FRAMES = 600 * FRAME_HZ
 SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
@@ -94,8 +96,29 @@ def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs
     low, high = np.array(PEOPLE_RAD).T
     last = out[-60 * FRAME_HZ :]
     assert (last.mean(0) > low).all() and (last.mean(0) < high).all()
-    assert ((out < low) | (out > high)).mean(axis=0).max() < 0.05
+    # One of twenty people sways so far (0.02 rad) that he is out of everybody's 98 % for an eighth of the time.
+    assert ((out < low) | (out > high)).mean(axis=0).max() < 0.125
     assert (last.std(0) > 0.2 * (high - low) / 4.65).all()  # alive
+
+
+@pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
+def test_whatever_its_face_was_left_in_it_comes_back_to_rest():
+    """Each part of the face, 0.4 away from where it rests and with nothing told: five seconds later it is back."""
+    listener = load(SHIPPED).build_graphs()
+    channels = listener.settings.channels
+    parts = [channels.index(name) for name in listener.settings.drawn_channels if name not in POSE_CHANNELS]
+    begun = SpeakerFrame(FRAME_S, SILENCE)
+    _, memory = listener.step(begun, listener.start(0), np.zeros((2, len(COLUMNS)), np.float32))
+    memories = []
+    for part in parts:
+        standard = memory.standard.copy()
+        standard[part] += 0.4 / listener.engine.tensors["motion_std"][part]
+        memories.append(dataclasses.replace(memory, standard=standard))
+    control = [np.zeros((2, len(COLUMNS)), np.float32)] * len(parts)
+    for index in range(1, 5 * FRAME_HZ):
+        plans, memories = listener.step_many(SpeakerFrame((index + 1) * FRAME_S, SILENCE), memories, control)
+    left = [plan.frames[0, part] for plan, part in zip(plans, parts, strict=True)]
+    assert max(left) < 0.15, channels[parts[int(np.argmax(left))]]
 
 
 def drifting(samples: np.ndarray, ppm: float) -> list[np.ndarray]:

@@ -22,7 +22,7 @@ INTEGERS = {"width": 256, "feedforward": 512, "heads": 4, "precision": "int8"}
         {"draws": "step"},
         {"draws": "innovation"},
         {"events": True, "draws": "innovation"},
-        {"events": True, "draws": "innovation", "own_head": False},
+        {"events": True, "draws": "innovation", "sway": True},
         pytest.param(INTEGERS, marks=pytest.mark.skipif(not fast.supported(), reason="no fast integers here")),
     ],
     ids=str,

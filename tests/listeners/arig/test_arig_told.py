@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_arig import arig_model
 
-from sfms_robot.frames import CHANNEL_INDEX, ListenerEvent
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, POSE_CHANNELS, ListenerEvent
 from sfms_robot.listeners.arig import told
 from sfms_robot.signals.control import COLUMNS, KINDS, control_track
 
@@ -60,8 +60,8 @@ def test_curves_of_the_data_are_found_again():
 
 @given(rho=st.floats(0.0, 0.99), off=st.floats(-2, 2))
 @settings(max_examples=30, deadline=None)
-def test_what_leaves_the_told_course_comes_back_to_it_at_the_rate_of_the_data(rho: float, off: float):
-    """Where nothing is drawn, a nod that is off is off by rho as much a frame later: its size is the one told."""
+def test_what_leaves_the_told_course_comes_back_to_it(rho: float, off: float):
+    """Where nothing is drawn: a face that no event moves at the rate of the data, a head by the end of its nod."""
     model = arig_model(events=True, draws="innovation")
     model.rho.fill_(rho)
     model.motion_low.fill_(-100)
@@ -69,12 +69,77 @@ def test_what_leaves_the_told_course_comes_back_to_it_at_the_rate_of_the_data(rh
     model.told.normal_(generator=torch.Generator().manual_seed(0))
     rows = rows_of(ListenerEvent("nod", 0.2, 0.8, 0.1, 2), frames=30)
     course = model._at_rest(told.features(rows) @ model.told)
+    over = rows[:, COLUMNS.index("nod.over")] * rows[:, COLUMNS.index("nod.active")]
     place = course[0] + off * model.is_drawn
     for frame in range(1, 30):
         pair = torch.cat([rows[frame - 1], rows[frame]])
-        nothing = torch.zeros(58)
-        before, place = place, model.drawn(nothing, place, pair)
-        torch.testing.assert_close(
-            model.target(place, before, pair)[model.is_drawn], nothing[model.is_drawn], atol=1e-3, rtol=0
-        )
-        torch.testing.assert_close(place - course[frame], rho**frame * off * model.is_drawn, atol=2e-3, rtol=1e-3)
+        before, place = place, model.drawn(torch.zeros(58), place, pair)
+        learned = model.moved(place, before, pair)[model.is_drawn]
+        torch.testing.assert_close(learned, torch.zeros_like(learned), atol=1e-3, rtol=0)
+        left = torch.full((58,), rho**frame * off)
+        left[:6] *= 1 - over[frame] if frame * 0.04 + 0.04 < 1.0 else 0.0
+        torch.testing.assert_close(place - course[frame], left * model.is_drawn, atol=2e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(start_s=st.floats(0, 1), duration_s=st.floats(0.1, 6))
+@settings(max_examples=10, deadline=None)
+def test_nothing_is_left_of_what_was_drawn_beside_an_event_once_it_is_over(
+    kind: str, start_s: float, duration_s: float
+):
+    """Less and less of it while it lasts, of what the kind moves alone."""
+    rows, moved = rows_of(ListenerEvent(kind, start_s, duration_s, 0.1), frames=200), told.moves(CHANNELS)
+    share = told.remains(rows[:-1], rows[1:], moved)
+    assert bool((share >= 0).all()) and bool((share <= 1).all())
+    own = moved[KINDS.index(kind)]
+    assert bool((share[:, ~own] == 1).all()) and not bool((share.prod(0)[own] > 0).any())
+    after = int((start_s + duration_s) / 0.04) + 1
+    assert bool((share[after:] == 1).all())
+
+
+def test_events_one_upon_the_other_take_back_what_either_moves():
+    smile, brow = ListenerEvent("smile", 0.2, 3.0, 0.5), ListenerEvent("brow_raise", 1.0, 1.0, 0.5)
+    moved = told.moves(CHANNELS)
+    both, one, other = (
+        told.remains(rows[:-1], rows[1:], moved)
+        for rows in (rows_of(*some) for some in ((smile, brow), (smile,), (brow,)))
+    )
+    torch.testing.assert_close(both, one * other)
+
+
+def test_a_jaw_may_speak_while_its_mouth_smiles():
+    kinds = {
+        kind: {CHANNELS[at] for at in np.flatnonzero(row)}
+        for kind, row in zip(KINDS, told.moves(CHANNELS), strict=True)
+    }
+    assert "jawOpen" not in kinds["smile"] and "jawOpen" in kinds["laugh"] and "mouthSmileLeft" in kinds["smile"]
+    assert kinds["nod"] == set(POSE_CHANNELS) and kinds["blink"] == {"eyeBlinkLeft", "eyeBlinkRight"}
+    assert not any(name.startswith("eyeLook") for names in kinds.values() for name in names)
+
+
+@given(rho=st.floats(0.0, 0.98), off=st.floats(-9, 9), drawn=st.floats(-5, 5))
+@settings(max_examples=50, deadline=None)
+def test_a_face_that_nothing_moves_comes_to_rest_whatever_is_drawn(rho: float, off: float, drawn: float):
+    """It is held to where faces rest, and comes back to there at the rate of the data; while it speaks it is free."""
+    model = arig_model(events=True, draws="innovation")
+    model.rho.fill_(rho)
+    model.rest_range.fill_(0.5)
+    model.motion_low.fill_(-1e6)
+    model.motion_high.fill_(1e6)
+    rows, sample = torch.zeros(2 * len(COLUMNS)), torch.full((58,), drawn)
+    place, free = torch.full((58,), off), model.drawn(sample, torch.full((58,), off), rows, torch.tensor(True))
+    torch.testing.assert_close(free, model.drawn(sample, place, rows))
+    for frame in range(1, 300):
+        place = model.drawn(sample, place, rows, torch.tensor(False))
+        assert float(place.abs().max()) <= max(0.5, rho**frame * abs(off)) + 1e-4
+    if rho < 0.9:
+        assert float(place.abs().max()) <= 0.5 + 1e-4
+
+
+def test_what_an_event_moves_is_not_held():
+    model = arig_model(events=True, draws="innovation")
+    model.rest_range.fill_(0.1)
+    rows = rows_of(ListenerEvent("smile", 0.0, 2.0, 0.5), frames=2).reshape(-1)
+    made = model.drawn(torch.full((58,), 3.0), torch.zeros(58), rows, torch.tensor(False)).abs()
+    smiles = told.moves(CHANNELS)[KINDS.index("smile")]
+    assert bool((made[smiles] > 0.1).all()) and bool((made[~smiles] <= 0.1).all())

@@ -1,9 +1,9 @@
-"""Slow sway of the head, as a process of its own beside the tokens. Beyond the paper, which has tokens for all.
+"""Slow sway of the head, as a process of its own beside what a listener draws. Beyond both papers, which draw all.
 
-A head at rest moves by about a degree, most of it below half a hertz. As tokens that steps: the codes of a whole head
-are as far apart as its sway is wide. A slow group of its own would need hundreds of codes to move by a tenth of a
-degree, and keyframes where nothing happens; and there is nothing to predict, since sway answers to nobody. So it is
-drawn from what recorded heads do (Shinozuka's spectral representation of a stationary Gaussian process),
+A head at rest moves by about a degree, most of it below half a hertz, and there is nothing to predict in it: sway
+answers to nobody. As tokens it steps, since the codes of a whole head are as far apart as its sway is wide. Drawn frame
+by frame on its own past it grows, or drags what was drawn of a nod along for seconds. So it is made of what recorded
+heads do (Shinozuka's spectral representation of a stationary Gaussian process),
 
     x(t) = size * sum over lines l of  M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l ~ N(0, 1)^S
 
@@ -18,18 +18,49 @@ hour it is where it was. It sets in over the first `EASE_S`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import Doubles, Floats
+from sfms_robot import config
+from sfms_robot.frames import FRAME_S, Doubles, Floats
+from sfms_robot.listeners.head_channels import head_channels, lateral_channels
 from sfms_robot.listeners.lots import Use, normals, uniforms
 
 BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1
 LINES = 6  # of each band
 EASE_S = 3.0
+
+
+class HeadSway:
+    """The sway of one listener's streams; nothing at all for one with `sway: false`.
+
+    Its tensors, fitted by `learning.slow_motion`: `sway_mixture` (BANDS, S, S) and `sway_spread` () of `draw_sway`, in
+    units of its motion space, of the S channels that move the head.
+    """
+
+    def __init__(self, settings: config.Listener, tensors: Mapping[str, Floats]) -> None:
+        self._head = head_channels(settings.channels) if settings.sway else []
+        self._lateral = lateral_channels(settings.channels)
+        self._tensors = tensors
+
+    def start(self, seed: int) -> Doubles:
+        """A stream's own, as `sway_at` takes it; empty without."""
+        if not self._head:
+            return np.zeros((3, 0, 0))
+        return draw_sway(self._tensors["sway_mixture"], float(self._tensors["sway_spread"]), seed, self._lateral)
+
+    def added(self, motion: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
+        """Motion (..., N, C) of frames `first`, `first` + 1, ... with the sway (..., 3, L, S) of each stream, in place.
+
+        `first` is of all streams, or (...) of each.
+        """
+        if self._head:
+            frames = np.asarray(first)[..., None] + 1.0 + np.arange(motion.shape[-2])
+            motion[..., self._head] += sway_at(sway, FRAME_S * frames)
+        return motion
 
 
 def draw_sway(mixture: Floats, spread: float, seed: int, lateral: Sequence[int] = ()) -> Doubles:

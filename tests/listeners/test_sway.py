@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.listeners.sfms.sway import BANDS, BANDS_HZ, EASE_S, draw_sway, sway_at
+from sfms_robot.listeners.sway import BANDS, BANDS_HZ, EASE_S, draw_sway, sway_at
 
 
 def made(seed: int = 0, amplitude: float = 0.01, spread: float = 0.0) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Slow motion of a head told from what it does, and the sway that a listener is given of it (`listeners.sfms.sway`)."""
+"""Slow motion of a head told from what it does, and the sway that a listener is given of it (`listeners.sway`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, ListenerEvent
-from sfms_robot.listeners.sfms.sway import BANDS, BANDS_HZ
+from sfms_robot.listeners.head_channels import head_channels
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import BANDS, BANDS_HZ
 
 CUT_HZ: Final = 1.0
 HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head
@@ -47,6 +49,18 @@ def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
     bands[0] += weight
     slow: Doubles = solveh_banded(bands, weight[:, None] * motion.astype(np.float64), lower=True)
     return slow.astype(np.float32)
+
+
+def without_sway(
+    motion: Tensor, space: MotionSpace, channels: Sequence[str], events: Sequence[ListenerEvent]
+) -> tuple[Tensor, Tensor]:
+    """Motion (N, C) of a space less the sway of its head, and that sway (N, S), by how far it is off neutral."""
+    head = head_channels(channels)
+    slow = torch.from_numpy(slow_part(motion[:, head].numpy(), events))
+    sway = slow - torch.tensor(space.neutral, dtype=torch.float32)[head]
+    fast = motion.clone()
+    fast[:, head] -= sway
+    return fast, sway
 
 
 def fit_sway(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sfms_robot.frames import POSE_CHANNELS
+from sfms_robot.frames import LATERAL_POSE, POSE_CHANNELS
 
 # Channels of any motion space that turn or move the head, and those of them that a mirror turns around.
 HEAD = frozenset(
     {*POSE_CHANNELS, *(f"{part}_{axis}" for part in ("rotation", "translation", "head") for axis in "xyz")}
 )
 
-LATERAL = frozenset(("roll", "yaw", "y", "rotation_y", "rotation_z", "translation_x", "head_y", "head_z"))
+LATERAL = frozenset((*LATERAL_POSE, "rotation_y", "rotation_z", "translation_x", "head_y", "head_z"))
 
 
 def head_channels(channels: Sequence[str]) -> list[int]:
