@@ -210,7 +210,7 @@ def _fit_rest(model: ArigModel, of_dyads: Sequence[Tensor], corpus: ArigCorpus) 
     lengths, still = list(corpus.lengths), []
     for rows, talk in zip(torch.split(control, lengths), torch.split(talks, lengths), strict=True):
         near = F.max_pool1d(talk[None], 2 * PAUSE_FRAMES + 1, 1, PAUSE_FRAMES)[0] > 0
-        still.append(~(told.moved(rows, model.moves) | near[:, None]))
+        still.append(~(told.moved_channels(rows, model.moves) | near[:, None]))
     rests, off = torch.cat(still), torch.cat(list(of_dyads)).abs()
     for channel in range(model.channels):
         found = off[rests[:, channel], channel]

@@ -251,7 +251,7 @@ class ArigModel(nn.Module):
     def _held(self, made: Tensor, begins: Tensor, row: Tensor, speaks: Tensor) -> Tensor:
         """Motion (..., C) that would begin at `begins`, where nothing moves the face not beyond where faces rest."""
         course = told.features(row) @ self.told
-        free = speaks[..., None] | told.moved(row, self.moves)
+        free = speaks[..., None] | told.moved_channels(row, self.moves)
         most = torch.where(free, UNBOUNDED, torch.maximum(self.rest_range, (begins - course).abs()))
         return course + torch.minimum(torch.maximum(made - course, -most), most)
 

@@ -60,7 +60,7 @@ def moves(channels: Sequence[str]) -> Tensor:
     return torch.tensor([[name.startswith(MOVES.get(kind, ())) for name in channels] for kind in KINDS])
 
 
-def moved(row: Tensor, moves: Tensor) -> Tensor:
+def moved_channels(row: Tensor, moves: Tensor) -> Tensor:
     """(..., C) bool: which channels an event of the control row (..., K) moves; `moves` (KINDS, C) as of `moves`."""
     active = row[..., [_AT[f"{kind}.active"] for kind in KINDS]] > 0
     return (active[..., None] & moves).any(-2)
