@@ -3,16 +3,17 @@
 A head at rest moves by about a degree, most of it below half a hertz, and there is nothing to predict in it: sway
 answers to nobody. As tokens it steps, since the codes of a whole head are as far apart as its sway is wide. Drawn frame
 by frame on its own past it grows, or drags what was drawn of a nod along for seconds. So it is made of what recorded
-heads do (Shinozuka's spectral representation of a stationary Gaussian process),
+heads do (Shinozuka's spectral representation of a stationary process),
 
-    x(t) = size * sum over lines l of  M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l ~ N(0, 1)^S
+    x(t) = size * sum over lines l of  2^1/2 M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l in R^S
 
 of which every line is one cosine a channel, |(Ma, Mb)| cos(2 pi f t - atan2(Mb, Ma)): as such it is kept.
 
 `LINES` frequencies drawn from each of the `BANDS_HZ`, `M M^T` of each band what heads do together there: who leans
-forward also comes down. `size` is a stream's own manner, and every other stream is somebody seen in a mirror: people
-lean to either side alike. A function of time alone: any frame of the future is known, nothing adds up, and after an
-hour it is where it was. It sets in over the first `EASE_S`.
+forward also comes down. Over the lines of a band sum a a^T + b b^T = 1: which way a head goes is by lot, how far it
+goes in all is not. Only `size` says that, a stream's own manner, and within what people's is. Every other stream is
+somebody seen in a mirror: people lean to either side alike. A function of time alone: any frame of the future is known,
+nothing adds up, and after an hour it is where it was. It sets in over the first `EASE_S`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from sfms_robot.listeners.lots import Use, normals, uniforms
 
 BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1
-LINES = 6  # of each band
+LINES = 6  # of each band; twice as many are no fewer than channels of a head
+WIDEST = 2.0  # deviations by which a manner is off the mean one, at most
 EASE_S = 3.0
 
 
@@ -80,8 +82,9 @@ def draw_sway(mixture: Floats, spread: float, seed: int, lateral: Sequence[int] 
     uniform = uniforms(seed, 0, Use.SWAY, 1 + bands * LINES)
     frequency_hz = edges[:-1, None] + uniform[1:].reshape(bands, LINES) * np.diff(edges)[:, None]
     drawn = normals(seed, 1, Use.SWAY, 1 + 2 * bands * LINES * channels).astype(np.float64)
-    factors = np.einsum("bsc,pblc->pbls", mixture.astype(np.float64), drawn[1:].reshape(2, bands, LINES, channels))
-    factors *= math.exp(spread * drawn[0]) / math.sqrt(LINES)
+    lots, _ = np.linalg.qr(drawn[1:].reshape(bands, 2 * LINES, channels))  # of each band: orthonormal columns
+    factors = np.einsum("bsc,bplc->pbls", mixture.astype(np.float64), lots.reshape(bands, 2, LINES, channels))
+    factors *= math.sqrt(2) * math.exp(spread * min(max(drawn[0], -WIDEST), WIDEST))
     if uniform[0] < 0.5:
         factors[..., list(lateral)] *= -1
     size, phase = np.hypot(*factors), np.arctan2(factors[1], factors[0])

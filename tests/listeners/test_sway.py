@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from sfms_robot.listeners.sway import BANDS, BANDS_HZ, EASE_S, draw_sway, sway_at
+from sfms_robot.data import data_dir
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import BANDS, BANDS_HZ, EASE_S, LINES, WIDEST, HeadSway, draw_sway, sway_at
+
+# Roll, pitch, yaw of listeners of composed dyads (`data compose`, training), less gaze: 1st and 99th percentile.
+PEOPLE_RAD = ((-0.030, 0.030), (-0.024, 0.058), (-0.033, 0.033))
 
 
 def made(seed: int = 0, amplitude: float = 0.01, spread: float = 0.0) -> np.ndarray:
@@ -31,10 +37,25 @@ def test_its_size_is_what_was_asked_also_after_an_hour():
         assert float(out.std()) == pytest.approx(wanted, rel=0.05)
 
 
-def test_people_differ_in_size_by_the_spread():
-    times_s = 10 + np.arange(400) * 1.7
-    sizes = np.array([np.log(sway_at(made(seed, spread=0.5), times_s).std()) for seed in range(60)])
-    assert 0.35 < float(sizes.std()) < 0.65
+def powers(sway: np.ndarray) -> np.ndarray:
+    """(BANDS, S, S) what the channels of a stream (3, L, S) do together in each band, in the long run."""
+    _, size, phase = sway.reshape(3, BANDS, LINES, -1)
+    line = size * np.exp(1j * phase)
+    return np.einsum("bls,blt->bst", line, line.conj()).real / 2
+
+
+def test_every_stream_has_the_powers_that_were_learned_and_a_manner_within_what_peoples_is():
+    mixture = np.random.default_rng(0).normal(0, 0.01, (BANDS, 6, 6)).astype(np.float32)
+    learned = mixture.astype(np.float64) @ mixture.transpose(0, 2, 1)
+    for seed in range(20):
+        np.testing.assert_allclose(powers(draw_sway(mixture, 0.0, seed)), learned, rtol=1e-6, atol=1e-9)
+    manners = []
+    for seed in range(300):
+        ratio = powers(draw_sway(mixture, 0.3, seed)) / learned
+        assert np.ptp(ratio) < 1e-3 * ratio.mean()  # the same in every band and channel
+        manners.append(np.log(ratio.mean()) / 2)
+    assert float(np.std(manners)) == pytest.approx(0.3, rel=0.15)
+    assert np.abs(manners).max() == pytest.approx(0.3 * WIDEST, rel=1e-3)  # some of 300 would be beyond
 
 
 def test_it_is_slow_and_does_not_step():
@@ -59,3 +80,24 @@ def test_streams_and_channels_go_their_own_ways():
     one, other = sway_at(made(1), times_s), sway_at(made(2), times_s)
     together = np.corrcoef(np.concatenate([one, other], axis=1).T)
     assert np.abs(together - np.eye(12)).max() < 0.4
+
+
+@pytest.mark.parametrize("name", ["sfms-small", "arig-small"])
+def test_the_heads_of_shipped_listeners_sway_as_far_as_people_do(name: str):
+    """Ten minutes of 150 streams: some sway further than most people, all together they do not."""
+    folder = data_dir("configs") / "listeners" / name
+    if not (folder / checkpoint.WEIGHTS).is_file():
+        pytest.skip(f"{name} has no weights here")
+    settings = checkpoint.load_config(folder)
+    space = MotionSpace.of(settings)
+    sway = HeadSway(settings, checkpoint.read_weights(folder / checkpoint.WEIGHTS))
+    low, high = np.array(PEOPLE_RAD).T
+    outside, alive = [], []
+    for seed in range(150):
+        still = np.tile(space.neutral.astype(np.float32), (15_000, 1))
+        pose = space.decode(sway.added(still, sway.start(seed), 0)[100::10])[0][:, :3]
+        outside.append(((pose < low) | (pose > high)).mean(0))
+        alive.append(pose.std(0))
+    assert np.mean(outside, axis=0).max() < 0.05
+    assert np.max(outside) < 0.2  # of the one in 150 who sways most
+    assert (np.array(alive) > 0.2 * (high - low) / 4.65).all()

@@ -12,6 +12,7 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_C
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig import audio_frontend, load
 from sfms_robot.listeners.arig.diffusion import Denoiser
+from sfms_robot.listeners.sway import sway_at
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.control import COLUMNS, control_track
 
@@ -19,8 +20,7 @@ FRAMES = 600 * FRAME_HZ
 SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
 PPM = 200e-6
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
-# Roll, pitch, yaw of listeners of composed dyads (`data compose`, training), less gaze: 1st and 99th percentile.
-PEOPLE_RAD = ((-0.030, 0.030), (-0.024, 0.058), (-0.033, 0.033))
+SETTLED_S = 0.4  # after a nod
 
 
 def silent_minutes(listener, frames: int = FRAMES) -> np.ndarray:
@@ -83,22 +83,28 @@ def minutes_of_events(minutes: float) -> list[ListenerEvent]:
     not (SHIPPED / checkpoint.WEIGHTS).is_file() or not checkpoint.load_config(SHIPPED).events,
     reason="arig-small is told no events here",
 )
-def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs():
+def test_after_ten_minutes_of_talk_and_events_a_head_is_where_it_began_but_for_its_sway():
+    """How far heads sway is told by test_sway; beside that, only nods move this one."""
     said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")
     listener = load(SHIPPED).build_graphs()
-    control = control_track(minutes_of_events(10), 0, FRAMES + 1)
-    memory, out = listener.start(0), np.zeros((FRAMES, 3))
+    told = minutes_of_events(10)
+    control = control_track(told, 0, FRAMES + 1)
+    start = listener.start(0)
+    memory, out = start, np.zeros((FRAMES, 3))
     for index in range(FRAMES):
         at = index * FRAME_SAMPLES % (len(said) - FRAME_SAMPLES)
         heard = SpeakerFrame((index + 1) * FRAME_S, said[at : at + FRAME_SAMPLES])
         plan, memory = listener.step(heard, memory, control[index : index + 2])
         out[index] = plan.frames[0, :3]
-    low, high = np.array(PEOPLE_RAD).T
-    last = out[-60 * FRAME_HZ :]
-    assert (last.mean(0) > low).all() and (last.mean(0) < high).all()
-    # One of twenty people sways so far (0.02 rad) that he is out of everybody's 98 % for an eighth of the time.
-    assert ((out < low) | (out > high)).mean(axis=0).max() < 0.125
-    assert (last.std(0) > 0.2 * (high - low) / 4.65).all()  # alive
+    nodding = np.zeros(FRAMES, bool)
+    for event in told:
+        if event.kind == "nod":
+            nodding[int(event.start_s * FRAME_HZ) : int((event.end_s + SETTLED_S) * FRAME_HZ)] = True
+    swayed = sway_at(start.sway, FRAME_S * np.arange(1, FRAMES + 1))[:, :3]
+    beside = np.abs(out - swayed)[~nodding]
+    assert np.percentile(beside, 99) < np.deg2rad(0.3) and beside.max() < np.deg2rad(1.0)
+    late = (out - swayed)[-60 * FRAME_HZ :][~nodding[-60 * FRAME_HZ :]]
+    assert np.abs(late.mean(0)).max() < np.deg2rad(0.1)
 
 
 @pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
