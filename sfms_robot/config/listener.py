@@ -25,9 +25,6 @@ class ChannelGroup(Model):
         keyframes: of a window. keyframe_cost: in its place where placement is penalised, what a keyframe has to save in
             squared error, summed over the group's channels in deviations.
         transition_bias: on the logit of class 0, more for fewer keyframes.
-        nucleus: in place of that of `sampling`.
-        nucleus_in_silence: in place of nucleus once nobody has spoken for 3.2 s; needs a listener with `phase`.
-        guidance: how much more than in training the speaker decides what is drawn (`listeners.sfms.draw`); 1: no more.
     """
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -35,9 +32,6 @@ class ChannelGroup(Model):
     keyframes: Count | None = None
     keyframe_cost: Positive | None = None
     transition_bias: Finite = 0.0
-    nucleus: Annotated[float, Field(gt=0, le=1)] | None = None
-    nucleus_in_silence: Annotated[float, Field(gt=0, le=1)] | None = None
-    guidance: Annotated[float, Field(ge=0, le=20)] = 1.0
 
     @property
     def codes(self) -> int:
@@ -226,8 +220,6 @@ class Sfms(Listener):
         if len({len(group.levels) for group in self.groups.values()}) != 1:
             raise ValueError("groups: every group needs the same number of levels")
         for name, group in self.groups.items():
-            if group.nucleus_in_silence is not None and not self.phase:
-                raise ValueError(f"groups.{name}.nucleus_in_silence: without phase silence is not known")
             if self.placement == "penalised" and (group.keyframe_cost is None or group.keyframes is not None):
                 raise ValueError(f"groups.{name}: placement penalised takes keyframe_cost, not keyframes")
             if self.placement != "penalised" and (group.keyframes is None or group.keyframe_cost is not None):

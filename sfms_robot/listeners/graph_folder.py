@@ -24,7 +24,7 @@ OUTSIDE: Final = (
     "description", "hop", "sampling", "precision", "neutral", "metres_per_unit", "flame_matrix", "wav2vec2", "scores",
     "placement", "max_gap_frames",
 )  # fmt: skip
-OUTSIDE_GROUPS: Final = ("keyframes", "keyframe_cost", "transition_bias", "nucleus", "nucleus_in_silence", "guidance")
+OUTSIDE_GROUPS: Final = ("keyframes", "keyframe_cost", "transition_bias")
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,6 @@ def digest(settings: config.Listener) -> str:
     """Of all that a listener's graphs depend on."""
     known = settings.model_dump(mode="json", exclude=set(OUTSIDE))
     for group in known.get("groups", {}).values():
-        group["guided"] = group["guidance"] != 1.0
         for key in OUTSIDE_GROUPS:
             group.pop(key)
     return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()[:16]

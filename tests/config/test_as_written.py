@@ -72,7 +72,6 @@ SFMS = {
         one.listener.sampling.smoothing == 0 and one.listener.sampling.seam_frames == 1
         and not one.listener.sampling.reach
     ),
-    "no guidance": lambda one: all(group.guidance == 1 for group in one.listener.groups.values()),
 }  # fmt: skip
 
 

@@ -33,13 +33,6 @@ def tiny_listener(**changes) -> SfmsListener:
         return SfmsListener(settings, torch_engine(settings, SfmsModel(settings)))
 
 
-def guided_listener(guidance: float, **changes) -> SfmsListener:
-    """The same weights; the speaker decides on the neck's tokens `guidance` times as much."""
-    groups = tiny_settings().model_dump()["groups"]
-    groups["neck"]["guidance"] = guidance
-    return tiny_listener(groups=groups, **changes)
-
-
 def told_listener(**changes) -> SfmsListener:
     """One that is told of events and sways by itself."""
     face = [name for name in BLENDSHAPES if not name.startswith("eyeLook")]

@@ -1,7 +1,6 @@
 """What a stream of SFMS asks its model, as modules of tensors alone: they run as they are, as graphs, or exported.
 
-B streams, P past and H future frames, G groups, W width, N ways to see the speaker: 1, or 2 where a group is guided,
-also without him.
+B streams, P past and H future frames, G groups, W width.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ class Network(nn.Module):
         self.model = model
         self.past, self.future = settings.past_frames, settings.future_frames
         self.codes = [group.codes for group in settings.groups.values()]
-        self.guided = any(group.guidance != 1.0 for group in settings.groups.values())
 
 
 class Rest(Network):
@@ -73,22 +71,19 @@ class Ahead(Network):
         last: Tensor,
         at: Tensor,
     ) -> tuple[Tensor]:
-        """The parts of a `Context`, and its last keyframes (B, P + H, G, 2) and their frames -> slots (B, N, H, W)."""
-        context, predictor = Context(face, face_known, voice, heard, phase, tokens, control), self.model.predictor
-        absent = predictor.absent_speaker(self.past) if self.guided else None
-        slots: Tensor = predictor(context, LastKeyframes(last, at), absent)
-        return (slots.view(1 + self.guided, -1, *slots.shape[1:]).transpose(0, 1),)
+        """The parts of a `Context`, and its last keyframes (B, P + H, G, 2) and their frames -> slots (B, H, W)."""
+        context = Context(face, face_known, voice, heard, phase, tokens, control)
+        return (self.model.predictor(context, LastKeyframes(last, at)),)
 
 
 class Next(Network):
     """The classes of one future frame, given the keyframes before it."""
 
     def forward(self, slots: Tensor, last: Tensor, at: Tensor, frame: Tensor) -> tuple[Tensor]:
-        """slots (B, N, W) of the frame, last keyframes (B, G, 2) up to the frame before, and its number (B,) -> logits
-        (B, N, all classes of all groups).
+        """slots (B, W) of the frame, last keyframes (B, G, 2) up to the frame before, and its number (B,) -> logits
+        (B, all classes of all groups).
         """
-        recent = LastKeyframes(last[:, None], at[:, None])
-        return (self.model.predictor.flat_logits(slots, recent, frame[:, None, None, None]),)
+        return (self.model.predictor.flat_logits(slots, LastKeyframes(last, at), frame[:, None, None]),)
 
 
 class Decode(Network):
@@ -129,7 +124,6 @@ def examples(settings: config.Sfms, streams: int) -> Mapping[str, dict[str, Tens
         settings.channels,
     )
     groups, (rows, bins) = len(settings.groups), SHAPES[settings.audio]
-    ways = 1 + any(group.guidance != 1.0 for group in settings.groups.values())
     b, flags = streams, torch.ones(streams, p, dtype=torch.bool)
     tokens = torch.zeros(b, window, groups, dtype=torch.long)
     undecided = torch.full((b, settings.future_frames, groups), UNDECIDED)
@@ -149,7 +143,7 @@ def examples(settings: config.Sfms, streams: int) -> Mapping[str, dict[str, Tens
             "at": recent - 1,
         },
         "next": {
-            "slots": torch.zeros(b, ways, width),
+            "slots": torch.zeros(b, width),
             "last": recent[:, 0],
             "at": recent[:, 0] - 1,
             "frame": torch.full((b,), p - 1),

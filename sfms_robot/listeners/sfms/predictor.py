@@ -135,38 +135,24 @@ class Predictor(nn.Module):
             nn.Sequential(nn.Linear(control, width), nn.GELU(), nn.Linear(width, width)) if control else None
         )
 
-    def forward(self, context: Context, recent: LastKeyframes | None = None, absent: Tensor | None = None) -> Tensor:
-        """What is known about every future frame without knowing those before it: (B', H, W).
+    def forward(self, context: Context, recent: LastKeyframes | None = None) -> Tensor:
+        """What is known about every future frame without knowing those before it: (B, H, W).
 
         `recent`: what `last_keyframes` finds in the context's tokens, for those who need it themselves.
-        `absent` (1, 2P, W), what `absent_speaker` gives: (2B', H, W), the second half knows the listener's tokens only.
         """
         c = context
         speaker = self.speaker(c.face, c.face_known, c.voice, c.heard, c.phase)
         own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent, c.control)
         newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(own.shape[0], -1)
         speaker = speaker.expand(own.shape[0], -1, -1)
-        if absent is not None:
-            speaker, own = torch.cat([speaker, absent.expand_as(speaker)]), own.repeat(2, 1, 1)
-            newest = torch.cat([newest, torch.zeros_like(newest)])
         speaker = speaker + self.role[:2].repeat_interleave(c.heard.shape[1], dim=0)
-        memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B', 2P + P + H, W)
+        memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B, 2P + P + H, W)
         x = self.slots + own[:, -self.future :]
         if self.phase_in is not None:
             x = x + self.phase_in(newest)[:, None]
         for block in self.decoder:
             x = block(x, memory=memory)
         return x
-
-    def absent_speaker(self, frames: int) -> Tensor:
-        """(1, 2 * frames, W): the speaker where there is none, neither heard nor seen; the same at all times."""
-        away = torch.zeros(1, frames, dtype=torch.bool, device=self.slots.device)
-        face, voice, phase = (
-            self.slots.new_zeros(1, frames, size)
-            for size in (self.speaker.face_in.in_features, self.slots.shape[1], self.phase_size)
-        )
-        out: Tensor = self.speaker(face, away, voice, away, phase)
-        return out
 
     def _own(self, tokens: Tensor, recent: LastKeyframes, control: Tensor) -> Tensor:
         """Tokens (B, P + H, G), their last keyframes and control rows (B, P + H, K) -> (B, P + H, W)."""
