@@ -30,13 +30,14 @@ def compose(
         240.0, min=1.0, help="Minutes of training dyads; all that the tables give if they give less."
     ),
     seed: int = typer.Option(1, min=0, help="One seed composes the same dyads."),
+    overwrite: bool = typer.Option(False, "--overwrite", help="Replace the dyads that --out holds."),
     json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object."),
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
     from sfms_robot.app.train.datasets import compose_dyads
     from sfms_robot.cli.show_learning import show
 
-    show(compose_dyads(data, out, minutes, seed), json)
+    show(compose_dyads(data, out, minutes, seed, overwrite), json)
 
 
 @app.command()

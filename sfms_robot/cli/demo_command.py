@@ -25,6 +25,7 @@ def demo(
     out: Path | None = typer.Option(
         None, metavar="DIR", help="Where recording and pictures go; default: sfms-demo, sfms-demo-2, ..."
     ),
+    overwrite: bool = typer.Option(False, "--overwrite", help="Replace the recording that --out holds."),
     seeds: int | None = typer.Option(
         None, min=1, metavar="N", help="In virtual time: what seeds 0 to N - 1 show, without pictures."
     ),
@@ -50,7 +51,7 @@ def demo(
         from sfms_robot.app.listen import demo as app
         from sfms_robot.app.listen.panel import live_panel
 
-        options = app.DemoOptions(head, listener, seed, duration, fast or seeds is not None, out)
+        options = app.DemoOptions(head, listener, seed, duration, fast or seeds is not None, out, overwrite)
         if seeds is not None:
             told = app.compare_seeds(options, seeds, lambda row: print(_line(row), file=sys.stderr))
         else:

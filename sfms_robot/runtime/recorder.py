@@ -244,7 +244,7 @@ class Recorder:
 def check_folder(folder: Path, overwrite: bool = False) -> None:
     """Whether a run may be recorded there. Raises ConfigError where one is already, unless it may be overwritten."""
     if (folder / RUN_FILE).exists() and not overwrite:
-        raise ConfigError(f"--record {folder}: holds a recording already (another folder, or --overwrite)")
+        raise ConfigError(f"{folder}: holds a recording already (another folder, or --overwrite)")
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:

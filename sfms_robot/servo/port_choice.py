@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
@@ -9,6 +10,7 @@ from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.servo.discovery import SerialDevice
 
 AUTO: Final = "auto"
+_NAMED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*=")  # a bus and its device; addresses and paths do not begin so
 
 Probe = Callable[[str, str], bool]  # bus, device -> do servos of that bus answer there?
 
@@ -18,7 +20,7 @@ def parse_ports(buses: Collection[str], text: str) -> dict[str, str]:
 
     Raises ConfigError for a bus that is missing, unknown or given twice, and for a device that two buses share.
     """
-    if text and len(buses) == 1 and text.partition("=")[0] not in buses and "," not in text:
+    if text and len(buses) == 1 and "," not in text and not _NAMED.match(text):
         return dict.fromkeys(buses, text)
     devices: dict[str, str] = {}
     for part in text.split(","):
@@ -58,5 +60,5 @@ def choose_ports(buses: Collection[str], ports: Sequence[SerialDevice], probe: P
 
 
 def _wrong(text: str, problem: str, buses: Collection[str]) -> ConfigError:
-    wanted = ",".join(f"{name}=DEVICE" for name in buses) if len(buses) > 1 else "DEVICE"
+    wanted = ",".join(f"{name}=DEVICE" for name in buses) if len(buses) > 1 else f"DEVICE, {next(iter(buses))}=DEVICE"
     return ConfigError(f"--port {text!r}: {problem} (sim, {AUTO}, {wanted})")

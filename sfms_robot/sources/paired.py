@@ -62,7 +62,7 @@ class PairedSource:
         duration_s: float | None = None,
     ) -> None:
         if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
-            raise ConfigError(f"--duration = {duration_s:g}: a run lasts longer than 0 s")
+            raise ConfigError(f"--duration = {duration_s:g}: a run lasts more than 0 s and ends")
         self.duration_s = _length_s(voice, sight, agent) if duration_s is None else duration_s
         self.latency_s = 0.0
         self.missing: tuple[str, ...] = ()

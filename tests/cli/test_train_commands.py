@@ -153,6 +153,16 @@ def test_an_earlier_training_is_not_lost_unasked(done, fails, arguments, tmp_pat
     assert anew["steps"] == 3 and weights.exists()
 
 
+@pytest.mark.parametrize("name", ["model.safetensors", "config.yaml"])
+def test_a_tokenizer_is_not_trained_into_the_folder_of_a_listener(fails, arguments, tmp_path, name):
+    """Its configuration would be replaced, and what was calibrated lost."""
+    (tmp_path / "out").mkdir(exist_ok=True)
+    (tmp_path / "out" / name).write_bytes(b"whole")
+    code, told = fails("tokenizer", *arguments())
+    assert code == 2 and f"{name} is of an earlier training" in told
+    assert [file.read_bytes() for file in (tmp_path / "out").iterdir()] == [b"whole"]
+
+
 def test_a_checkpoint_of_another_configuration(done, fails, arguments):
     done("tokenizer", *arguments(), "--no-tensorboard")
     raw = tiny()

@@ -174,7 +174,11 @@ def test_a_new_set_replaces_the_old_one_and_nothing_else(tables, tmp_path):
     composed.compose_folder(tables, tmp_path, seed=1, minutes=1)
     (tmp_path / "train" / "mine.npz").write_bytes(b"")
     (tmp_path / "train" / "M9z_A_0000.npz").write_bytes(b"")
-    composed.compose_folder(tables, tmp_path, seed=1, minutes=1)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*.npz")}
+    with pytest.raises(ConfigError, match="holds dyads already, .*--overwrite"):
+        composed.compose_folder(tables, tmp_path, seed=2, minutes=1)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*.npz")} == before
+    composed.compose_folder(tables, tmp_path, seed=1, minutes=1, overwrite=True)
     assert (tmp_path / "train" / "mine.npz").exists()
     assert not (tmp_path / "train" / "M9z_A_0000.npz").exists()
 

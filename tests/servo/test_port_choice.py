@@ -25,6 +25,7 @@ def test_every_bus_gets_its_device(buses, text, devices):
     ("buses", "text", "problem"),
     [
         (["main"], "main=A,main=B", "bus main is given twice"),
+        (["main"], "foo=/dev/ttyS0", "one device per bus is needed"),
         (["main"], "main=A,face=B", "one device per bus is needed"),
         (["main"], "", "one device per bus is needed"),
         (["main"], "main=", "one device per bus is needed"),

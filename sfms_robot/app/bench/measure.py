@@ -91,8 +91,10 @@ def times(call: Callable[[], object], count: int, clock: Callable[[], float] = t
 
 
 def environment(folder: Path) -> Mapping[str, str]:
-    """That finds the package of another checkout or installation first."""
-    return {**os.environ, "PYTHONPATH": str(folder)}
+    """That finds the package of another checkout or installation first. Raises ConfigError where there is none."""
+    if not (folder / "sfms_robot" / "__init__.py").is_file():
+        raise ConfigError(f"--against {folder}: no sfms_robot in it; a checkout, or a folder of packages that has one")
+    return {**os.environ, "PYTHONPATH": str(folder.resolve())}
 
 
 def beside(name: str, against: Path, repeats: int = 3) -> dict[str, Row]:

@@ -34,12 +34,13 @@ class DemoOptions:
     duration_s: float | None = None
     fast: bool = False
     folder: Path | None = None
+    overwrite: bool = False
 
     def run(self, seed: int, record: Path | None) -> session.RunOptions:
         """The person's voice alone: it is what any microphone gives."""
         return session.RunOptions(
             self.head, listener=self.listener, audio=DEFAULT_SPEAKER, face="none", duration_s=self.duration_s,
-            fast=self.fast, seed=seed, record=record,
+            fast=self.fast, seed=seed, record=record, overwrite=self.overwrite,
         )  # fmt: skip
 
 

@@ -98,6 +98,8 @@ class Command:
     def servo(self, words: str, baud: int | None = None) -> str:
         rate = f" --baud {baud}" if baud is not None else ""
         family = "" if self.family == "dynamixel2" else f" --family {self.family}"
+        if self.port == "sim" and self.head:  # which servos there are is the head's to say
+            return f"sfms-robot servo {words} --port {self.port} --head {self.head}"
         return f"sfms-robot servo {words} --port {self.port}{rate}{family}"
 
 

@@ -181,7 +181,7 @@ def _report(dataset: Dataset, tally: _Tally, features: dict[str, int]) -> dict[s
     }
 
 
-def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str, Any]:
+def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool = False) -> dict[str, Any]:
     """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
@@ -194,4 +194,4 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int) -> dict[str,
                 tasks[name] = progress.add_task(f"composing {name}", total=wanted)
             progress.update(tasks[name], completed=done)
 
-        return dict(compose_folder(data, out, seed, minutes, told=told))
+        return dict(compose_folder(data, out, seed, minutes, told=told, overwrite=overwrite))

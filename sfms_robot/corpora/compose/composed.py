@@ -143,16 +143,23 @@ def compose_folder(
     minutes: float,
     voices: Sequence[Path] = (),
     told: Callable[[str, float, float], None] | None = None,
+    overwrite: bool = False,
 ) -> dict[str, float]:
     """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train, validation and test.
 
     Beside them, out/interaction and out/speaking are sets of the same form. No filmed voice, no speaking.
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
-    ami_audio_clips/, the clips beside the tables) and those of further folders. Dyads of an earlier run are removed
-    from `out` once the new ones are written, so that two sets never mix. `told` hears of every dyad: the set, the
-    minutes wanted of it, the minutes written. Returns the minutes written per split. Raises ConfigError.
+    ami_audio_clips/, the clips beside the tables) and those of further folders. Dyads of an earlier run are refused,
+    or, with `overwrite`, removed from `out` once the new ones are written: two sets never mix. `told` hears of every
+    dyad: the set, the minutes wanted of it, the minutes written. Returns the minutes written per split. Raises
+    ConfigError.
     """
+    folders = [out / part for part in ("", "interaction", "speaking")]
+    if not overwrite and (earlier := sorted(file for folder in folders for file in _composed(folder))):
+        raise ConfigError(
+            f"--out {out}: holds dyads already, {earlier[0].name} among {len(earlier)}: another folder, or --overwrite"
+        )
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
@@ -170,6 +177,11 @@ def compose_folder(
     return written
 
 
+def _composed(out: Path) -> set[Path]:
+    """Every dyad that a run has written to a folder of splits."""
+    return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
+
+
 def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float], None] | None) -> dict[str, float]:
     """Write a set and remove what an earlier one left; minutes per split."""
     written, fresh = dict.fromkeys(SPLITS, 0.0), set()
@@ -179,9 +191,8 @@ def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float]
         written[split] += len(dyad.listener) * FRAME_S / 60
         if each:
             each(sum(written.values()))
-    for split in SPLITS:
-        for stale in {file for pattern in _FILES for file in (out / split).glob(pattern)} - fresh:
-            stale.unlink()
+    for stale in _composed(out) - fresh:
+        stale.unlink()
     return {str(split): value for split, value in written.items()}
 
 
