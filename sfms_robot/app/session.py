@@ -384,6 +384,11 @@ class RunOptions:
         """`audio`, where "default" is the microphone for servos that are not emulated here."""
         return "mic" if self.audio == "default" and self.port != SIM and not self.dry_run else self.audio
 
+    def facts(self, head: Head) -> dict[str, str]:
+        """What a recording says of the run."""
+        rates = None if self.calmness is None else self.calmness.model_dump(exclude_none=True)
+        return run_facts(head, self.listener, {**asdict(self), "audio": self.hears, "calmness": rates})
+
     @property
     def servos(self) -> HeadOptions:
         """The head and its servos."""
@@ -585,18 +590,12 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     return feed
 
 
-def _rates(calmness: Calmness | None) -> dict[str, Any] | None:
-    return None if calmness is None else calmness.model_dump(exclude_none=True)
-
-
 def _recorder(options: RunOptions, head: Head, stack: ExitStack) -> Recorder | None:
     if options.record is None:
         return None
-    about = run_facts(
-        head, options.listener, {**asdict(options), "audio": options.hears, "calmness": _rates(options.calmness)}
-    )
     when_full: FullPolicy = "wait" if options.fast else "drop"
-    return stack.enter_context(closing(Recorder(options.record, list(head.joints), when_full=when_full, about=about)))
+    recorder = Recorder(options.record, list(head.joints), when_full=when_full, about=options.facts(head))
+    return stack.enter_context(closing(recorder))
 
 
 def _present(opened: OpenHead) -> dict[str, Any]:

@@ -50,7 +50,9 @@ def run(
     face: str = typer.Option(
         "auto",
         rich_help_panel=PERSON,
-        help="The speaker's face: FILE.csv or .csv.gz, 'none', or 'auto': the shipped speaker's own, else none.",
+        metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|FILE.csv|none|auto",
+        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, who "
+        "is in front of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
     ),
     agent_audio: str = typer.Option(
         "none",

@@ -10,7 +10,9 @@ from websockets.sync.client import connect
 
 from sfms_robot.app.listen.page_session import LEFT_S, EndsAlone, page_session
 from sfms_robot.app.listen.preflight import begin_page
+from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.session import RunOptions
+from sfms_robot.config import Calmness
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.safety import Interrupt
 
@@ -57,7 +59,7 @@ def test_a_run_that_a_visitor_has_left_is_asked_to_end():
 
 @pytest.mark.slow
 def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
-    options = RunOptions(head="op3_head", duration_s=8.0, seed=1)
+    options = RunOptions(head="op3_head", duration_s=8.0, seed=1, calmness=Calmness(smile=0.5))
     plan = [
         (at(1.5), {"type": "record", "on": True}),
         (at(1.6), {"type": "show", "channels": {"yaw": 0.4}, "seconds": 1.0}),
@@ -84,7 +86,8 @@ def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
         assert second["seed"] == 7 and pages.released and not pages.next(stay=True)  # nobody looks any more
         assert "halted" in [change["state"] for change in first["states"]["changes"]]
         assert first["observers_detached"] == second["observers_detached"] == {}
-        assert (pages._folder / "recording-1" / "run.mcap").stat().st_size > 1000
+        about = read_recording(pages._folder / "recording-1").about
+        assert json.loads(about["options"])["calmness"]["smile"] == 0.5
     hello = next(told for told in visit.seen if told["type"] == "hello" and told["seed"] == 7)
     assert hello["intensity"]["neck"] == 0.5 and hello["calmness"]["nod"] == 4.0  # what was turned stays turned
     errors = [told["error"] for told in visit.seen if told["type"] == "error"]

@@ -9,7 +9,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -22,7 +22,6 @@ from sfms_robot.app.listen.page_facts import page_facts
 from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_recorder import PageRecorder
 from sfms_robot.app.listen.preflight import begin_listening
-from sfms_robot.app.listen.run_facts import run_facts
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import InputError
@@ -93,8 +92,7 @@ class PageSession:
             halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
             scene_of(head)  # a picture that is broken is said before anything moves
             self.page.say("begin", scene=str(options.head), **self._facts(head, knobs, calmness))
-            facts = run_facts(head, options.listener, {**asdict(options), "audio": options.hears, "calmness": None})
-            recorder = PageRecorder(self.page, self._folder, list(head.joints), facts)
+            recorder = PageRecorder(self.page, self._folder, list(head.joints), options.facts(head))
             lonely = self._lonely(interrupt)
             stack.callback(recorder.close)
             self._commands.reach = Reach(halt, puppet, knobs, calmness, feed.calm, recorder.record, self._release)
