@@ -9,7 +9,6 @@ import { visitorPanel } from './visitor-panel.js';
 const SHOW_S = 1.0, AGAIN_MS = 400, EXPRESSION_S = 2.5;
 const RATES = { nod: 'nods', smile: 'smiles', gaze_shift: 'looks away', blink: 'blinks', mm_hm: '“mm-hm”', laugh: 'laughs', brow_raise: 'raises brows', shake: 'shakes', tilt: 'tilts' };
 const MOST_PER_MINUTE = { blink: 40, gaze_shift: 30 };
-const PEOPLE = { nod: 2.2, smile: 1, gaze_shift: 7, blink: 17, mm_hm: 2, laugh: 1, brow_raise: 1, shake: 0.3, tilt: 0.3 };
 const OF_A_RECORDING = ['servos']; // nobody is there to be told anything
 const GROUPS = [['Head', 0, 6], ['Brows and cheeks', 6, 14], ['Eyes', 14, 28], ['Jaw', 28, 32], ['Mouth', 32, 55], ['Nose and tongue', 55, 58]];
 
@@ -82,7 +81,7 @@ function listenerPanel(hello, connection) {
         make('p', { className: 'quiet' }, 'Each of these begins the run anew, behind this page.'),
       ]
     : [make('p', {}, `${hello.listener}, seed ${hello.seed}`)];
-  const rates = Object.keys(RATES).filter((kind) => kind in (hello.calmness ?? {})).map((kind) => rateSlider(kind, hello, connection));
+  const rates = Object.keys(RATES).filter((kind) => kind in (hello.people_per_minute ?? {})).map((kind) => rateSlider(kind, hello, connection));
   return [...choices, ...(rates.length ? [make('h3', { style: 'margin:0;font-size:.95rem' }, 'Calmness, a minute'), ...rates] : [])];
 }
 
@@ -90,7 +89,7 @@ function rateSlider(kind, hello, connection) {
   const asked = hello.calmness[kind];
   const set = throttled((value) => connection.send('calm', { rates: { [kind]: value } }), 150);
   const row = slider(RATES[kind], {
-    max: MOST_PER_MINUTE[kind] ?? 10, step: 0.1, value: asked ?? PEOPLE[kind], changed: set,
+    max: MOST_PER_MINUTE[kind] ?? 10, step: 0.1, value: asked ?? hello.people_per_minute[kind], changed: set,
     text: (value) => value.toFixed(1),
   });
   row.classList.add('rate');

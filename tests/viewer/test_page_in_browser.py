@@ -290,6 +290,18 @@ def test_what_is_wrong_with_the_run_is_said(own_page, run):
         page.until("document.getElementById('notice').textContent.includes(arguments[0])", notice)
 
 
+def test_rates_stand_where_people_are_and_nowhere_for_a_listener_that_decides_nothing(own_page, run):
+    page = own_page.open(run.url)
+    stands = "document.querySelector('.rate input[aria-label=\"blinks\"]').value"
+    page.until("document.querySelector('.rate')")
+    assert float(page.ask(stands)) == pytest.approx(page.ask("page.hello.people_per_minute.blink"), abs=0.051)
+    page.driver.execute_script("globalThis.whole = page.hello")
+    page.driver.execute_script(
+        "page.connection.dispatchEvent(new CustomEvent('hello', {detail: {...whole, people_per_minute: {}}}))"
+    )
+    page.until("!document.querySelector('.rate')")
+
+
 def test_phone(own_page, run):
     own_page.look(PHONE, dark=True)
     phone = own_page.open(run.url)

@@ -10,7 +10,10 @@ from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.listen.named_expressions import NAMED_EXPRESSIONS
 from sfms_robot.config import Calmness, Head
+from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.frames import CHANNELS
+from sfms_robot.listeners.events.hazards import load_tables
+from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.viewer.visitor_commands import VERSION
 
 
@@ -22,13 +25,13 @@ def page_facts(
     speaker: str | None,
     seed: int,
     calmness: Calmness,
+    people: Mapping[str, float],
     knobs: LiveKnobs,
     source: Mapping[str, bool],
     choices: bool,
 ) -> dict[str, Any]:
-    """`speaker`: name of the recorded person; None: somebody live. `source`: what a visitor may bring of the person.
-
-    `choices`: another listener, speaker or seed may be chosen.
+    """`speaker`: name of the recorded person; None: somebody live. `people`: see `people_per_minute`. `source`: what a
+    visitor may bring of the person. `choices`: another listener, speaker or seed may be chosen.
     """
     return {
         "version": VERSION,
@@ -54,10 +57,23 @@ def page_facts(
         "intensity": knobs.values["intensity"],
         "style": knobs.values["style"],
         "calmness": calmness.model_dump(exclude={"addressed"}),
+        "people_per_minute": dict(people),
         "human": "human/head.bin",
         "source": dict(source),
         "replay": False,
     }  # fmt: skip
+
+
+def people_per_minute(listener: str) -> dict[str, float]:
+    """Events a minute by kind, as people taught them: what a rate of None asks for. Empty where none are decided.
+
+    A listener of another package or machine may decide them; what it learned is not known here, so it is taken for
+    one of ours. Raises ConfigError.
+    """
+    folder = listener_folder(listener)
+    if folder is not None and not load_listener(folder / "config.yaml").events:
+        return {}
+    return {kind: hazard.per_minute for kind, hazard in load_tables().hazards.items()}
 
 
 def _lines(rows: list[dict[str, Any]], line: str) -> list[dict[str, str]]:

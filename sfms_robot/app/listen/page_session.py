@@ -18,7 +18,7 @@ from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
 from sfms_robot.app.listen.page_commands import PageCommands, Reach
-from sfms_robot.app.listen.page_facts import page_facts
+from sfms_robot.app.listen.page_facts import page_facts, people_per_minute
 from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_recorder import PageRecorder
 from sfms_robot.app.listen.preflight import begin_listening
@@ -164,7 +164,7 @@ class PageSession:
         speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
         return page_facts(
             head, port=options.port, listener=options.listener, seed=options.seed, calmness=calmness,
-            speaker=speaker if speaker in speakers() else None,
+            speaker=speaker if speaker in speakers() else None, people=people_per_minute(options.listener),
             knobs=knobs, source={feed: self._choices or by for feed, by in by_visitor.items()}, choices=self._choices,
         )  # fmt: skip
 

@@ -77,6 +77,6 @@ def _facts(recording: RunRecording) -> dict[str, Any]:
     facts = page_facts(
         head, port=about["port"], listener=about["listener"], seed=int(about["seed"]),
         speaker=DEFAULT_SPEAKER if speaker == "default" else speaker,
-        calmness=Calmness(), knobs=turned(head), source={"voice": False, "face": False}, choices=False,
+        calmness=Calmness(), people={}, knobs=turned(head), source={"voice": False, "face": False}, choices=False,
     )  # fmt: skip
     return facts | {"replay": True}

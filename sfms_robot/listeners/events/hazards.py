@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 
 from sfms_robot.config import Model, load
 from sfms_robot.config.base import Finite, NonNegative, Positive
+from sfms_robot.data import data_dir
 from sfms_robot.frames import EVENT_KINDS, Doubles
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE, NUMBERS
 from sfms_robot.listeners.events.hats import log_time
@@ -100,9 +101,9 @@ class EventTables(Model):
         return self
 
 
-def load_tables(file: Path) -> EventTables:
-    """Raises a ConfigError of one line."""
-    return load(EventTables, file)
+def load_tables(file: Path | None = None) -> EventTables:
+    """From a file as `train events` writes it, or the bundled one. Raises a ConfigError of one line."""
+    return load(EventTables, data_dir("sim") / "listeners" / FILE if file is None else file)
 
 
 @dataclass(frozen=True)

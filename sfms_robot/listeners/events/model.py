@@ -22,11 +22,10 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.data import data_dir
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame, changed
 from sfms_robot.listeners.events import chance
 from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
-from sfms_robot.listeners.events.hazards import FILE, STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
+from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
 from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
 from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
 
@@ -101,7 +100,7 @@ class EventModel:
     @classmethod
     def load(cls, file: Path | None = None) -> EventModel:
         """From a file as `train events` writes it, or the bundled one. Raises ConfigError."""
-        return cls(load_tables(data_dir("sim") / "listeners" / FILE if file is None else file))
+        return cls(load_tables(file))
 
     def start(self, seed: int, calmness: Calmness | None = None) -> EventMemory:
         """Nothing heard, nothing done."""
