@@ -12,7 +12,7 @@ import typer
 
 from sfms_robot.cli import names
 
-# Of the ten seeds that `--seeds 10` tries, one in the middle by how often they nod.
+# A lively one of the ten that `--seeds 10` tries: it nods 7 times, they 4.4 times in the mean.
 DEFAULT_SEED = 1
 
 
