@@ -21,6 +21,18 @@ def test_the_demo_draws_what_it_saw(tmp_path, monkeypatch, command_line):
     assert (tmp_path / "sfms-demo" / "run.mcap").is_file()
 
 
+@pytest.mark.slow
+def test_a_recording_of_an_earlier_demo_is_replaced_only_when_told(tmp_path, command_line):
+    words = ("demo", "--fast", "--head", "op3_head", "--duration", 1, "--json", "--out", tmp_path / "shown")
+    assert command_line(*words).code == 0
+    before = (tmp_path / "shown" / "run.mcap").read_bytes()
+    again = command_line(*words, "--seed", 2)
+    assert again.code == 2 and "holds a recording already" in again.err and "--overwrite" in again.err
+    assert (tmp_path / "shown" / "run.mcap").read_bytes() == before
+    assert command_line(*words, "--seed", 2, "--overwrite").code == 0
+    assert (tmp_path / "shown" / "run.mcap").read_bytes() != before
+
+
 def test_a_second_demo_writes_beside_the_first(tmp_path):
     first = tmp_path / "sfms-demo"
     for name in ("sfms-demo", "sfms-demo-2", "sfms-demo-3"):

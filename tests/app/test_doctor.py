@@ -40,6 +40,14 @@ BAUD = 1_000_000
 COMMAND = Command("/dev/ttyUSB0", "dynamixel2")
 
 
+def test_what_is_to_be_typed_reaches_the_servos_it_is_about():
+    words = "write 19 return_delay_time 0"
+    assert COMMAND.servo(words, BAUD).endswith("--port /dev/ttyUSB0 --baud 1000000")
+    assert Command("/dev/ttyUSB0", "feetech", "face").servo(words).endswith("--port /dev/ttyUSB0 --family feetech")
+    assert Command("sim", "feetech", "face").servo(words, BAUD).endswith("--port sim --head face")
+    assert Command("sim", "feetech").servo(words, BAUD).endswith("--port sim --baud 1000000 --family feetech")
+
+
 class Patient:
     """A chain, and the head that expects ids 1 to `count` of one model on it."""
 

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 from sfms_robot.app.servo.budget import Budget
 from sfms_robot.app.servo.register_view import State
-from sfms_robot.app.servo.serial_line import FoundServo
+from sfms_robot.app.servo.serial_line import SIM, FoundServo
 from sfms_robot.servo.discovery import Holder, SerialDevice
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
@@ -92,15 +92,21 @@ class Command:
 
     @property
     def fix(self) -> str:
-        family = "" if self.family == "dynamixel2" else f" --family {self.family}"
-        return f"sfms-robot doctor --port {self.port}{f' --head {self.head}' if self.head else family} --fix"
+        return f"sfms-robot doctor --port {self.port}{self._of_head or self._of_family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
         rate = f" --baud {baud}" if baud is not None else ""
-        family = "" if self.family == "dynamixel2" else f" --family {self.family}"
-        if self.port == "sim" and self.head:  # which servos there are is the head's to say
-            return f"sfms-robot servo {words} --port {self.port} --head {self.head}"
-        return f"sfms-robot servo {words} --port {self.port}{rate}{family}"
+        # Which emulated servos there are, and at what rate, is their head's to say.
+        which = self._of_head if self.port == SIM and self.head else f"{rate}{self._of_family}"
+        return f"sfms-robot servo {words} --port {self.port}{which}"
+
+    @property
+    def _of_head(self) -> str:
+        return f" --head {self.head}" if self.head else ""
+
+    @property
+    def _of_family(self) -> str:
+        return "" if self.family == "dynamixel2" else f" --family {self.family}"
 
 
 # --- the port ---------------------------------------------------------------------------------------------------

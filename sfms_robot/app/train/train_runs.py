@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -64,7 +64,7 @@ def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
         raise ConfigError(f"{options.file}: listener.kind = 'arig' has no tokenizer; `train listener` is all of it")
     began_s = time.monotonic()
     with run_of(options) as run:
-        run = _begun(run, options, "tokenizer", (tokenizer.WEIGHTS, checkpoint.WEIGHTS, checkpoint.CONFIG))
+        run = _begun(run, options, tokenizer.WEIGHTS, "tokenizer", checkpoint.WEIGHTS, checkpoint.CONFIG)
         figures = tokenizer.train_tokenizer(settings, options.data, options.out, run, options.order)
     return _timed(figures, began_s) if run.group.first else {}
 
@@ -77,7 +77,7 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
     arig = isinstance(settings, config.ArigTraining)
     began_s = time.monotonic()
     with run_of(options) as run:
-        run = _begun(run, options, "arig" if arig else "listener", (checkpoint.WEIGHTS,))
+        run = _begun(run, options, checkpoint.WEIGHTS, "arig" if arig else "listener")
         if isinstance(settings, config.ArigTraining):
             figures = train_arig(settings, options.data, options.out, run)
         else:
@@ -95,17 +95,16 @@ def _calibrate(settings: config.Training, options: TrainOptions) -> None:
         calibrate(settings, options.data, options.out, options.order, partial(progress.advance, task))
 
 
-def _begun(run: Run, options: TrainOptions, job: str, files: Sequence[str]) -> Run:
+def _begun(run: Run, options: TrainOptions, weights: str, job: str, *others: str) -> Run:
     """The run as it begins: from the checkpoint, where it was started again. Raises ConfigError where it would be the
-    end of an earlier training, whose `files` (or a configuration of somebody else) lie in the folder.
+    end of an earlier training: of its own, or of `others` whose files would be replaced.
     """
     if run.group.restarts:
         return replace(run, resume=checkpoint_file(options.out, job).exists())
     if options.resume or options.overwrite:
         return run
     run.group.wait()  # nobody has written anything yet
-    first, *others = (options.out / name for name in files)
-    for file in (first, checkpoint_file(options.out, job), *others):
+    for file in (options.out / weights, checkpoint_file(options.out, job), *(options.out / name for name in others)):
         if file.exists():
             raise ConfigError(f"{file} is of an earlier training: --resume goes on with it, --overwrite begins anew")
     run.group.wait()

@@ -155,8 +155,12 @@ def compose_folder(
     dyad: the set, the minutes wanted of it, the minutes written. Returns the minutes written per split. Raises
     ConfigError.
     """
-    folders = [out / part for part in ("", "interaction", "speaking")]
-    if not overwrite and (earlier := sorted(file for folder in folders for file in _composed(folder))):
+    sets = {
+        "listening": (out, minutes, dyads),
+        "interaction": (out / "interaction", SHARES["interaction"] * minutes, conversations),
+        "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),
+    }
+    if not overwrite and (earlier := sorted(file for folder, _, _ in sets.values() for file in _composed(folder))):
         raise ConfigError(
             f"--out {out}: holds dyads already, {earlier[0].name} among {len(earlier)}: another folder, or --overwrite"
         )
@@ -164,11 +168,6 @@ def compose_folder(
     brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
     material = read_material(ami, [*bundled, *brought, *voices], data_dir("sim") / "listeners" / "motions.npz")
-    sets = {
-        "listening": (out, minutes, dyads),
-        "interaction": (out / "interaction", SHARES["interaction"] * minutes, conversations),
-        "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),
-    }
     written: dict[str, float] = {}
     for name, (folder, wanted, make) in sets.items():
         each = partial(told, name, wanted * (1 + 2 * HELD_OUT_SHARE)) if told else None

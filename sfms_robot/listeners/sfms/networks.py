@@ -34,7 +34,7 @@ class Network(nn.Module):
     def __init__(self, model: SfmsModel, settings: config.Sfms) -> None:
         super().__init__()
         self.model = model
-        self.past, self.future = settings.past_frames, settings.future_frames
+        self.future = settings.future_frames
         self.codes = [group.codes for group in settings.groups.values()]
 
 

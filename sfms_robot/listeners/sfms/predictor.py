@@ -123,8 +123,7 @@ class Predictor(nn.Module):
         self.own = nn.ModuleList(Block(width, heads) for _ in range(layers))
         self.slots = nn.Parameter(torch.randn(future, width) * 0.02)
         self.role = nn.Parameter(torch.randn(3, width) * 0.02)
-        self.phase_size = 0 if speaker.phase_in is None else speaker.phase_in.in_features
-        self.phase_in = nn.Linear(self.phase_size, width) if self.phase_size else None
+        self.phase_in = None if speaker.phase_in is None else nn.Linear(speaker.phase_in.in_features, width)
         self.decoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
         # Weights keep the name that they were first saved under.
         self.trail_in = nn.Linear(described, width) if sequential else None

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from people_rad import PEOPLE_RAD
 from tiny_arig import arig_listener
 
 from sfms_robot.data import data_dir
@@ -83,8 +84,8 @@ def minutes_of_events(minutes: float) -> list[ListenerEvent]:
     not (SHIPPED / checkpoint.WEIGHTS).is_file() or not checkpoint.load_config(SHIPPED).events,
     reason="arig-small is told no events here",
 )
-def test_after_ten_minutes_of_talk_and_events_a_head_is_where_it_began_but_for_its_sway():
-    """How far heads sway is told by test_sway; beside that, only nods move this one."""
+def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs():
+    """And beside its sway, which test_sway tells of, only nods have moved it."""
     said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")
     listener = load(SHIPPED).build_graphs()
     told = minutes_of_events(10)
@@ -105,6 +106,12 @@ def test_after_ten_minutes_of_talk_and_events_a_head_is_where_it_began_but_for_i
     assert np.percentile(beside, 99) < np.deg2rad(0.3) and beside.max() < np.deg2rad(1.0)
     late = (out - swayed)[-60 * FRAME_HZ :][~nodding[-60 * FRAME_HZ :]]
     assert np.abs(late.mean(0)).max() < np.deg2rad(0.1)
+    low, high = np.array(PEOPLE_RAD).T
+    last = out[-60 * FRAME_HZ :]
+    assert (last.mean(0) > low).all() and (last.mean(0) < high).all()
+    # One of twenty people sways so far (0.02 rad) that he is out of everybody's 98 % for an eighth of the time.
+    assert ((out < low) | (out > high)).mean(axis=0).max() < 0.125
+    assert (last.std(0) > 0.2 * (high - low) / 4.65).all()  # alive
 
 
 @pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
