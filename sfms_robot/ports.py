@@ -340,7 +340,7 @@ class Watched:
     by_hand: bool = False
 
 
-class Life(Protocol):
+class SpontaneousMotion(Protocol):
     """What the head does of itself, on top of the face that was asked for. State is a value."""
 
     def start(self) -> Any: ...

@@ -41,14 +41,14 @@ from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.open_feed import NamedFeed, open_feed
 from sfms_robot.listeners.plugins import REMOTE, listener_folder
 from sfms_robot.listeners.process import ListenerProcess
-from sfms_robot.motion.audit import Audit
+from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.motion.timeline import PlanTimeline
 from sfms_robot.network import check_zenoh
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Timeline
 from sfms_robot.realtime import realtime_priority
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.spontaneous import Life
+from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.halt import HaltLatch
@@ -86,7 +86,7 @@ class Motion:
     timeline: PlanTimeline
     retargeter: HeadRetargeter
     limiter: JerkLimiter
-    audit: Audit
+    audit: CommandAudit
     leads_s: Doubles
     rest_rad: Doubles
     holds: NDArray[np.bool_]
@@ -193,7 +193,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
         PlanTimeline(1.0 / rate_hz),
         retargeter,
         JerkLimiter(limits, 1.0 / rate_hz),
-        Audit(limits, calibration_of(head.joints), 1.0 / rate_hz),
+        CommandAudit(limits, calibration_of(head.joints), 1.0 / rate_hz),
         leads_s,
         np.array([joint.rest_rad for joint in head.joints.values()]),
         holds,
@@ -279,7 +279,7 @@ class Programme:
     duration_s: float | None
     timeline: Timeline | None = None
     retargeter: Retargeter | None = None
-    life: Life | None = None
+    life: HeadLife | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
     answers: bool = False
@@ -457,7 +457,7 @@ def run(
         watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
         programme = Programme(
             person, feed, duration_s,
-            life=Life(opened.config.life, options.seed, opened.config.camera),
+            life=HeadLife(opened.config.life, options.seed, opened.config.camera),
             knobs=lambda: live.now,
             overlay=overlay,
             answers=True,

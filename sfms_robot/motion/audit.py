@@ -29,7 +29,7 @@ class AuditState:
     clamped: int = 0
 
 
-class Audit:
+class CommandAudit:
     """Holds the limits of the joints of one bus; `calibration` has the same joints in the same order."""
 
     def __init__(self, limits: JointLimits, calibration: Calibration, dt_s: float) -> None:

@@ -34,6 +34,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats, Plan
+from sfms_robot.signals.minimum_jerk import minimum_jerk
 
 BLEND_FRAMES = 2
 STALL_S = 0.5  # without a plan for this long, ease to neutral
@@ -347,7 +348,7 @@ def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:
     np.minimum(out, curve.high[piece], out=out)
     if float(asked_s.max()) > curve.made_at_s + STALL_S:
         u = np.clip((asked_s - curve.made_at_s - STALL_S) / EASE_S, 0.0, 1.0)
-        out *= (1 - u**3 * (10 - 15 * u + 6 * u**2))[:, None]
+        out *= (1 - minimum_jerk(u))[:, None]
     return out
 
 

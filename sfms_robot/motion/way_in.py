@@ -14,6 +14,7 @@ import numpy as np
 
 from sfms_robot.frames import Doubles
 from sfms_robot.ranges import Bools, Range
+from sfms_robot.signals.minimum_jerk import minimum_jerk
 
 GENTLE_S: Final = 2.0  # longer than the easing of a run, so that usually the face asked for is ahead of the curve
 _SHARE: Final = 0.8
@@ -73,7 +74,7 @@ class WayIn:
     def now(self) -> Doubles:
         """Angle, speed and acceleration (3, J) of the curves."""
         u = np.minimum(self.elapsed_s / self.duration_s, 1.0)
-        left = 1.0 - u**3 * (10 - 15 * u + 6 * u**2)
+        left = 1.0 - minimum_jerk(u)
         speed = -30 * u**2 * (1 - u) ** 2 / self.duration_s
         acceleration = -60 * u * (1 - u) * (1 - 2 * u) / self.duration_s**2
         curve: Doubles = (self.found_rad - self.edge_rad) * np.stack([left, speed, acceleration])

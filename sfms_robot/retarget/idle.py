@@ -66,7 +66,7 @@ class IdleState:
     draws: int = 0
 
 
-class IdleMotion:
+class IdleFiller:
     """Adds to a motion what is missing in it. `full_rad` (2,): the eye's yaw and pitch for a channel of 1."""
 
     def __init__(self, config: Idle, full_rad: Doubles, seed: int) -> None:

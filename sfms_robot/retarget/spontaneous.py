@@ -12,13 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfms_robot.config import CameraMount, Gaze
-from sfms_robot.config import Life as LifeConfig
+from sfms_robot.config import CameraMount, Gaze, Life
 from sfms_robot.frames import POSE, Doubles, Floats
 from sfms_robot.ports import Watched
 from sfms_robot.retarget.gaze import GazeHold, GazeState, ShownPose
 from sfms_robot.retarget.gaze_target import AimState, GazeTarget, turned
-from sfms_robot.retarget.idle import IdleMotion, IdleState
+from sfms_robot.retarget.idle import IdleFiller, IdleState
 
 
 @dataclass(frozen=True)
@@ -30,17 +29,17 @@ class LifeState:
     aim: AimState | None = None
 
 
-class Life:
-    """Implements `ports.Life`. Parts that the configuration leaves out do nothing at all.
+class HeadLife:
+    """Implements `ports.SpontaneousMotion`. Parts that the configuration leaves out do nothing at all.
 
     `camera`: of the head; None: nobody can tell where people are, and the head looks straight at them.
     """
 
-    def __init__(self, config: LifeConfig, seed: int, camera: CameraMount | None = None) -> None:
+    def __init__(self, config: Life, seed: int, camera: CameraMount | None = None) -> None:
         eyes = config.gaze or Gaze()
         full_rad = np.radians([eyes.full_yaw_deg, eyes.full_pitch_deg])
         self._gaze = GazeHold(config.gaze) if config.gaze else None
-        self._idle = IdleMotion(config.idle, full_rad, seed) if config.idle else None
+        self._idle = IdleFiller(config.idle, full_rad, seed) if config.idle else None
         self._target = GazeTarget(config.person, config.gaze, camera, seed) if config.person else None
 
     def start(self) -> LifeState:

@@ -23,12 +23,12 @@ from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floa
 from sfms_robot.ports import (
     Bus,
     Clock,
-    Life,
     Limiter,
     Observer,
     PlanFeed,
     Retargeter,
     Source,
+    SpontaneousMotion,
     StopPolicy,
     Tick,
     Timeline,
@@ -74,7 +74,7 @@ class Parts:
     observers: Sequence[Observer]
     leads_s: Doubles
     rest_rad: Doubles
-    life: Life | None = None
+    life: SpontaneousMotion | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
     answers: bool = False

@@ -15,6 +15,7 @@ from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import Bus, Limiter
 from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.log import RunLog
+from sfms_robot.signals.minimum_jerk import minimum_jerk
 
 EASE_S: Final = 1.0  # torque-on pose -> live face, and live face -> rest
 REST_LIMIT_S: Final = 60.0  # of the whole way to rest; twice what the slowest joint of a shipped head may need
@@ -31,7 +32,7 @@ logger = logging.getLogger(__name__)
 def smooth(u: T) -> T:
     """0 -> 0, 1 -> 1 with speed and acceleration zero at both ends (quintic)."""
     u = np.clip(u, 0.0, 1.0)
-    return u**3 * (10 - 15 * u + 6 * u**2)
+    return minimum_jerk(u)
 
 
 def come_to_rest(

@@ -21,6 +21,7 @@ import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
+from urllib.parse import urlsplit
 
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.ports import Clock
@@ -261,6 +262,8 @@ def _open(device: str, baud: int) -> serial.Serial:
     if scheme and scheme not in _NETWORKED:
         choices = "a device such as /dev/ttyUSB0 or COM3, socket://HOST:PORT, rfc2217://HOST:PORT"
         raise PortError(f"{device}: no servos can be behind {scheme}:// ({choices})")
+    if scheme and not _names_port(device):
+        raise PortError(f"{device}: names no host and port to connect to ({scheme}://HOST:PORT)")
     import serial
 
     try:
@@ -305,6 +308,14 @@ def _check_baud(port: serial.Serial, device: str) -> None:
 def _is_url(device: str) -> bool:
     """socket://, rfc2217:// and the like; everything else is a path, relative ones too."""
     return "://" in device
+
+
+def _names_port(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return bool(parts.hostname) and parts.port is not None
+    except ValueError:  # a port that is no number, or none that there can be
+        return False
 
 
 def _low_latency(port: serial.Serial) -> None:

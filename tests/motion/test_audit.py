@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.config import load_head
-from sfms_robot.motion.audit import Audit
+from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 
@@ -10,7 +10,7 @@ DT_S = 0.01
 HEAD = load_head("face28")
 LIMITS = JointLimits.of(HEAD)
 J = len(LIMITS.low)
-AUDIT = Audit(LIMITS, Calibration(HEAD.joints, np.full(J, 4096)), DT_S)
+AUDIT = CommandAudit(LIMITS, Calibration(HEAD.joints, np.full(J, 4096)), DT_S)
 
 
 def audited(stream, wanted=None):
@@ -52,7 +52,7 @@ def test_a_speed_acceleration_or_jerk_just_over_its_limit_is_a_violation(order):
         limit if order == n else np.full(J, 1e9)
         for n, limit in enumerate((LIMITS.speed, LIMITS.acceleration, LIMITS.jerk), 1)
     ))  # fmt: skip
-    audit = Audit(alone, Calibration(HEAD.joints, np.full(J, 4096)), DT_S)
+    audit = CommandAudit(alone, Calibration(HEAD.joints, np.full(J, 4096)), DT_S)
     for share, found in ((0.9999, 0), (1.0001, 1)):
         state = audit.start(np.zeros(J))
         rise = bound * DT_S**order * share

@@ -9,7 +9,7 @@ from sfms_robot.app.wiring import calibration_of, firmware_maps
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.data import data_dir, shipped_names
-from sfms_robot.motion.audit import Audit
+from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.chase import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
@@ -44,7 +44,7 @@ class Law:
         self.count = len(servos)
         self.limiter = JerkLimiter(self.limits, DT_S, chase)
         self.goals = Goals("law", servos, calibration)
-        self.audit = Audit(self.limits, calibration, DT_S)
+        self.audit = CommandAudit(self.limits, calibration, DT_S)
         self.calibration = calibration
 
     def start(self, angles) -> None:

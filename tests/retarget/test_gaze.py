@@ -30,7 +30,7 @@ def looking(yaw_deg: float, pitch_deg: float = 0.0, **pose_rad: float) -> np.nda
 
 def lived(listener, seconds: float, **gaze) -> np.ndarray:
     """What is shown, (T, N, 58), of a listener given as a function of time; N instants with leads a tick."""
-    alive = spontaneous.Life(Life(gaze=Gaze(**gaze)), seed=0)
+    alive = spontaneous.HeadLife(Life(gaze=Gaze(**gaze)), seed=0)
     state, shown = alive.start(), []
     for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
         times_s = now_s + LEADS_S

@@ -29,7 +29,7 @@ def still(t):
 
 def lived(watched, seconds, person=STEADY, gaze=EYES, camera=BASE, seed=0, listener=still) -> np.ndarray:
     """What is shown, (T, N, 58), of `watched(t, shown so far)`; N instants with leads a tick."""
-    alive = spontaneous.Life(Life(gaze=gaze, person=person), seed, camera)
+    alive = spontaneous.HeadLife(Life(gaze=gaze, person=person), seed, camera)
     state, shown = alive.start(), []
     for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
         times_s = now_s + LEADS_S

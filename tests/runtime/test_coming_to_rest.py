@@ -15,7 +15,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError, ModelError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.retarget.spontaneous import Life
+from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.log import RunLog
@@ -110,7 +110,7 @@ def driven(
     log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
     parts: dict[str, Any] = {
         "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Turner(), 0, 0.01), "timeline": motion.timeline,
-        "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus, "life": Life(HEAD.life, 0),
+        "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus, "life": HeadLife(HEAD.life, 0),
     }  # fmt: skip
     if limiter:
         parts["limiter"] = limiter(parts["limiter"])

@@ -207,3 +207,11 @@ def test_data_that_look_like_a_header_are_stuffed(data):
     for sent in port.sent:
         packet = dxl2.maybe_packet(bytearray(sent))
         assert packet is not None and data in packet.params
+
+
+@pytest.mark.parametrize(
+    "url", ["socket://nohost", "socket://", "socket://:7000", "socket://host:ab", "rfc2217://host"]
+)
+def test_an_address_without_host_or_port_is_told_what_it_lacks(url):
+    with pytest.raises(PortError, match=f"^{url}: names no host and port to connect to .*://HOST:PORT"):
+        SerialPort(url, 57600, Time())

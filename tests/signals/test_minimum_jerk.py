@@ -1,0 +1,14 @@
+import numpy as np
+import pytest
+
+from sfms_robot.signals.minimum_jerk import minimum_jerk
+
+
+def test_rests_at_both_ends_and_is_its_own_mirror():
+    u = np.linspace(0.0, 1.0, 201)
+    way = minimum_jerk(u)
+    assert (way[0], way[-1]) == (0.0, 1.0)
+    assert np.all(np.diff(way) > 0)
+    assert way + way[::-1] == pytest.approx(np.ones(201), abs=1e-12)
+    for ends in (way[:2], 1 - way[-2:]):
+        assert np.ptp(ends) < 10.1 * 0.005**3  # third order: neither speed nor acceleration
