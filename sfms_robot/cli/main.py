@@ -114,17 +114,21 @@ def _endings_as_interrupts() -> Iterator[None]:
     """SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does, so that what a command has open is put right.
 
     Not where they are ignored (nohup) or handled, and only in the main thread: Python gives signals to no other.
+    SIGINT does so also where it is ignored, as a script's shell has it for whatever it starts with `&`: it has to stop
+    who moves a head in every phase.
     """
     main_thread = threading.current_thread() is threading.main_thread()
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if main_thread and hasattr(signal, name)]
-    heeded = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    heeded = {number: signal.SIG_DFL for number in numbers if signal.getsignal(number) is signal.SIG_DFL}
+    if main_thread and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        heeded[signal.SIGINT] = signal.SIG_IGN
     for number in heeded:
         signal.signal(number, signal.default_int_handler)
     try:
         yield
     finally:
-        for number in heeded:
-            signal.signal(number, signal.SIG_DFL)
+        for number, before in heeded.items():
+            signal.signal(number, before)
 
 
 def _outcome(words: list[str]) -> tuple[int, str | None]:

@@ -35,6 +35,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import replace
 from typing import Any, Final
 
@@ -262,8 +263,12 @@ class _Child:
         self.ended = False
         self._closing = False
         self._named = False  # what to load was sent: it goes before all
-        for work in (self._write, self._read):
-            threading.Thread(target=work, name=f"listener {work.__name__}", daemon=True).start()
+        self._threads = [
+            threading.Thread(target=work, name=f"listener {work.__name__}", daemon=True)
+            for work in (self._write, self._read)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def send(self, frame: SpeakerFrame) -> int:
         """Queue a frame; the number of older ones dropped for it."""
@@ -311,7 +316,9 @@ class _Child:
     def _write(self) -> None:
         pipe = self._process.stdin
         assert pipe is not None
-        try:
+        # It may have died, which the reader sees too, and says so. What could not be sent is dropped with the pipe:
+        # `close` fails over it once more, and has closed the file all the same.
+        with suppress(BrokenPipeError, OSError, ValueError), closing(pipe):
             while True:
                 with self._changed:
                     self._changed.wait_for(lambda: self._closing or self._frames or (self._urgent and self._named))
@@ -321,9 +328,6 @@ class _Child:
                     self._named = True
                 pickle.dump(item, pipe, protocol=5)
                 pipe.flush()
-            pipe.close()
-        except (BrokenPipeError, OSError, ValueError):
-            return  # it died: the reader sees that too, and says so
 
     def _read(self) -> None:
         pipe = self._process.stdout

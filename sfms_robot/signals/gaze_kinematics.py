@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, POSE, Floats, changed
+from sfms_robot.signals.minimum_jerk import minimum_jerk
 
 EYE_PAN_RAD: Final = math.radians(30)  # of an eyeLook channel of 1, sideways
 EYE_TILT_RAD: Final = math.radians(20)
@@ -40,7 +41,7 @@ _TILT_SHARE: Final = 0.8  # of the pitch, less than of the yaw
 _ROLL: Final = -0.08  # of the yaw
 _SACCADE_S: Final = (0.021, 0.0022, 0.04, 0.12)  # at 0, more for each degree, least, most
 _HEAD_S: Final = (0.3, 0.012)  # at 0, more for each degree that it turns
-_SPOT_RAD: Final = (math.radians(0.55), math.radians(1.3))  # deviation and most, from the target
+_SPOT_RAD: Final = (math.radians(0.55), math.radians(1.3))  # deviation and most, from the target, drift and all
 _DRIFT_RAD_S: Final = math.radians(0.2)
 _FIXATION_S: Final = (0.228, 0.48, 0.11)  # median, deviation of its logarithm, least
 
@@ -149,7 +150,7 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...]
     """The head's part, the eyes, as in a `GazeFrame`, and the state after them."""
     state = _aimed(target, state)
     since_s, left_s = state.since_s + FRAME_S, max(0.0, state.left_s - FRAME_S)
-    part = _least_jerk(min(1.0, since_s / state.shift_s))
+    part = minimum_jerk(min(1.0, since_s / state.shift_s))
     goal = head_share(target, state.share)
     yaw = _towards(state.head[0], goal[0], state.head_left_s, FRAME_S)
     pitch = _towards(state.head[1], goal[1], state.head_left_s, FRAME_S)
@@ -191,13 +192,13 @@ def _fixated(state: GazeState) -> GazeState:
     x, y, drift_x, drift_y, long = _drawn(state.seed, state.number)
     narrow = spread * min(1.0, most / max(spread * math.hypot(x, y), 1e-9))
     median_s, deviation, least_s = _FIXATION_S
-    return changed(
-        state,
-        number=state.number + 1,
-        spot_rad=(narrow * x, narrow * y),
-        drift_rad_s=(_DRIFT_RAD_S * drift_x, _DRIFT_RAD_S * drift_y),
-        left_s=max(least_s, median_s * math.exp(deviation * long)),
-    )
+    left_s = max(least_s, median_s * math.exp(deviation * long))
+    spot, drift = (narrow * x, narrow * y), (_DRIFT_RAD_S * drift_x, _DRIFT_RAD_S * drift_y)
+    last = (spot[0] + drift[0] * left_s, spot[1] + drift[1] * left_s)
+    far = math.hypot(*last)
+    if far > most:  # what begins and ends no further off is no further off between
+        drift = ((last[0] * most / far - spot[0]) / left_s, (last[1] * most / far - spot[1]) / left_s)
+    return changed(state, number=state.number + 1, spot_rad=spot, drift_rad_s=drift, left_s=left_s)
 
 
 @lru_cache(maxsize=1024)  # plans overlap: most fixations are asked for by several
@@ -228,10 +229,6 @@ def _towards(axis: Axis, goal: float, left_s: float, dt_s: float) -> Axis:
         (v_t + s * (a_t + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / left_s,
         (a_t + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / left_s**2,
     )
-
-
-def _least_jerk(s: float) -> float:
-    return s**3 * (10 + s * (-15 + 6 * s))
 
 
 def _eyes(pan: float, tilt: float) -> tuple[float, ...]:

@@ -47,6 +47,21 @@ def test_a_signal_ends_a_run_without_torque_and_without_a_word(phase, number, sl
     assert json.loads(out.splitlines()[-1])["exit"] == "interrupted"
 
 
+@pytest.fixture
+def in_the_background():
+    """What a script's shell does for whatever it starts with `&`."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("phase", [loading, connecting, listening], ids=lambda each: each.__name__)
+def test_an_interrupt_ends_a_run_that_a_script_started_in_the_background(
+    phase, in_the_background, slow_head, device, chain
+):
+    test_a_signal_ends_a_run_without_torque_and_without_a_word(phase, signal.SIGINT, slow_head, device, chain)
+
+
 def once(running, chain):
     running.signal(signal.SIGQUIT)
 

@@ -244,6 +244,18 @@ def test_a_child_that_hangs_is_named_then_replaced_and_its_frames_do_not_pile_up
     assert listener.statistics()["restarts"] == 1 and pid_of(listener) != before
 
 
+def test_a_child_that_dies_with_a_full_pipe_leaves_no_file_open(listener):
+    answered(listener, 0.0)
+    child = listener._child
+    os.kill(pid_of(listener), signal.SIGSTOP)
+    for frame in frames(2000):
+        listener.push(frame, 10.0)
+    child.kill()
+    for thread in child._threads:
+        thread.join()
+    assert child._process.stdin.closed and child._process.stdout.closed
+
+
 def test_a_child_that_keeps_dying_is_given_up_and_pushing_goes_on(listener):
     for _ in range(RESTARTS + 1):
         listener._child.close()
