@@ -1,9 +1,9 @@
 """A voice agent: sound in from your microphone or call, sound out to your loudspeaker, and a head that listens."""
 
 import sys
-import wave
 
 import numpy as np
+import soundfile
 
 import sfms_robot as sr
 from sfms_robot.data import data_dir
@@ -13,10 +13,8 @@ RATE_HZ, PIECE_S = 48_000, 0.02  # as a browser or a telephone call hands it ove
 
 def microphone(seconds: float) -> np.ndarray:
     """Stands for yours: a recorded person, int16."""
-    with wave.open(str(data_dir("sim") / "speakers" / "katie" / "speech.wav")) as file:
-        voice = np.frombuffer(file.readframes(file.getnframes()), np.int16)
-        step = file.getframerate() / RATE_HZ
-    return voice[(np.arange(round(seconds * RATE_HZ)) * step).astype(int) % len(voice)]
+    voice, rate_hz = soundfile.read(data_dir("sim") / "speakers" / "katie" / "speech.flac", dtype="int16")
+    return voice[(np.arange(round(seconds * RATE_HZ)) * rate_hz / RATE_HZ).astype(int) % len(voice)]
 
 
 def text_to_speech(text: str) -> np.ndarray:

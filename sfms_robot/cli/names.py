@@ -17,4 +17,4 @@ def listeners() -> list[str]:
 
 def speakers() -> list[str]:
     """Shipped speakers."""
-    return shipped_names(data_dir("sim") / "speakers", "speech.wav")
+    return shipped_names(data_dir("sim") / "speakers", "speech.flac")

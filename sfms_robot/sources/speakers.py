@@ -25,7 +25,7 @@ class Speaker:
 
 def speakers() -> list[str]:
     """Names of the shipped speakers."""
-    return shipped_names(data_dir("sim") / "speakers", "speech.wav")
+    return shipped_names(data_dir("sim") / "speakers", "speech.flac")
 
 
 def shipped_speaker(name: str) -> Speaker:
@@ -34,7 +34,7 @@ def shipped_speaker(name: str) -> Speaker:
         raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speakers())})")
     folder = data_dir("sim") / "speakers" / name
     face = folder / "face.csv.gz"
-    return Speaker(name, folder / "speech.wav", face if face.is_file() else None)
+    return Speaker(name, folder / "speech.flac", face if face.is_file() else None)
 
 
 def voice_file(name: str) -> Path | None:

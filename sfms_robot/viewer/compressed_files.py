@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import gzip
+import lzma
+import mimetypes
 from pathlib import Path
 from typing import Final
 
 from starlette.datastructures import Headers
 from starlette.responses import FileResponse, Response
-from starlette.staticfiles import StaticFiles
+from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
 _LEVEL: Final = 6
@@ -18,11 +20,15 @@ _OF_PLAIN: Final = ("content-length", "accept-ranges")  # headers that are true 
 
 
 class CompressedFiles(StaticFiles):
-    """The files of a folder; gzip for who takes it, and the plain file for who does not or asks for a part of it."""
+    """The files of a folder; gzip for who takes it, and the plain file for who does not or asks for a part of it.
+
+    What lies there as FILE.xz, to be small where it is installed, is served as FILE, and always whole.
+    """
 
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder)
         self._folder = folder
+        self._stored = {file.relative_to(folder).with_suffix("").as_posix(): file for file in folder.rglob("*.xz")}
         self._packed: dict[tuple[str, float], asyncio.Task[bytes]] = {}  # by file and when it was changed
 
     def prepare(self) -> None:
@@ -32,6 +38,8 @@ class CompressedFiles(StaticFiles):
                 self._gzip(file)
 
     async def get_response(self, path: str, scope: Scope) -> Response:
+        if (stored := self._stored.get(path)) is not None and scope["method"] in ("GET", "HEAD"):
+            return await self._unpacked(path, stored, Headers(scope=scope))
         plain = await super().get_response(path, scope)
         asked = Headers(scope=scope)
         if not isinstance(plain, FileResponse) or plain.status_code != 200 or scope["method"] != "GET":
@@ -43,6 +51,18 @@ class CompressedFiles(StaticFiles):
         headers = {name: value for name, value in plain.headers.items() if name not in _OF_PLAIN}
         return Response(packed, headers=headers | {"Content-Encoding": _WITH_GZIP})
 
+    async def _unpacked(self, path: str, stored: Path, asked: Headers) -> Response:
+        found = stored.stat()
+        headers = {"ETag": f'"{found.st_mtime_ns:x}-{found.st_size:x}"', "Vary": "Accept-Encoding"}
+        if self.is_not_modified(Headers(headers), asked):
+            return NotModifiedResponse(Headers(headers))
+        kind = mimetypes.guess_type(path)[0]
+        if _WITH_GZIP in asked.get("accept-encoding", ""):
+            return Response(
+                await self._gzip(stored), media_type=kind, headers=headers | {"Content-Encoding": _WITH_GZIP}
+            )
+        return Response(await asyncio.to_thread(_plain, stored), media_type=kind, headers=headers)
+
     def _gzip(self, file: Path) -> asyncio.Task[bytes]:
         key = (str(file), file.stat().st_mtime)
         if key not in self._packed:
@@ -51,4 +71,8 @@ class CompressedFiles(StaticFiles):
 
 
 def _compressed(file: Path) -> bytes:
-    return gzip.compress(file.read_bytes(), _LEVEL, mtime=0)
+    return gzip.compress(_plain(file), _LEVEL, mtime=0)
+
+
+def _plain(file: Path) -> bytes:
+    return lzma.decompress(file.read_bytes()) if file.suffix == ".xz" else file.read_bytes()

@@ -41,7 +41,7 @@ def seeded(tmp_path_factory):
 
 def voice(file, seconds: float):
     """A shipped voice, cut off after so many seconds."""
-    samples, rate = soundfile.read(data_dir("sim") / "speakers" / "katie" / "speech.wav")
+    samples, rate = soundfile.read(data_dir("sim") / "speakers" / "katie" / "speech.flac")
     assert len(samples) >= seconds * rate
     soundfile.write(file, samples[: int(seconds * rate)], rate)
     return str(file)

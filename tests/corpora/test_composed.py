@@ -60,7 +60,7 @@ def motions():
 
 @pytest.fixture(scope="module")
 def katie():
-    return read_voice(data_dir("sim") / "speakers" / "katie" / "speech.wav")
+    return read_voice(data_dir("sim") / "speakers" / "katie" / "speech.flac")
 
 
 @pytest.fixture(scope="module")
@@ -440,7 +440,7 @@ def test_voice_fills_exactly_the_segments(katie):
 
 
 def test_a_mouth_moves_only_while_its_voice_sounds():
-    voice = read_voice(data_dir("sim") / "speakers" / "facegood_1114_3_16" / "speech.wav")
+    voice = read_voice(data_dir("sim") / "speakers" / "facegood_1114_3_16" / "speech.flac")
     _, mouth = lay(np.array([[2.0, 6.0]]), 250, voice, np.random.default_rng(0))
     assert mouth[:, BLENDSHAPES.index("jawOpen")].max() > 0.1
     assert not mouth[:48].any() and not mouth[153:].any()

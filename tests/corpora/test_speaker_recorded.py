@@ -19,7 +19,7 @@ JAW = CHANNEL_INDEX["jawOpen"]
 
 @pytest.fixture(scope="module")
 def katie():
-    return read_voice(data_dir("sim") / "speakers" / "katie" / "speech.wav")
+    return read_voice(data_dir("sim") / "speakers" / "katie" / "speech.flac")
 
 
 @pytest.fixture

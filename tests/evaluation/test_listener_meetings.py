@@ -31,7 +31,7 @@ def person():
 
 @pytest.fixture(scope="module")
 def one(person):
-    voice = read_voice(data_dir("sim") / "speakers" / "katie" / "speech.wav")
+    voice = read_voice(data_dir("sim") / "speakers" / "katie" / "speech.flac")
     motions = load_motions(data_dir("sim") / "listeners" / "motions.npz")["validation"]
     return listener_meeting(person, [voice], [], motions, np.random.default_rng(0))
 

@@ -127,3 +127,68 @@ def test_tensors_are_read_one_at_a_time(tmp_path):
         tracemalloc.stop()
     assert dict(seen) == {f"layer{index}": index for index in range(12)}
     assert peak_bytes < 5 * megabyte.nbytes
+
+
+def matrices(seed=0):
+    draw = np.random.default_rng(seed)
+    large = draw.normal(0, 1, (96, 128)).astype(np.float32) * draw.uniform(1e-3, 10, (96, 1)).astype(np.float32)
+    large[7] = 0
+    kernels = draw.normal(0, 0.1, (96, 32, 5)).astype(np.float32)
+    return {"large": large, "kernels": kernels, "small": draw.normal(size=(8, 6)).astype(np.float32),
+            "row": draw.normal(size=9000).astype(np.float32), "number": np.float32(0.3).reshape(()),
+            "count": np.arange(9000).reshape(90, 100)}  # fmt: skip
+
+
+def test_large_matrices_in_8_bits_are_off_by_half_a_step_of_their_row_and_all_else_is_as_in_16(tmp_path):
+    wanted = matrices()
+    checkpoint.write_tensors(tmp_path / "a.safetensors", wanted, 8)
+    shapes = {name: (value.shape, value.dtype.kind == "f") for name, value in wanted.items()}
+    found = checkpoint.read_weights(tmp_path / "a.safetensors", shapes)
+    assert found.keys() == wanted.keys()
+    for name, value in wanted.items():
+        assert found[name].shape == value.shape
+        if name in ("large", "kernels"):
+            rows, off = (each.reshape(96, -1) for each in (value, found[name] - value))
+            assert 0 < np.abs(off).max() and (np.abs(off).max(1) <= np.abs(rows).max(1) / 253).all()
+        else:
+            rounded = value.astype(np.float16).astype(np.float32) if value.dtype.kind == "f" else value
+            np.testing.assert_array_equal(found[name], rounded)
+    left = sum(value.nbytes for value in wanted.values()) - (tmp_path / "a.safetensors").stat().st_size
+    assert left > 0.7 * (wanted["large"].nbytes + wanted["kernels"].nbytes)
+
+
+def test_written_in_8_bits_again_they_are_the_same(tmp_path):
+    for before, after in (("a", "b"), ("b", "c")):
+        if before == "a":
+            checkpoint.write_tensors(tmp_path / "a", matrices(), 8)
+        checkpoint.write_tensors(tmp_path / after, checkpoint.read_weights(tmp_path / before), 8)
+    assert (tmp_path / "b").read_bytes() == (tmp_path / "c").read_bytes()
+
+
+def test_what_16_bits_do_not_hold_stays_in_32(tmp_path):
+    checkpoint.write_tensors(tmp_path / "a", {"far": np.array([1e5, 1.0], np.float32), "none": np.zeros((0, 3))}, 16)
+    np.testing.assert_array_equal(checkpoint.read_weights(tmp_path / "a")["far"], [1e5, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"),
+    [
+        (None, "tensor large is of int8, the model needs float32"),
+        (np.ones(5, np.float32), r"tensor large\.row_scale is not \(96,\) real numbers"),
+        (np.ones(96, np.int64), r"tensor large\.row_scale is not \(96,\) real numbers"),
+        (np.full(96, np.nan, np.float32), "tensor large holds values that are not finite"),
+        (np.full(96, 1e38, np.float32), "tensor large holds values that are not finite"),
+        (np.full(96, 1e5, np.float32), r"tensor large holds 1\.27e\+07, no trained model is above 1e\+06"),
+    ],
+)
+def test_a_scale_of_rows_that_is_wrong_is_named(scale, told, tmp_path):
+    tensors = {"large": np.full((96, 128), 127, np.int8)} | ({} if scale is None else {"large.row_scale": scale})
+    save_numpy(tensors, tmp_path / "a.safetensors")
+    with pytest.raises(ModelError, match=told):
+        checkpoint.read_weights(tmp_path / "a.safetensors", {"large": ((96, 128), True)})
+
+
+def test_a_scale_of_nothing_is_a_tensor_too_many(tmp_path):
+    save_numpy({"large": np.ones(3, np.float32), "large.row_scale": np.ones(3, np.float32)}, tmp_path / "a.safetensors")
+    with pytest.raises(ModelError, match=r"tensor large\.row_scale is not part of the configured model"):
+        checkpoint.read_weights(tmp_path / "a.safetensors", {"large": ((3,), True)})

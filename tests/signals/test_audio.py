@@ -110,5 +110,5 @@ def test_a_file_read_in_frames_is_the_file_read_at_once_and_can_start_again(tmp_
 
 @pytest.mark.parametrize("name", ["facegood_1114_3_16", "katie"])
 def test_shipped_voices_are_what_soundfile_reads(name):
-    file = data_dir("sim") / "speakers" / name / "speech.wav"
+    file = data_dir("sim") / "speakers" / name / "speech.flac"
     np.testing.assert_array_equal(read_audio(file), soundfile.read(file, dtype="float32")[0])

@@ -101,7 +101,7 @@ def found(part, whole):
 
 @pytest.mark.slow
 def test_what_is_played_is_what_is_heard(hear, play, tmp_path):
-    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")[: 3 * AUDIO_HZ]
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 3 * AUDIO_HZ]
     soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
     hearing = hear("mic:person")
     player = play("person", tmp_path / "said.wav")
@@ -173,7 +173,7 @@ def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_ser
     When the player begins nobody knows on a busy computer. So it calls first, and what it says is told for a tenth of
     a second before it will be heard.
     """
-    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")[: 6 * AUDIO_HZ]
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 6 * AUDIO_HZ]
     soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
     soundfile.write(tmp_path / "played.wav", called(CALLED_S, said), AUDIO_HZ)
     sound_server.plug("robot")

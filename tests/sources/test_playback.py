@@ -331,7 +331,7 @@ def found(part, whole):
 @pytest.mark.slow
 def test_what_is_told_to_leave_is_what_is_recorded_then(sound_server):
     """A sound server's own time stamps: of what is played, and of what its monitor records of it."""
-    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")[: 7 * AUDIO_HZ]
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 7 * AUDIO_HZ]
     with closing(open_playback("person", RecordedVoice(said))) as played:
         taken = []
 
@@ -421,7 +421,7 @@ def test_what_is_not_said_here_is_not_played(agent_audio):
 @pytest.mark.slow
 def test_what_it_plays_is_taken_out_of_what_it_hears(sound_server, tmp_path):
     """Its loudspeaker is heard by the microphone 50 ms later; nobody else speaks."""
-    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")[: 6 * AUDIO_HZ]
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 6 * AUDIO_HZ]
     soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
     sound_server.plug("robot")
     sound_server.load("module-loopback", "source=robot.monitor", "sink=person", "latency_msec=50")

@@ -342,3 +342,17 @@ def test_it_ends_with_who_began_it():
     while answers:  # its pipe is at an end: the port is given back
         with socket.socket() as asking:
             answers = asking.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_what_is_stored_packed_is_served_as_what_it_is(page):
+    url = page.url + "static/vision/vision_wasm_internal.wasm"
+    plain, headers = got(url)
+    assert headers["Content-Type"] == "application/wasm" and plain[:4] == b"\0asm"
+    assert int(headers["Content-Length"]) == len(plain) and "Content-Encoding" not in headers
+    packed, other = got(url, **{"Accept-Encoding": "gzip"})
+    assert other["Content-Encoding"] == "gzip" and gzip.decompress(packed) == plain and len(packed) < len(plain) / 2
+    assert other["ETag"] == headers["ETag"] and other["Vary"] == "Accept-Encoding"
+    with pytest.raises(HTTPError) as known:
+        got(url, **{"If-None-Match": headers["ETag"]})
+    with known.value:
+        assert known.value.code == 304

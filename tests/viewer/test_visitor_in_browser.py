@@ -1,9 +1,8 @@
 """The visitor as the person who is listened to: a browser whose microphone and camera are files."""
 
-import wave
-
 import numpy as np
 import pytest
+import soundfile
 from chromium import Page, ServedRun, missing
 
 from sfms_robot.data import data_dir
@@ -16,7 +15,7 @@ pytestmark = [
     pytest.mark.flaky(reruns=2),  # against clocks that all programs of this machine share
 ]
 
-VOICE = data_dir("sim") / "speakers" / "katie" / "speech.wav"
+VOICE = data_dir("sim") / "speakers" / "katie" / "speech.flac"
 FRAMES = 50
 
 
@@ -46,11 +45,11 @@ def film(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory, film):
-    with wave.open(str(VOICE)) as speech:
-        assert speech.getnchannels() == 1
+    voice = tmp_path_factory.mktemp("voice") / "speech.wav"  # Chromium's fake microphone plays nothing else
+    soundfile.write(voice, *soundfile.read(VOICE, dtype="int16"))
     flags = (
         "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
-        f"--use-file-for-fake-audio-capture={VOICE}", f"--use-file-for-fake-video-capture={film}",
+        f"--use-file-for-fake-audio-capture={voice}", f"--use-file-for-fake-video-capture={film}",
     )  # fmt: skip
     with (
         ServedRun(

@@ -1,18 +1,29 @@
-"""Graphs of a listener's networks, for onnxruntime."""
+"""A listener as it is shipped: graphs of its networks for onnxruntime, weights in few bits."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast, get_args
 
 from sfms_robot.config.listener_kinds import LISTENER_KINDS
 from sfms_robot.data import find
-from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.errors import ConfigError
+from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, load_config, read_weights, write_tensors
 
 
-def export_listener(name: str, out: Path | None, int8: bool) -> list[Path]:
+def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | None = None) -> list[Path]:
     """Write the graphs of a listener by shipped name or folder, below its own folder or `out`; the files written.
 
-    `int8`: those with large layers in 8 bits too. Takes a minute. Raises ConfigError, MissingExtra, ModelError.
+    `int8`: those with large layers in 8 bits too. `weight_bits`: the weights as well, stored so (8, 16 or 32: see
+    `checkpoint.write_tensors`). Takes a minute. Raises ConfigError, MissingExtra, ModelError.
     """
+    if weight_bits not in (None, *get_args(Bits)):
+        raise ConfigError(f"--weight-bits {weight_bits}: must be 8, 16 or 32")
     folder = find("listeners", name, "config.yaml")
-    return LISTENER_KINDS[load_config(folder).kind].export_folder(folder, folder if out is None else out, int8)
+    kind, target = LISTENER_KINDS[load_config(folder).kind], folder if out is None else out
+    weights = None if weight_bits is None else read_weights(folder / WEIGHTS)
+    files = kind.export_folder(folder, target, int8)
+    if weights is not None:
+        write_tensors(target / WEIGHTS, weights, cast("Bits", weight_bits))
+        files = [*files, target / WEIGHTS]
+    return files

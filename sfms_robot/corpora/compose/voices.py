@@ -25,6 +25,7 @@ from sfms_robot.signals.events import runs, voice_activity
 from sfms_robot.signals.tracks import read_track, resample
 
 # Two people in one track, hardly audible, hardly any speech, or people talking over one another.
+_SOUNDS: Final = (".wav", ".flac")
 _UNFIT: Final = (
     "katiesteve", "audio_ES2003a", "audio_EN2001b", "audio_EN2001d", "audio_EN2002", "audio_EN2009b", "pair_",
 )  # fmt: skip
@@ -60,11 +61,15 @@ class Voice:
 
 
 def find_voices(folders: Sequence[Path]) -> list[Voice]:
-    """Every WAV file in the folders, or one level below them. Raises ConfigError when there is none."""
-    files = [file for folder in folders for file in sorted([*folder.glob("*.wav"), *folder.glob("*/*.wav")])]
+    """Every WAV and FLAC file in the folders, or one level below them. Raises ConfigError when there is none."""
+    sounds = [
+        sorted(file for ending in _SOUNDS for file in [*folder.glob(f"*{ending}"), *folder.glob(f"*/*{ending}")])
+        for folder in folders
+    ]
+    files = [file for some in sounds for file in some]
     voices = [read_voice(file) for file in files if not file.stem.startswith(_UNFIT)]
     if not voices:
-        raise ConfigError(f"{', '.join(map(str, folders))}: no WAV file to take voices from")
+        raise ConfigError(f"{', '.join(map(str, folders))}: no WAV or FLAC file to take voices from")
     return voices
 
 

@@ -123,7 +123,7 @@ def save(folder: Path, model: TableModel) -> None:
     raw["model"]["kind"] = model.recipe.model.kind
     text = yaml.safe_dump(raw, sort_keys=False, width=110, default_flow_style=None)
     (folder / checkpoint.CONFIG).write_text(text, encoding="utf-8")
-    checkpoint.save_weights(folder / WEIGHTS, model, half=True)
+    checkpoint.save_weights(folder / WEIGHTS, model, bits=16)
 
 
 def read(folder: Path) -> TableModel:

@@ -50,7 +50,7 @@ def train_arig(
     outcome = fit(job, out, run)
     if run.group.first:
         checkpoint.save_config(out, listener)
-        checkpoint.save_weights(out / checkpoint.WEIGHTS, student.model.cpu(), half=True)
+        checkpoint.save_weights(out / checkpoint.WEIGHTS, student.model.cpu(), bits=16)
     parts = held_out_parts(student.to(run.device), held_out.to(run.device), phase)
     return {
         **asdict(outcome),

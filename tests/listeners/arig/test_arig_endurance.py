@@ -86,7 +86,7 @@ def minutes_of_events(minutes: float) -> list[ListenerEvent]:
 )
 def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs():
     """And beside its sway, which test_sway tells of, only nods have moved it."""
-    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.wav")
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")
     listener = load(SHIPPED).build_graphs()
     told = minutes_of_events(10)
     control = control_track(told, 0, FRAMES + 1)
