@@ -479,7 +479,7 @@ def test_minutes_below_zero_are_refused(tables):
 
 
 def test_a_folder_without_voices_is_refused(tables, tmp_path):
-    with pytest.raises(ConfigError, match="no WAV file to take voices from"):
+    with pytest.raises(ConfigError, match="no WAV or FLAC file to take voices from"):
         composed.compose(tables, [tmp_path], MOTIONS, seed=1, minutes=1)
 
 
