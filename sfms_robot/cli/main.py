@@ -118,10 +118,11 @@ def _endings_as_interrupts() -> Iterator[None]:
     who moves a head in every phase.
     """
     main_thread = threading.current_thread() is threading.main_thread()
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if main_thread and hasattr(signal, name)]
-    heeded = {number: signal.SIG_DFL for number in numbers if signal.getsignal(number) is signal.SIG_DFL}
-    if main_thread and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        heeded[signal.SIGINT] = signal.SIG_IGN
+    replaced = {"SIGINT": signal.SIG_IGN, "SIGTERM": signal.SIG_DFL, "SIGHUP": signal.SIG_DFL}
+    known = {
+        getattr(signal, name): before for name, before in replaced.items() if main_thread and hasattr(signal, name)
+    }
+    heeded = {number: before for number, before in known.items() if signal.getsignal(number) is before}
     for number in heeded:
         signal.signal(number, signal.default_int_handler)
     try:

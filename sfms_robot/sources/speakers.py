@@ -12,6 +12,7 @@ from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 
 DEFAULT_SPEAKER = "facegood_1114_3_16"
+VOICE = "speech.flac"  # in the folder of each
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Speaker:
 
 def speakers() -> list[str]:
     """Names of the shipped speakers."""
-    return shipped_names(data_dir("sim") / "speakers", "speech.flac")
+    return shipped_names(data_dir("sim") / "speakers", VOICE)
 
 
 def shipped_speaker(name: str) -> Speaker:
@@ -34,7 +35,7 @@ def shipped_speaker(name: str) -> Speaker:
         raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speakers())})")
     folder = data_dir("sim") / "speakers" / name
     face = folder / "face.csv.gz"
-    return Speaker(name, folder / "speech.flac", face if face.is_file() else None)
+    return Speaker(name, folder / VOICE, face if face.is_file() else None)
 
 
 def voice_file(name: str) -> Path | None:

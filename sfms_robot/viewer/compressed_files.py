@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 import gzip
 import lzma
-import mimetypes
 from pathlib import Path
 from typing import Final
 
 from starlette.datastructures import Headers
 from starlette.responses import FileResponse, Response
-from starlette.staticfiles import NotModifiedResponse, StaticFiles
+from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
 _LEVEL: Final = 6
@@ -28,7 +27,7 @@ class CompressedFiles(StaticFiles):
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder)
         self._folder = folder
-        self._stored = {file.relative_to(folder).with_suffix("").as_posix(): file for file in folder.rglob("*.xz")}
+        self._stored = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.xz")}
         self._packed: dict[tuple[str, float], asyncio.Task[bytes]] = {}  # by file and when it was changed
 
     def prepare(self) -> None:
@@ -38,30 +37,17 @@ class CompressedFiles(StaticFiles):
                 self._gzip(file)
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        if (stored := self._stored.get(path)) is not None and scope["method"] in ("GET", "HEAD"):
-            return await self._unpacked(path, stored, Headers(scope=scope))
-        plain = await super().get_response(path, scope)
+        stored = path in self._stored
+        plain = await super().get_response(f"{path}.xz" if stored else path, scope)
         asked = Headers(scope=scope)
-        if not isinstance(plain, FileResponse) or plain.status_code != 200 or scope["method"] != "GET":
+        if not isinstance(plain, FileResponse) or plain.status_code != 200 or (scope["method"] != "GET" and not stored):
             return plain
         plain.headers["Vary"] = "Accept-Encoding"
-        if _WITH_GZIP not in asked.get("accept-encoding", "") or "range" in asked:
-            return plain
-        packed = await self._gzip(Path(plain.path))
         headers = {name: value for name, value in plain.headers.items() if name not in _OF_PLAIN}
-        return Response(packed, headers=headers | {"Content-Encoding": _WITH_GZIP})
-
-    async def _unpacked(self, path: str, stored: Path, asked: Headers) -> Response:
-        found = stored.stat()
-        headers = {"ETag": f'"{found.st_mtime_ns:x}-{found.st_size:x}"', "Vary": "Accept-Encoding"}
-        if self.is_not_modified(Headers(headers), asked):
-            return NotModifiedResponse(Headers(headers))
-        kind = mimetypes.guess_type(path)[0]
-        if _WITH_GZIP in asked.get("accept-encoding", ""):
-            return Response(
-                await self._gzip(stored), media_type=kind, headers=headers | {"Content-Encoding": _WITH_GZIP}
-            )
-        return Response(await asyncio.to_thread(_plain, stored), media_type=kind, headers=headers)
+        if _WITH_GZIP in asked.get("accept-encoding", "") and (stored or "range" not in asked):
+            packed = await self._gzip(Path(plain.path))
+            return Response(packed, headers=headers | {"Content-Encoding": _WITH_GZIP})
+        return Response(await asyncio.to_thread(_plain, Path(plain.path)), headers=headers) if stored else plain
 
     def _gzip(self, file: Path) -> asyncio.Task[bytes]:
         key = (str(file), file.stat().st_mtime)

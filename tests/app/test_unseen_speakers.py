@@ -30,7 +30,7 @@ def test_bundled_speakers_that_are_kept_for_test_have_a_face_as_long_as_their_vo
 def test_folders_without_such_a_voice_are_named(tmp_path):
     with pytest.raises(ConfigError, match="no such folder"):
         voice_folders(Path(tmp_path / "gone"))
-    with pytest.raises(ConfigError, match=f"{tmp_path.name}: no WAV file"):
+    with pytest.raises(ConfigError, match=f"{tmp_path.name}: no WAV or FLAC file to take voices from"):
         unseen((tmp_path,))
 
 

@@ -139,7 +139,7 @@ def matrices(seed=0):
             "count": np.arange(9000).reshape(90, 100)}  # fmt: skip
 
 
-def test_large_matrices_in_8_bits_are_off_by_half_a_step_of_their_row_and_all_else_is_as_in_16(tmp_path):
+def test_large_matrices_in_8_bits_are_off_by_half_a_step_of_their_row_and_all_else_by_nothing(tmp_path):
     wanted = matrices()
     checkpoint.write_tensors(tmp_path / "a.safetensors", wanted, 8)
     shapes = {name: (value.shape, value.dtype.kind == "f") for name, value in wanted.items()}
@@ -151,8 +151,7 @@ def test_large_matrices_in_8_bits_are_off_by_half_a_step_of_their_row_and_all_el
             rows, off = (each.reshape(96, -1) for each in (value, found[name] - value))
             assert 0 < np.abs(off).max() and (np.abs(off).max(1) <= np.abs(rows).max(1) / 253).all()
         else:
-            rounded = value.astype(np.float16).astype(np.float32) if value.dtype.kind == "f" else value
-            np.testing.assert_array_equal(found[name], rounded)
+            np.testing.assert_array_equal(found[name], value)
     left = sum(value.nbytes for value in wanted.values()) - (tmp_path / "a.safetensors").stat().st_size
     assert left > 0.7 * (wanted["large"].nbytes + wanted["kernels"].nbytes)
 

@@ -45,6 +45,7 @@ def film(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory, film):
+    assert soundfile.info(VOICE).channels == 1
     voice = tmp_path_factory.mktemp("voice") / "speech.wav"  # Chromium's fake microphone plays nothing else
     soundfile.write(voice, *soundfile.read(VOICE, dtype="int16"))
     flags = (

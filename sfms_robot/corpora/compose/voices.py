@@ -24,8 +24,8 @@ from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.events import runs, voice_activity
 from sfms_robot.signals.tracks import read_track, resample
 
-# Two people in one track, hardly audible, hardly any speech, or people talking over one another.
 _SOUNDS: Final = (".wav", ".flac")
+# Two people in one track, hardly audible, hardly any speech, or people talking over one another.
 _UNFIT: Final = (
     "katiesteve", "audio_ES2003a", "audio_EN2001b", "audio_EN2001d", "audio_EN2002", "audio_EN2009b", "pair_",
 )  # fmt: skip
@@ -62,12 +62,8 @@ class Voice:
 
 def find_voices(folders: Sequence[Path]) -> list[Voice]:
     """Every WAV and FLAC file in the folders, or one level below them. Raises ConfigError when there is none."""
-    sounds = [
-        sorted(file for ending in _SOUNDS for file in [*folder.glob(f"*{ending}"), *folder.glob(f"*/*{ending}")])
-        for folder in folders
-    ]
-    files = [file for some in sounds for file in some]
-    voices = [read_voice(file) for file in files if not file.stem.startswith(_UNFIT)]
+    files = [file for folder in folders for file in sorted([*folder.glob("*"), *folder.glob("*/*")])]
+    voices = [read_voice(file) for file in files if file.suffix in _SOUNDS and not file.stem.startswith(_UNFIT)]
     if not voices:
         raise ConfigError(f"{', '.join(map(str, folders))}: no WAV or FLAC file to take voices from")
     return voices

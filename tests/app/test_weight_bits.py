@@ -1,0 +1,27 @@
+"""`export --weight-bits`: the same listener, stored in less room."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.app.export.graph_export import export_listener
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+from sfms_robot.listeners.checkpoint import WEIGHTS, read_weights
+
+
+@pytest.mark.parametrize("bits", [0, 4, 12, -8])
+def test_other_numbers_of_bits_are_refused_before_anything_is_written(bits, tmp_path):
+    with pytest.raises(ConfigError, match=f"--weight-bits {bits}: must be 8, 16 or 32"):
+        export_listener("sfms-small", tmp_path, False, bits)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_what_ships_in_8_bits_is_what_its_weights_in_32_bits_give(tmp_path):
+    shipped = data_dir("configs") / "listeners" / "sfms-small" / WEIGHTS
+    assert tmp_path / WEIGHTS in export_listener("sfms-small", tmp_path, False, 32)
+    wide, narrow = read_weights(tmp_path / WEIGHTS), read_weights(shipped)
+    assert (tmp_path / WEIGHTS).stat().st_size > 3 * shipped.stat().st_size
+    assert wide.keys() == narrow.keys()
+    for name, value in narrow.items():
+        np.testing.assert_array_equal(wide[name], value)
