@@ -185,13 +185,14 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
     control = np.zeros((1, past + ahead, heard.control.shape[1]), np.float32)
     drawn = np.repeat(np.maximum(tokens[:, -1:], 0), frames + ahead + 1, axis=1)
     shown = np.repeat(path[:, :1], frames + ahead + 1, axis=1)
+    settled = np.array([past - 1])
     for now in range(0, frames, listener.hop):  # the newest frame heard
         frames_passed = listener.hop if now else 1
         tokens, path = passed(tokens, path, frames_passed, listener.holds)
         asked = control_at(listener, dyad.events or (), now)
         if asked is not None:
             control, before = listener.told([asked]), later(control, frames_passed)
-            tokens = revoked(tokens, before, control, ahead)
+            tokens, settled = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
         seen = Seen(
             face=face[None, window],
@@ -201,6 +202,7 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             phase=phase[None, window],
             tokens=tokens,
             control=np.repeat(control, streams, axis=0),
+            settled=np.broadcast_to(settled, streams),
         )
         tokens, path = listener.plan(seen, path, seeds, [now] * streams)
         shown[:, now + 1 : now + 1 + ahead] = listener.shown(path)

@@ -21,7 +21,11 @@ LIKELIEST = 128  # classes that are looked at: what is behind them weighs next t
 
 @dataclass(frozen=True)
 class Seen:
-    """What a plan may look at: the parts of `predictor.Context`, those of the speaker of 1 or B streams."""
+    """What a plan may look at: the parts of `predictor.Context`, those of the speaker of 1 or B streams.
+
+    Attributes:
+        settled: (B,) the last frame of each window whose motion stays as it is: no new ramp begins before it.
+    """
 
     face: Floats
     face_known: NDArray[np.bool_]
@@ -30,6 +34,7 @@ class Seen:
     phase: Floats
     tokens: Tokens
     control: Floats
+    settled: Tokens
 
 
 class Sampler:
@@ -41,7 +46,7 @@ class Sampler:
         self._temperature, self._nucleus = np.float32(common.temperature), np.float32(common.nucleus)
         self._bias = np.array([group.transition_bias for group in groups], np.float32)
         self._classes = [group.codes + 1 for group in groups]
-        self._now, self._ramp = settings.past_frames - 1, settings.ramp_frames or 0
+        self._ramp = settings.ramp_frames or 0
 
     def draw(self, seen: Seen, seeds: Sequence[int], frames: Sequence[int]) -> Tokens:
         """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b has `seeds[b]` and draws for frames up
@@ -65,12 +70,12 @@ class Sampler:
             (flat,) = self._engine.run("next", slots[:, frame - window], *last, np.array([frame - 1]))
             at = frame - first + before
             now = [(told, one.wanted[:, at], one.spread[:, at]) for told, one in courses]
-            since = frame - np.maximum(last.at[..., 0], self._now if self._ramp else -1)  # no ramp began before that
+            since = frame - np.maximum(last.at[..., 0], seen.settled[:, None] if self._ramp else -1)
             drawn = self._drawn(flat, last, since, chances[:, frame - window], now)
             known = tokens[:, frame]
             tokens[:, frame] = np.where(known == UNDECIDED, drawn, known)
             last = last.then(tokens[:, frame], frame)
-        return anchored(tokens, seen.tokens == UNDECIDED, self._now, self._ramp) if self._ramp else tokens
+        return anchored(tokens, seen.tokens == UNDECIDED, seen.settled, self._ramp) if self._ramp else tokens
 
     def _chances(self, seeds: Sequence[int], frames: Sequence[int], count: int) -> Doubles:
         """(B, count, G) in 0..1 for each stream's last `count` frames."""

@@ -98,18 +98,21 @@ def _newest(tokens: Tokens) -> Tokens:
     return out
 
 
-def anchored(tokens: Tokens, drawn: NDArray[np.bool_], now: int, ramp: int) -> Tokens:
-    """Tokens (B, T, G) in which no ramp to a keyframe just `drawn`, (B, T, G), begins before `now`, the newest frame
-    that was shown: what a group held until then is a keyframe there.
+def anchored(tokens: Tokens, drawn: NDArray[np.bool_], settled: Tokens, ramp: int) -> Tokens:
+    """Tokens (B, T, G) in which no ramp to a keyframe just `drawn`, (B, T, G), begins before frame `settled` (B,): what
+    a group held until then is a keyframe there.
 
-    Without it, motion that was shown already would have been on its way to a keyframe that nobody knew of.
+    Without it, motion that was shown already would have been on its way to a keyframe that nobody knew of, and a nod
+    would begin before the time for which it was told.
     """
-    ahead = tokens[:, now + 1 : now + ramp] > 0
+    stream, frame = np.arange(len(tokens)), np.arange(tokens.shape[1])
+    new, out = drawn & (tokens > 0), tokens.copy()
+    behind = frame > settled[:, None]
+    ahead = (tokens > 0) & (behind & (frame < settled[:, None] + ramp))[..., None]
     first = ahead.argmax(1)  # the next keyframe of each group, if there is any
-    new = np.take_along_axis(drawn[:, now + 1 : now + ramp], first[:, None], axis=1)[:, 0]
-    held = _newest(tokens[:, : now + 1])
-    out = tokens.copy()
-    out[:, now] = np.where(ahead.any(1) & new, held, tokens[:, now])
+    is_new = np.take_along_axis(new, first[:, None], axis=1)[:, 0]
+    held = _newest(np.where(behind[..., None], 0, tokens))
+    out[stream, settled] = np.where(ahead.any(1) & is_new, held, tokens[stream, settled])
     return out
 
 
@@ -118,10 +121,15 @@ def later(control: Floats, frames: int = 1) -> Floats:
     return np.concatenate([control[:, frames:], np.zeros_like(control[:, :frames])], axis=1)
 
 
-def revoked(tokens: Tokens, drawn_under: Floats, told: Floats, horizon: int) -> Tokens:
-    """Tokens (B, P + H, G) without those of the future that what is told now, (B, P + H, K), has overtaken."""
+def revoked(tokens: Tokens, drawn_under: Floats, told: Floats, horizon: int) -> tuple[Tokens, Tokens]:
+    """Tokens (B, P + H, G) without those of the future that what is told now, (B, P + H, K), has overtaken.
+
+    And (B,) the last frame of each stream that is settled: the one before those overtaken, else the newest shown.
+    """
     changed = (np.abs(told - drawn_under)[:, -horizon:] > SAME).any(-1)
     stale: NDArray[Any] = np.logical_or.accumulate(changed, axis=1)
     stale[:, :KEPT_FRAMES] = False
     future = np.where(stale[..., None], UNDECIDED, tokens[:, -horizon:])
-    return np.concatenate([tokens[:, :-horizon], future], axis=1)
+    overtaken = stale & (tokens[:, -horizon:, 0] != UNDECIDED)
+    settled = tokens.shape[1] - horizon - 1 + np.where(overtaken.any(1), overtaken.argmax(1), 0)
+    return np.concatenate([tokens[:, :-horizon], future], axis=1), settled

@@ -4,7 +4,8 @@ Tokens once drawn stay drawn while what they were drawn for holds: a new plan ke
 draws only the `hop` frames at its far end. So a keyframe is decided (future - hop) to future frames ahead, 0.16 to
 0.32 s with hop 4, and re-planning cannot jitter. A listener that is told of events compares what it is told now with
 what the tokens were drawn under: from the first future frame on for which that differs they are drawn anew, but never
-the next frame's, which servos are already under way to. What is behind the last keyframe drawn is an extrapolation,
+the next frame's, which servos are already under way to. Frames that are kept show what they showed: the way to a
+keyframe behind them begins at the last of them. What is behind the last keyframe drawn is an extrapolation,
 which the next plan may correct: it starts where the motion was, at the speed it had, and the difference fades over
 `seam_frames`.
 
@@ -251,11 +252,10 @@ class SfmsListener(RunsOnEngine):
         """Plans of streams that have heard all up to now, told (B, P + H, K), and their memories with them."""
         tokens, path, control = self._moved_on(memories)
         speakers, seen = self._taken_in([memory.speaker for memory in memories])
-        tokens = revoked(tokens, control, told, self.horizon)
+        tokens, settled = revoked(tokens, control, told, self.horizon)
         newest = [memory.frames - 1 for memory in memories]
-        tokens, path = self.plan(
-            Seen(**seen, tokens=tokens, control=told), path, [memory.seed for memory in memories], newest
-        )
+        window = Seen(**seen, tokens=tokens, control=told, settled=settled)
+        tokens, path = self.plan(window, path, [memory.seed for memory in memories], newest)
         sway = _stacked([memory.sway for memory in memories])
         plans = self._plans(times_s, self.with_sway(self.shown(path), sway, np.array(newest) + 1))
         after = [

@@ -48,7 +48,7 @@ def offline(listener, speaker, seed):
         own = tokens[None, past.start : past.stop + h].clone()
         own[:, p + decided - (now + 1) :] = UNDECIDED
         parts = [x[None, past].numpy() for x in (face, known, voice, known, place)]
-        seen = Seen(*parts, own.numpy(), np.zeros((1, p + h, 0), np.float32))
+        seen = Seen(*parts, own.numpy(), np.zeros((1, p + h, 0), np.float32), np.array([p - 1]))
         drawn = torch.from_numpy(listener.sampler.draw(seen, [seed], [now + h]))
         tokens[past.stop : past.stop + h] = drawn[0, p:]
         decided = now + 1 + h

@@ -97,7 +97,8 @@ def test_tokens_are_revoked_from_the_first_future_frame_that_is_told_otherwise()
     told[0, 43, 5] = 0.5  # of frame 3 of the future, and of that alone
     told[1, 40, 5] = 0.5  # of the next frame, which stays nevertheless
     told[:, 10] = 1.0  # what is past is past
-    after = revoked(tokens, before, told, 8)
+    after, settled = revoked(tokens, before, told, 8)
+    assert settled.tolist() == [42, 40]
     assert (after[0, 43:] == UNDECIDED).all() and (after[0, :43] == 1).all()
     assert (after[1, 40 + KEPT_FRAMES :] == UNDECIDED).all() and (after[1, : 40 + KEPT_FRAMES] == 1).all()
 
