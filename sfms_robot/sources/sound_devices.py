@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Final, Literal
 
+from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.sources.speakers import speakers
 
 _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
 _HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # numbers that change when something is plugged in
@@ -100,7 +100,7 @@ def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays:
     Raises PortError where there are none, ConfigError for a name that is not there or fits several, with the choices.
     """
     if not devices:
-        choices = "leave it out" if plays else ", ".join(("FILE.wav", *speakers(), "none"))
+        choices = "leave it out" if plays else ", ".join(("FILE.wav", *speaker_names(), "none"))
         missing = "loudspeaker" if plays else "microphone"
         raise PortError(f"{flag}: this computer has no {missing}, or its sound server does not run ({choices})")
     fitting = _fitting(devices, wanted)
