@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import HeadOptions, OpenHead, Programme, build_bus, build_motion, drive_head
+from sfms_robot.app.open_head import HeadOptions, OpenHead, build_bus, build_motion
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
 from sfms_robot.config.calibrate_first import held_back

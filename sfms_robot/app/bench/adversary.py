@@ -16,7 +16,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from sfms_robot.app.bench.measure import Row
-from sfms_robot.app.session import Motion, build_motion
+from sfms_robot.app.open_head import Motion, build_motion
 from sfms_robot.config import load_head
 from sfms_robot.data import head_names
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan

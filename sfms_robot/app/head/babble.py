@@ -15,7 +15,8 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.app.head.pose import NobodyThere, WholeTimeline
-from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats

@@ -13,7 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame

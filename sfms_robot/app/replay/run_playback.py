@@ -17,8 +17,9 @@ import numpy as np
 from sfms_robot.app.head.pose import NobodyThere, WholeTimeline
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.report import figures_so_far
+from sfms_robot.app.open_head import HeadOptions, open_head
 from sfms_robot.app.replay.run_file import RunRecording, read_recording
-from sfms_robot.app.session import HeadOptions, Panel, Programme, drive_head, open_head, run_log
+from sfms_robot.app.session import Panel, Programme, drive_head, run_log
 from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
