@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from sfms_robot.errors import ConfigError
+
+SPEAKER_VOICE: Final = "speech.flac"  # in the folder of each shipped speaker
 
 Shipped = Literal["configs", "firmware_maps", "sim"]
 
@@ -28,6 +30,21 @@ def data_dir(name: Shipped) -> Path:
 def shipped_names(folder: Path, marker: str) -> list[str]:
     """Names of the folders in `folder` that hold a file called `marker`, sorted."""
     return sorted(path.parent.name for path in folder.glob(f"*/{marker}"))
+
+
+def head_names() -> list[str]:
+    """Of the shipped heads."""
+    return shipped_names(data_dir("configs") / "heads", "head.yaml")
+
+
+def listener_names() -> list[str]:
+    """Of the shipped listeners."""
+    return shipped_names(data_dir("configs") / "listeners", "config.yaml")
+
+
+def speaker_names() -> list[str]:
+    """Of the people who ship with the package."""
+    return shipped_names(data_dir("sim") / "speakers", SPEAKER_VOICE)
 
 
 def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:

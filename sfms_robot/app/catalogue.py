@@ -8,16 +8,15 @@ from typing import Any
 
 from sfms_robot.config import load_head
 from sfms_robot.config.listener_kinds import load_listener
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.sound_devices import SoundDevice
-from sfms_robot.sources.speakers import shipped_speaker, speakers
+from sfms_robot.sources.speakers import shipped_speaker
 
 
 def shipped_heads() -> list[dict[str, Any]]:
     """What `head list` shows."""
-    names = shipped_names(data_dir("configs") / "heads", "head.yaml")
-    heads = [load_head(name) for name in names]
+    heads = [load_head(name) for name in head_names()]
     return [
         {
             "name": head.name,
@@ -34,7 +33,7 @@ def shipped_listeners() -> list[dict[str, Any]]:
     """What `listener list` shows."""
     folder = data_dir("configs") / "listeners"
     rows = []
-    for name in shipped_names(folder, "config.yaml"):
+    for name in listener_names():
         config = load_listener(folder / name / "config.yaml")
         rows.append(
             {
@@ -52,7 +51,7 @@ def shipped_speakers() -> list[dict[str, Any]]:
     import soundfile
 
     rows = []
-    for name in speakers():
+    for name in speaker_names():
         speaker = shipped_speaker(name)
         title = (speaker.audio.parent / "SOURCE.md").read_text(encoding="utf-8").splitlines()[0]
         rows.append(

@@ -10,15 +10,15 @@ from typing import Any
 
 import typer
 
-from sfms_robot.cli import names
+from sfms_robot.data import head_names, listener_names
 
 # A lively one of the ten that `--seeds 10` tries: it nods 7 times, they 4.4 times in the mean.
 DEFAULT_SEED = 1
 
 
 def demo(
-    head: str = typer.Option("face28", autocompletion=names.heads, help="Shipped head, or a folder with a head.yaml."),
-    listener: str = typer.Option("sfms-small", autocompletion=names.listeners, help="Shipped listener, or a folder."),
+    head: str = typer.Option("face28", autocompletion=head_names, help="Shipped head, or a folder with a head.yaml."),
+    listener: str = typer.Option("sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder."),
     seed: int = typer.Option(DEFAULT_SEED, min=0, max=2**32 - 1, help="Two seeds listen differently."),
     duration: float | None = typer.Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
     fast: bool = typer.Option(False, "--fast", help="Virtual time: as fast as it goes."),

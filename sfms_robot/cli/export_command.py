@@ -7,12 +7,12 @@ from pathlib import Path
 
 import typer
 
-from sfms_robot.cli import names
+from sfms_robot.data import listener_names
 
 
 def export(
     listener: str = typer.Argument(
-        ..., autocompletion=names.listeners, help="Shipped listener, or a folder with config.yaml."
+        ..., autocompletion=listener_names, help="Shipped listener, or a folder with config.yaml."
     ),
     out: Path | None = typer.Option(None, metavar="DIR", help="Write below this folder. Default: the listener's own."),
     int8: bool = typer.Option(False, "--int8", help="Also with large layers in 8 bits (kind: arig), for large models."),

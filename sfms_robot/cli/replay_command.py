@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from sfms_robot.cli import names
+from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 
 
@@ -22,7 +22,7 @@ def replay(
         None, help="Drive a head with the recorded face: 'sim', 'auto', a device, or NAME=DEVICE per bus."
     ),
     head: str | None = typer.Option(
-        None, autocompletion=names.heads, help="With --port: another head than the recorded one."
+        None, autocompletion=head_names, help="With --port: another head than the recorded one."
     ),
     fast: bool = typer.Option(False, "--fast", help="With --port sim: virtual time."),
     yes: bool = typer.Option(False, "--yes", help="With --port: hobby servos may jump when they come on."),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from sfms_robot.cli import names
+from sfms_robot.data import head_names, listener_names, speaker_names
 
 if TYPE_CHECKING:
     from sfms_robot.config import Calmness
@@ -26,7 +26,7 @@ OPTIONAL = {
 
 def run(
     head: str = typer.Option(
-        "face28", autocompletion=names.heads, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
+        "face28", autocompletion=head_names, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
     ),
     port: str = typer.Option(
         "sim",
@@ -41,7 +41,7 @@ def run(
     ),
     audio: str = typer.Option(
         "default",
-        autocompletion=names.speakers,
+        autocompletion=speaker_names,
         rich_help_panel=PERSON,
         metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|none",
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
@@ -56,7 +56,7 @@ def run(
     ),
     agent_audio: str = typer.Option(
         "none",
-        autocompletion=names.speakers,
+        autocompletion=speaker_names,
         rich_help_panel=PERSON,
         metavar="FILE.wav|device:DEVICE|NAME|tcp[:[HOST:]PORT]|none",
         help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, a "
@@ -73,7 +73,7 @@ def run(
     ),
     listener: str = typer.Option(
         "sfms-small",
-        autocompletion=names.listeners,
+        autocompletion=listener_names,
         rich_help_panel=LISTENER,
         help="Shipped listener, a folder with config.yaml and weights, or zenoh/NAME on a machine that serves it.",
     ),

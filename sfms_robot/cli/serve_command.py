@@ -10,12 +10,12 @@ from pathlib import Path
 
 import typer
 
-from sfms_robot.cli import names
+from sfms_robot.data import listener_names
 
 
 def serve(
     listener: str = typer.Option(
-        "sfms-small", autocompletion=names.listeners, help="Shipped listener, or a folder with config.yaml and weights."
+        "sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder with config.yaml and weights."
     ),
     name: str | None = typer.Option(None, help="What robots ask for, zenoh/NAME. Default: the listener's name."),
     zenoh: Path | None = typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from sfms_robot.config.base import Model, NonNegative
-from sfms_robot.config.listener import Count, Listener
+from sfms_robot.config.listener import Count, Listener, check_heads
 
 # Conversational states (3.3), in the order of the model's classes.
 STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
@@ -107,8 +107,7 @@ class Arig(Listener):
 
     @model_validator(mode="after")
     def _heads_fit(self) -> Arig:
-        if self.width % (2 * self.heads):
-            raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        check_heads(self.heads, width=self.width)
         return self
 
     @model_validator(mode="after")

@@ -94,6 +94,13 @@ class Sampling(Model):
     smile: SmileCourse | None = None
 
 
+def check_heads(heads: int, **widths: int) -> None:
+    """Raises ValueError for a width, by its key, that cannot be cut into `heads` heads of even width."""
+    for key, width in widths.items():
+        if width % (2 * heads):
+            raise ValueError(f"{key} {width} is not a multiple of twice heads ({heads})")
+
+
 class Scores(Model):
     """The network that ranks keyframes, of the learned placements. `sweeps`: rounds of second thoughts of `learned`."""
 
@@ -104,8 +111,7 @@ class Scores(Model):
 
     @model_validator(mode="after")
     def _heads_fit(self) -> Scores:
-        if self.width % (2 * self.heads):
-            raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        check_heads(self.heads, width=self.width)
         return self
 
 
@@ -233,9 +239,7 @@ class Sfms(Listener):
             raise ValueError(f"wav2vec2: audio is {self.audio}, which needs no model")
         if self.hop_frames > self.future_frames:
             raise ValueError(f"hop {self.hop} is above future_frames {self.future_frames}")
-        for key, width in (("tokenizer_width", self.tokenizer_width), ("predictor_width", self.predictor_width)):
-            if width % (2 * self.heads):
-                raise ValueError(f"{key} {width} is not a multiple of twice heads ({self.heads})")
+        check_heads(self.heads, tokenizer_width=self.tokenizer_width, predictor_width=self.predictor_width)
         return self
 
     @property

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from sfms_robot.config.base import Model
-from sfms_robot.config.listener import Count, Sfms
+from sfms_robot.config.listener import Count, Sfms, check_heads
 from sfms_robot.config.training import TokenizerTraining
 
 HALVINGS = 3  # of time, in a grouped tokenizer: 8 frames to a code
@@ -37,8 +37,7 @@ class Baseline(Model):
 
     @model_validator(mode="after")
     def _heads_fit(self) -> Baseline:
-        if self.width % (2 * self.heads):
-            raise ValueError(f"width {self.width} is not a multiple of twice heads ({self.heads})")
+        check_heads(self.heads, width=self.width)
         return self
 
 

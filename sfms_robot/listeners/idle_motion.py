@@ -23,12 +23,12 @@ import numpy as np
 
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import MOTION_DIM, SHAPES, Doubles, Floats
+from sfms_robot.listeners.spectral_lines import as_cosines, set_in, sum_of_lines
 
 FILE: Final = "idle_motion.safetensors"  # in a listener's folder; without it a listener has none
 BANDS_HZ: Final = (0.04, 0.4, 0.75, 1.25, 2.0, 3.0, 5.0, 8.0)  # edges
 BANDS: Final = len(BANDS_HZ) - 1
 LINES: Final = 3  # of each band
-EASE_S: Final = 3.0
 LARGEST: Final = 0.5  # no resting face moves so far
 _SEED: Final = 0x1D1E  # apart from what else a stream draws by its seed
 _COUNT: Final = MOTION_DIM - SHAPES.start
@@ -49,11 +49,8 @@ class IdleStream:
 
     def added(self, frames: Floats, times_s: Doubles) -> Floats:
         """Motion (N, 58) with the idle motion of times (N,) since the stream began: a new array."""
-        turn = times_s[:, None, None] * self.frequency
-        turn -= self.phase
-        parts = (self.size * np.cos(turn, out=turn)).sum(1)  # (N, K)
-        begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
-        eased = (parts @ self.loadings + self.rest) * (begun**2 * (3 - 2 * begun))[:, None]
+        parts = sum_of_lines(times_s, self.frequency, self.size, self.phase)  # (N, K)
+        eased = (parts @ self.loadings + self.rest) * set_in(times_s)[:, None]
         out = frames.copy()
         out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + eased, 0), 1)
         return out
@@ -84,9 +81,9 @@ class IdleMotion:
         size = math.exp(self.spread * rng.standard_normal() - self.spread**2)  # of power 1 in the mean
         factors = size * rng.standard_normal((2, bands, LINES, parts)) * (self.amplitude / math.sqrt(LINES))[:, None]
         cosine, sine = factors.reshape(2, bands * LINES, parts)
-        size, phase = np.hypot(cosine, sine), np.arctan2(sine, cosine)
+        sizes, phase = as_cosines(cosine, sine)
         frequency = 2 * math.pi * frequency_hz.reshape(-1, parts)
-        return IdleStream(frequency, size, phase, self.loadings.astype(np.float64), self.rest.astype(np.float64))
+        return IdleStream(frequency, sizes, phase, self.loadings.astype(np.float64), self.rest.astype(np.float64))
 
     def save(self, file: Path) -> None:
         """Raises ModelError where it cannot be written."""

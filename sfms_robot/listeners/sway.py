@@ -7,7 +7,7 @@ heads do (Shinozuka's spectral representation of a stationary process),
 
     x(t) = size * sum over lines l of  2^1/2 M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l in R^S
 
-of which every line is one cosine a channel, |(Ma, Mb)| cos(2 pi f t - atan2(Mb, Ma)): as such it is kept.
+of which every line is one cosine a channel (`spectral_lines`).
 
 `LINES` frequencies drawn from each of the `BANDS_HZ`, `M M^T` of each band what heads do together there: who leans
 forward also comes down. Over the lines of a band sum a a^T + b b^T = 1: which way a head goes is by lot, how far it
@@ -28,12 +28,12 @@ from sfms_robot import config
 from sfms_robot.frames import FRAME_S, Doubles, Floats
 from sfms_robot.listeners.head_channels import head_channels, lateral_channels
 from sfms_robot.listeners.lots import Use, normals, uniforms
+from sfms_robot.listeners.spectral_lines import as_cosines, set_in, sum_of_lines
 
 BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1
 LINES = 6  # of each band; twice as many are no fewer than channels of a head
 WIDEST = 2.0  # deviations by which a manner is off the mean one, at most
-EASE_S = 3.0
 
 
 class HeadSway:
@@ -87,7 +87,7 @@ def draw_sway(mixture: Floats, spread: float, seed: int, lateral: Sequence[int] 
     factors *= math.sqrt(2) * math.exp(spread * min(max(drawn[0], -WIDEST), WIDEST))
     if uniform[0] < 0.5:
         factors[..., list(lateral)] *= -1
-    size, phase = np.hypot(*factors), np.arctan2(factors[1], factors[0])
+    size, phase = as_cosines(*factors)
     turns = np.broadcast_to(2 * math.pi * frequency_hz[..., None], size.shape)
     return np.stack([turns, size, phase]).reshape(3, bands * LINES, channels)
 
@@ -96,9 +96,5 @@ def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
     """Sway (..., 3, L, S) at times (T,) since the stream began, or (..., T) of each -> (..., T, S) in units of the
     motion; 0 before that.
     """
-    frequency, size, phase = (sway[..., None, part, :, :] for part in range(3))  # (..., 1, L, S)
-    turn = times_s[..., None, None] * frequency  # (..., T, L, S)
-    turn -= phase
-    wave = size * np.cos(turn, out=turn)
-    begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
-    return np.asarray(wave.sum(-2) * (begun**2 * (3 - 2 * begun))[..., None], np.float32)
+    frequency, size, phase = (sway[..., part, :, :] for part in range(3))
+    return np.asarray(sum_of_lines(times_s, frequency, size, phase) * set_in(times_s)[..., None], np.float32)

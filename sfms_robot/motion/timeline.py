@@ -34,7 +34,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats, Plan
-from sfms_robot.signals.minimum_jerk import minimum_jerk
+from sfms_robot.signals.minimum_jerk import ease
 
 BLEND_FRAMES = 2
 STALL_S = 0.5  # without a plan for this long, ease to neutral
@@ -347,8 +347,7 @@ def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:
     np.maximum(out, curve.low[piece], out=out)
     np.minimum(out, curve.high[piece], out=out)
     if float(asked_s.max()) > curve.made_at_s + STALL_S:
-        u = np.clip((asked_s - curve.made_at_s - STALL_S) / EASE_S, 0.0, 1.0)
-        out *= (1 - minimum_jerk(u))[:, None]
+        out *= (1 - ease((asked_s - curve.made_at_s - STALL_S) / EASE_S))[:, None]
     return out
 
 

@@ -8,13 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfms_robot.frames import Doubles
-
-
-def smooth(share: Doubles) -> Doubles:
-    """0..1 -> 0..1 with neither speed nor acceleration at the ends; held outside."""
-    s = np.minimum(np.maximum(share, 0.0), 1.0)
-    eased: Doubles = s * s * s * (10.0 + s * (6.0 * s - 15.0))
-    return eased
+from sfms_robot.signals.minimum_jerk import ease
 
 
 @dataclass(frozen=True)
@@ -38,6 +32,6 @@ class Jump:
 
     def at(self, times_s: Doubles) -> Doubles:
         """Directions (N, 2) at (N,) instants."""
-        share = smooth((times_s - self.began_s) / self.duration_s)[:, None]
+        share = ease((times_s - self.began_s) / self.duration_s)[:, None]
         direction: Doubles = self.start_rad + share * (self.end_rad - self.start_rad)
         return direction

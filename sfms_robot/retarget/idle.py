@@ -18,8 +18,9 @@ import numpy as np
 
 from sfms_robot.config import Idle
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
-from sfms_robot.retarget.eyes import Jump, smooth
+from sfms_robot.retarget.eyes import Jump
 from sfms_robot.signals.eye_angles import directions, turn
+from sfms_robot.signals.minimum_jerk import ease
 
 ENOUGH = 0.8  # a listener with this share of the wanted blinks gets none added
 CLOSING_S, CLOSED_S, OPENING_S = 0.08, 0.04, 0.18  # a spontaneous blink, whole and a little slow for lid servos
@@ -104,7 +105,7 @@ class IdleFiller:
             return motion
         waves = np.sin(2 * math.pi * _HZ * times_s[:, None, None] + self._phases) @ _SIZES  # (N, 3)
         out = motion.copy()
-        out[:, _HEAD] += (float(smooth(np.array(state.head))) * self._head_rad * waves).astype(np.float32)
+        out[:, _HEAD] += (float(ease(np.array(state.head))) * self._head_rad * waves).astype(np.float32)
         return out
 
     def look(self, motion: Floats, times_s: Doubles, state: IdleState) -> Floats:
@@ -115,12 +116,12 @@ class IdleFiller:
             return motion
         out = motion.copy()
         if state.eyes and self._glance_rad:
-            aside_rad = float(smooth(np.array(state.eyes))) * state.glance.at(times_s)
+            aside_rad = float(ease(np.array(state.eyes))) * state.glance.at(times_s)
             turn(out, directions(motion, self._full_rad) + aside_rad[:, None], self._full_rad)
         if open_eyed:
             return out
-        opening = smooth((since_s - CLOSING_S - CLOSED_S) / OPENING_S)
-        lid = (smooth(since_s / CLOSING_S) - opening).astype(np.float32)
+        opening = ease((since_s - CLOSING_S - CLOSED_S) / OPENING_S)
+        lid = (ease(since_s / CLOSING_S) - opening).astype(np.float32)
         out[:, _BLINKS] = np.maximum(out[:, _BLINKS], lid[:, None])
         return out
 

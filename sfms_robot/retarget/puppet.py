@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, POSE, SHAPES, Doubles, Floats
-from sfms_robot.retarget.eyes import smooth
 from sfms_robot.signals.eye_angles import directions, turn
+from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.25  # listener -> face
 CHANGE_S: Final = 0.12  # one face asked for -> the next; straight, so that a stream of them flows
@@ -59,8 +59,8 @@ class Ramp:
     def at(self, times_s: Doubles) -> Doubles:
         """(N, C)."""
         times = times_s[:, None]
-        risen = self.start + (1.0 - self.start) * smooth((times - self.began_s) / self.rise_s)
-        weight: Doubles = risen * (1.0 - smooth((times - self.until_s) / self.fall_s))
+        risen = self.start + (1.0 - self.start) * ease((times - self.began_s) / self.rise_s)
+        weight: Doubles = risen * (1.0 - ease((times - self.until_s) / self.fall_s))
         return weight
 
     def hold(self, which: Bools, now_s: float, seconds: Doubles | float) -> Ramp:
@@ -115,7 +115,7 @@ class Turn:
 
     def directions_rad(self, times_s: Doubles) -> Doubles:
         """(N, 2)."""
-        share = smooth((times_s - self.since_s) / self.ramp.rise_s)[:, None]
+        share = ease((times_s - self.since_s) / self.ramp.rise_s)[:, None]
         direction: Doubles = self.before_rad + share * (self.after_rad - self.before_rad)
         return direction
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from sfms_robot.frames import Doubles
-from sfms_robot.runtime.safety import smooth
+from sfms_robot.signals.minimum_jerk import ease
 
 FADE_S: Final = 0.5
 
@@ -21,7 +21,7 @@ class Fade:
 
     def at(self, times_s: Doubles) -> Doubles:
         """(N,) at (N,) instants."""
-        share: Doubles = self.before + (self.after - self.before) * smooth((times_s - self.since_s) / FADE_S)
+        share: Doubles = self.before + (self.after - self.before) * ease((times_s - self.since_s) / FADE_S)
         return share
 
     def toward(self, share: float, times_s: Doubles) -> Fade:

@@ -40,8 +40,9 @@ from sfms_robot.runtime.heat import Heat, HeatGuard, temperatures_C
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
 from sfms_robot.runtime.presence import Presence
-from sfms_robot.runtime.safety import EASE_S, come_to_rest, smooth
+from sfms_robot.runtime.safety import EASE_S, come_to_rest
 from sfms_robot.runtime.states import RunState, Situation, following
+from sfms_robot.signals.minimum_jerk import ease
 
 LOOK_S: Final = 0.1  # between two looks at what is lost
 WARMTH_S: Final = 1.0  # and at how warm servos are
@@ -280,7 +281,7 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     angles_rad, retargeter = parts.retargeter.step(motion[1:], state.retargeter, knobs)
     if not state.heat.none:
         angles_rad = parts.rest_rad + state.heat.share * (angles_rad - parts.rest_rad)
-    eased = smooth((now_s + period_s - state.since_s) / EASE_S)
+    eased = ease((now_s + period_s - state.since_s) / EASE_S)
     ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)

@@ -7,7 +7,7 @@ import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import Bus, Limiter
 from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.signals.minimum_jerk import minimum_jerk
+from sfms_robot.signals.minimum_jerk import ease
 
 EASE_S: Final = 1.0  # torque-on pose -> live face, and live face -> rest
 REST_LIMIT_S: Final = 60.0  # of the whole way to rest; twice what the slowest joint of a shipped head may need
@@ -24,15 +24,8 @@ STANDS_RAD: Final = 0.01  # of a servo: its gear and its load leave it a little 
 FOLLOW_S: Final = 0.3  # that servos are given after their goals have arrived
 FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
 
-T = TypeVar("T", float, Doubles)
 Seen = Callable[[float, float, Doubles, Mapping[str, Reading]], None]  # time, share of the way ahead, goals, readings
 logger = logging.getLogger(__name__)
-
-
-def smooth(u: T) -> T:
-    """0 -> 0, 1 -> 1 with speed and acceleration zero at both ends (quintic)."""
-    u = np.clip(u, 0.0, 1.0)
-    return minimum_jerk(u)
 
 
 def come_to_rest(
@@ -60,7 +53,7 @@ def come_to_rest(
     for tick in ticks:
         began_s = tick.time_s if began_s is None else began_s
         since_s = tick.time_s - began_s
-        before, angle, ahead = (smooth((since_s + k * log.period_s) / EASE_S) for k in (-1, 0, 1))
+        before, angle, ahead = (ease((since_s + k * log.period_s) / EASE_S) for k in (-1, 0, 1))
         speed, acceleration = (ahead - before) / (2 * log.period_s), (ahead - 2 * angle + before) / log.period_s**2
         reference = np.stack([from_rad + angle * span, speed * span, acceleration * span])
         arrived = False

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sfms_robot.frames import FRAME_S, Doubles, Floats
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.hats import hats
 from sfms_robot.signals.voice_activity import Ear
 
 GAP_FRAMES: Final = 5  # this many silent frames, 0.2 s, end a phrase
@@ -33,7 +34,6 @@ LONGEST: Final = round(
 _OF_SPEECH: Final = slice(0, len(SPEECH_KNOTS_S))
 _OF_SILENCE: Final = slice(_OF_SPEECH.stop, _OF_SPEECH.stop + len(SILENCE_KNOTS_S))
 _OF_LAST: Final = slice(_OF_SILENCE.stop, FEATURES)
-_SOFT_S: Final = 0.2  # the grid is logarithmic from here up
 
 
 @dataclass(frozen=True)
@@ -152,16 +152,8 @@ def features(times_s: Doubles) -> Floats:
     """Seconds (N, 3) -> (N, 21): hats of speech (none in silence), silence, last phrase (none before it)."""
     speech, silence, last = times_s.T
     parts = [
-        _hats(speech, SPEECH_KNOTS_S) * (speech > 0)[:, None],
-        _hats(silence, SILENCE_KNOTS_S),
-        _hats(last, PHRASE_KNOTS_S) * (last > 0)[:, None],
+        hats(speech, SPEECH_KNOTS_S) * (speech > 0)[:, None],
+        hats(silence, SILENCE_KNOTS_S),
+        hats(last, PHRASE_KNOTS_S) * (last > 0)[:, None],
     ]
     return np.concatenate(parts, axis=1).astype(np.float32)
-
-
-def _hats(values: Doubles, knots_s: Sequence[float]) -> Doubles:
-    """(N,) -> (N, K): weights of the two neighbouring knots, adding up to 1; beyond the last knot that one alone."""
-    at = np.log1p(np.minimum(values, knots_s[-1]) / _SOFT_S)
-    knots = np.log1p(np.array(knots_s) / _SOFT_S)
-    place = np.interp(at, knots, np.arange(len(knots)))
-    return np.asarray(np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(len(knots)))))

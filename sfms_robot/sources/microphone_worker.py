@@ -16,10 +16,17 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import PortError
-from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.frames import Floats
 from sfms_robot.sources.front_end import FrontEnd, Heard, ToldSpeech
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.sound_devices import SoundDevice, choose_device, portaudio, recording_devices, why_not_opened
+from sfms_robot.sources.sound_devices import (
+    SoundDevice,
+    accepted_format,
+    choose_device,
+    portaudio,
+    recording_devices,
+    why_not_opened,
+)
 
 LOST_S: Final = 0.2
 STATISTICS_S: Final = 1.0
@@ -200,7 +207,7 @@ def open_capture(wanted: str, flag: str) -> Capture:
     devices = recording_devices(flag)
     device = choose_device(devices, wanted, flag)
     try:
-        rate_hz, channels = _format(device)
+        rate_hz, channels = accepted_format(device, (1, device.channels), sounddevice.check_input_settings)
         for _ in range(_STARTS):
             capture = Capture(device, rate_hz, channels)
             if capture.start():
@@ -208,21 +215,6 @@ def open_capture(wanted: str, flag: str) -> Capture:
     except sounddevice.PortAudioError as error:
         raise PortError(f"{flag}: {device.name} cannot be opened, {why_not_opened(error)}") from error
     raise PortError(f"{flag}: {device.name} is open, but gives no sound ({_others(devices, device)})")
-
-
-def _format(device: SoundDevice) -> tuple[float, int]:
-    """Rate and channels that it takes. Raises PortAudioError: it takes none."""
-    import sounddevice
-
-    wishes = [(rate, channels) for rate in (AUDIO_HZ, device.rate_hz) for channels in (1, device.channels)]
-    with device.selected():
-        for rate_hz, channels in wishes[:-1]:
-            try:
-                sounddevice.check_input_settings(device.number, channels, "float32", samplerate=rate_hz)
-                return rate_hz, channels
-            except (sounddevice.PortAudioError, ValueError):
-                continue
-    return wishes[-1]
 
 
 def _others(devices: Sequence[SoundDevice], device: SoundDevice) -> str:

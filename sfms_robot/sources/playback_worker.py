@@ -16,9 +16,16 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import PortError
-from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.frames import Floats
 from sfms_robot.sources.playout import Playout, Silence
-from sfms_robot.sources.sound_devices import SoundDevice, choose_device, playing_devices, portaudio, why_not_opened
+from sfms_robot.sources.sound_devices import (
+    SoundDevice,
+    accepted_format,
+    choose_device,
+    playing_devices,
+    portaudio,
+    why_not_opened,
+)
 
 FLAG: Final = "--play"
 LOST_S: Final = 0.5  # a busy computer is none that is gone
@@ -159,7 +166,8 @@ def open_loudspeaker(wanted: str) -> PlaybackStream:
     sounddevice = portaudio(FLAG)
     device = choose_device(playing_devices(FLAG), wanted, FLAG, plays=True)
     try:
-        rate_hz, channels = _format(device)
+        counts = (1, min(_PLAYED, device.channels), device.channels)
+        rate_hz, channels = accepted_format(device, counts, sounddevice.check_output_settings)
         for _ in range(_STARTS):
             stream = PlaybackStream(device, rate_hz, channels)
             if stream.start():
@@ -167,19 +175,3 @@ def open_loudspeaker(wanted: str) -> PlaybackStream:
     except sounddevice.PortAudioError as error:
         raise PortError(f"{FLAG}: {device.name} cannot be opened, {why_not_opened(error)}") from error
     raise PortError(f"{FLAG}: {device.name} is open, but takes no sound")
-
-
-def _format(device: SoundDevice) -> tuple[float, int]:
-    """Rate and channels that it takes. Raises PortAudioError: it takes none."""
-    import sounddevice
-
-    channels = (1, min(_PLAYED, device.channels), device.channels)
-    wishes = [(rate, count) for rate in (AUDIO_HZ, device.rate_hz) for count in channels]
-    with device.selected():
-        for rate_hz, count in wishes[:-1]:
-            try:
-                sounddevice.check_output_settings(device.number, count, "float32", samplerate=rate_hz)
-                return rate_hz, count
-            except (sounddevice.PortAudioError, ValueError):
-                continue
-    return wishes[-1]

@@ -14,8 +14,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, speakers, voice_file
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, voice_file
 
 if TYPE_CHECKING:
     from sfms_robot.ports import Source, Voice
@@ -77,11 +78,12 @@ def check_source(
     the choices.
     """
     known = source_kinds() if kinds is None else kinds
-    _check("--audio", audio, known.voices, voice_file(audio), ["FILE.wav", "none", "default", *speakers()])
+    speakers = speaker_names()
+    _check("--audio", audio, known.voices, voice_file(audio), ["FILE.wav", "none", "default", *speakers])
     _check("--face", face, known.sights, _existing(face), ["FILE.csv", "FILE.csv.gz", "none", "auto"])
-    _check("--agent-audio", agent_audio, known.agent_voices, voice_file(agent_audio), ["FILE.wav", "none", *speakers()])
+    _check("--agent-audio", agent_audio, known.agent_voices, voice_file(agent_audio), ["FILE.wav", "none", *speakers])
     if play is not None and (agent_audio == "none" or split_kind(agent_audio)[0] == "device"):
-        choices = ", ".join(["FILE.wav", "tcp", *speakers()])
+        choices = ", ".join(["FILE.wav", "tcp", *speakers])
         raise ConfigError(f"--play {play}: nothing is played of --agent-audio {agent_audio} ({choices})")
 
 

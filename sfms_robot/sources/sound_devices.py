@@ -9,14 +9,15 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Final, Literal
 
+from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.sources.speakers import speakers
+from sfms_robot.frames import AUDIO_HZ
 
 _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
 _HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # numbers that change when something is plugged in
@@ -100,7 +101,7 @@ def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays:
     Raises PortError where there are none, ConfigError for a name that is not there or fits several, with the choices.
     """
     if not devices:
-        choices = "leave it out" if plays else ", ".join(("FILE.wav", *speakers(), "none"))
+        choices = "leave it out" if plays else ", ".join(("FILE.wav", *speaker_names(), "none"))
         missing = "loudspeaker" if plays else "microphone"
         raise PortError(f"{flag}: this computer has no {missing}, or its sound server does not run ({choices})")
     fitting = _fitting(devices, wanted)
@@ -109,6 +110,24 @@ def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays:
     problem = "fits several devices" if fitting else "no such device"
     choices = ", ".join(device.label for device in fitting or devices)
     raise ConfigError(f"{flag}{' ' if plays else ':'}{wanted}: {problem} ({choices})")
+
+
+def accepted_format(device: SoundDevice, channels: Sequence[int], check: Callable[..., None]) -> tuple[float, int]:
+    """Rate and channels that it takes: 16 kHz first, `channels` in their order; the last of all is taken unasked.
+
+    `check`: sounddevice's, of what is recorded or of what is played.
+    """
+    import sounddevice
+
+    wishes = [(rate, count) for rate in (AUDIO_HZ, device.rate_hz) for count in channels]
+    with device.selected():
+        for rate_hz, count in wishes[:-1]:
+            try:
+                check(device.number, count, "float32", samplerate=rate_hz)
+                return rate_hz, count
+            except (sounddevice.PortAudioError, ValueError):
+                continue
+    return wishes[-1]
 
 
 def why_not_opened(error: Exception) -> str:

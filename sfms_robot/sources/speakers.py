@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import SPEAKER_VOICE, data_dir, speaker_names
 from sfms_robot.errors import ConfigError
 
 DEFAULT_SPEAKER = "facegood_1114_3_16"
-VOICE = "speech.flac"  # in the folder of each
 
 
 @dataclass(frozen=True)
@@ -24,27 +23,22 @@ class Speaker:
     face: Path | None
 
 
-def speakers() -> list[str]:
-    """Names of the shipped speakers."""
-    return shipped_names(data_dir("sim") / "speakers", VOICE)
-
-
 def shipped_speaker(name: str) -> Speaker:
     """A shipped speaker by name. Raises ConfigError with the names there are."""
-    if name not in speakers():
-        raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speakers())})")
+    if name not in speaker_names():
+        raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speaker_names())})")
     folder = data_dir("sim") / "speakers" / name
     face = folder / "face.csv.gz"
-    return Speaker(name, folder / VOICE, face if face.is_file() else None)
+    return Speaker(name, folder / SPEAKER_VOICE, face if face.is_file() else None)
 
 
 def voice_file(name: str) -> Path | None:
     """A sound file by path, or a speaker's by name; None when there is neither."""
-    if name in speakers() and not Path(name).is_file():
+    if name in speaker_names() and not Path(name).is_file():
         return shipped_speaker(name).audio
     return Path(name) if Path(name).exists() else None
 
 
 def own_face(name: str) -> Path | None:
     """The face that belongs to a voice: a shipped speaker's; None beside somebody's sound file."""
-    return shipped_speaker(name).face if name in speakers() and not Path(name).is_file() else None
+    return shipped_speaker(name).face if name in speaker_names() and not Path(name).is_file() else None

@@ -7,10 +7,10 @@ from sfms_robot.app.bench.adversary import CHUNK, adversarial, torment, wild
 from sfms_robot.app.bench.lead import delay_ticks, delays
 from sfms_robot.app.bench.retarget_bench import retarget
 from sfms_robot.config import load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 QUICK = ["op3_head", "open_duck_mini_v2_head", "poppy_head", "reachy_mini", "inmoov2_ssc32"]
 
 

@@ -4,9 +4,9 @@ import pytest
 
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.config import load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 
 
 @pytest.mark.parametrize("name", HEADS)

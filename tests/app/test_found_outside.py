@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import HeadOptions, OpenHead, Programme, build_bus, build_motion, drive_head
+from sfms_robot.app.open_head import HeadOptions, OpenHead, build_bus, build_motion
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
 from sfms_robot.config.calibrate_first import held_back
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.motion.limits import JointLimits
@@ -20,7 +21,7 @@ from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, STANDS_RAD,
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.recording import RecordedVoice
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 SECONDS = 1.6
 
 

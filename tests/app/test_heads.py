@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import build_bus
+from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated, plugged_in
 from sfms_robot.config import Faults, Head, Safety, load_head, parse
 from sfms_robot.emulator.launch import EmulatedServo, launch

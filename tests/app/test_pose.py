@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.head.pose import EXPRESSIONS, RISE_S, HeldFace, PoseOptions, parse_face, pose_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.runtime.safety import EASE_S
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 
 
 @pytest.fixture(autouse=True)

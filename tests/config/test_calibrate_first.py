@@ -5,10 +5,10 @@ import pytest
 from sfms_robot.app.calibrated_head import ready
 from sfms_robot.config import load_head
 from sfms_robot.config.calibrate_first import PACE, TRAVEL, held_back
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 
 
 @pytest.mark.parametrize("name", HEADS)

@@ -9,10 +9,11 @@ import pytest
 from sfms_robot.corpora import splits
 from sfms_robot.corpora.clips import load
 from sfms_robot.corpora.compose import ami, composed
-from sfms_robot.corpora.compose.acting import Score, act, held, mirrored, nod_habit, nod_manner, stretched, tiled
+from sfms_robot.corpora.compose.acting import Score, act, mirrored, nod_habit, nod_manner
 from sfms_robot.corpora.compose.looks import Dwell, learn_dwell
 from sfms_robot.corpora.compose.motions import KINDS, edges
 from sfms_robot.corpora.compose.motions import load as load_motions
+from sfms_robot.corpora.compose.splicing import held, stretched, tiled
 from sfms_robot.corpora.compose.voices import find_voices, lay, read_voice, split_voices
 from sfms_robot.corpora.splits import SPLITS
 from sfms_robot.data import data_dir

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import HeadOptions, OpenHead, Programme, build_bus, build_motion, drive_head
+from sfms_robot.app.open_head import HeadOptions, OpenHead, build_bus, build_motion
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import calibration_of, plugged_in
 from sfms_robot.config import load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.runtime.clock import VirtualClock
@@ -19,7 +20,7 @@ from sfms_robot.servo.families import family_named
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.recording import RecordedVoice
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 LISTEN_S = 0.5
 AT_REST_DEG = 1.0  # of a servo's place: what its gear and the last 1e-4 rad of its goal leave
 

@@ -4,10 +4,10 @@ import pytest
 
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_firmware_map, load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.emulator.sagging import BEYOND_RAD, sagged_rad, sagging_joints
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 PITCHES = {
     "face28": {"neck_pitch"},
     "op3_head": {"head_tilt"},

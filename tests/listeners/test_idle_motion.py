@@ -10,7 +10,8 @@ from sfms_robot.errors import ModelError
 from sfms_robot.frames import BLENDSHAPES, EVENT_KINDS, MOTION_DIM, SHAPES
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, EASE_S, IdleMotion
+from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, IdleMotion
+from sfms_robot.listeners.spectral_lines import EASE_S
 
 BROW = BLENDSHAPES.index("browInnerUp")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from motion_rows import motions
 
-from sfms_robot.app.session import build_motion
+from sfms_robot.app.open_head import build_motion
 from sfms_robot.config import load_head
 from sfms_robot.corpora.compose.motions import load
 from sfms_robot.data import data_dir

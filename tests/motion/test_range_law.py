@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sfms_robot.app.wiring import calibration_of, firmware_maps
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.calibrate_first import held_back
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.chase import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
@@ -17,7 +17,7 @@ from sfms_robot.servo.goals import Goals
 from sfms_robot.servo.policy import BusServo
 
 DT_S = 0.01
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 CHASES = [TimeOptimalChase, StopChase]
 
 

@@ -5,12 +5,12 @@ import pytest
 from motion_rows import motion
 
 from sfms_robot.config import load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 
 
 @pytest.mark.parametrize("name", HEADS)

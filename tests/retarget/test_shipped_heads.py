@@ -5,11 +5,11 @@ import pytest
 
 from sfms_robot.config import load_head
 from sfms_robot.config.check import check_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
-HEADS = shipped_names(data_dir("configs") / "heads", "head.yaml")
+HEADS = head_names()
 FRAMES = 10_000
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.config.calibrate_first import held_back
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
@@ -15,7 +15,7 @@ from sfms_robot.retarget.kinematics.rotations import rotation
 from sfms_robot.signals.eye_angles import directions
 
 FULL_RAD = np.radians([30.0, 20.0])
-HEADS = {name: load_head(name) for name in shipped_names(data_dir("configs") / "heads", "head.yaml")}
+HEADS = {name: load_head(name) for name in head_names()}
 HEADS |= {f"{name}, cautious": held_back(head) for name, head in list(HEADS.items())}
 RECENTRE_DEG = 400.0  # they never jump back to where the face has them
 RETARGETERS = {name: HeadRetargeter(head) for name, head in HEADS.items() if head.kinematics}

@@ -1,10 +1,10 @@
-"""Signals become a request to end, and easing is smooth at both ends."""
+"""Signals become a request to end."""
 
 import signal
 
 import pytest
 
-from sfms_robot.runtime.safety import Interrupt, Released, signals_to, smooth
+from sfms_robot.runtime.safety import Interrupt, Released, signals_to
 
 
 class NoBus:
@@ -55,10 +55,3 @@ def test_a_signal_that_is_ignored_stays_so() -> None:
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_easing_starts_and_ends_at_rest_and_never_turns_back() -> None:
-    values = [smooth(u / 1000) for u in range(-100, 1101)]
-    assert values[0] == 0.0 and values[-1] == 1.0
-    assert all(a <= b for a, b in zip(values, values[1:], strict=False))
-    assert smooth(1e-3) < 1e-7 and 1 - smooth(1 - 1e-3) < 1e-7

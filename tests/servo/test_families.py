@@ -6,7 +6,7 @@ import pytest
 
 from sfms_robot.config import load_head
 from sfms_robot.config.named_bus import BUS_GROUP
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.families import BusFamily, families, family_named, servo_families
 
@@ -20,7 +20,7 @@ def test_every_family_names_classes_that_there_are():
 
 
 def test_every_bus_of_a_shipped_head_has_a_family():
-    for name in shipped_names(data_dir("configs") / "heads", "head.yaml"):
+    for name in head_names():
         for bus in load_head(name).buses.values():
             family_named(bus.family)
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Faults, LoadRule, Safety, Threshold, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.member import FaultReporter, Member, State
+from sfms_robot.servo.chain.fault_reporter import FaultReporter
+from sfms_robot.servo.chain.member import Member, State
 from sfms_robot.servo.policy import BusServo, Measured, counts, load_rules
 from sfms_robot.servo.registers import Table
 

@@ -5,7 +5,9 @@ import pytest
 from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain import member as rules
-from sfms_robot.servo.chain.member import FaultReporter, Member, State
+from sfms_robot.servo.chain.fault_reporter import FaultReporter
+from sfms_robot.servo.chain.liveness import LONGEST_PAUSE_S
+from sfms_robot.servo.chain.member import Member, State
 from sfms_robot.servo.chain.startup import Silent
 from sfms_robot.servo.policy import BusServo, Measured
 from sfms_robot.servo.registers import Table
@@ -73,7 +75,7 @@ def test_off_to_online_by_enable(way):
 
 def test_online_to_silent_when_a_probe_is_in_vain_and_not_before(member):
     member.suspect(0.0)
-    assert member.state is State.ONLINE and not member.presence.listed
+    assert member.state is State.ONLINE and not member.liveness.listed
     member.probe_failed(0.05)
     assert member.state is State.SILENT and not member.gets_goals and member.fault == "no answer"
 
@@ -309,9 +311,9 @@ def test_probes_of_a_dead_servo_become_rare_and_never_stop(member):
     member.suspect(0.0)
     probes = []
     for k in range(2000):
-        if member.presence.probe_s <= 0.01 * k:
+        if member.liveness.probe_s <= 0.01 * k:
             probes.append(0.01 * k)
             member.probe_failed(0.01 * k)
     gaps = [b - a for a, b in zip(probes, probes[1:], strict=False)]
     assert 15 < len(probes) < 30
-    assert gaps[0] < 0.2 and gaps[-1] == pytest.approx(rules.LONGEST_PAUSE_S, abs=0.02)
+    assert gaps[0] < 0.2 and gaps[-1] == pytest.approx(LONGEST_PAUSE_S, abs=0.02)

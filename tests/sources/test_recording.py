@@ -7,6 +7,7 @@ import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
 from sfms_robot.signals.audio import read_audio
@@ -14,7 +15,7 @@ from sfms_robot.signals.tracks import Track, write_track
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.recording import RecordedSight, RecordedVoice
 from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.speakers import shipped_speaker, speakers
+from sfms_robot.sources.speakers import shipped_speaker
 
 
 def recorded(audio, track, duration_s=None, loop=True, agent_audio=None):
@@ -88,7 +89,7 @@ def test_a_run_needs_a_length(duration_s):
 
 
 def test_shipped_speakers_can_be_heard_and_seen():
-    assert {"facegood_1114_3_16", "katie"} <= set(speakers())
+    assert {"facegood_1114_3_16", "katie"} <= set(speaker_names())
     default = open_source()
     frames = default.read(10.0)
     assert default.duration_s == pytest.approx(47.68) and len(frames) == 250
@@ -150,7 +151,7 @@ def test_a_robots_voice_that_is_not_there_is_named(name, said):
 
 
 def test_a_shipped_speaker_lends_the_robot_its_voice():
-    source = open_source("none", "none", agent_audio=speakers()[0])
+    source = open_source("none", "none", agent_audio=speaker_names()[0])
     assert any(frame.agent_audio.any() for frame in source.read(5.0))
 
 

@@ -19,7 +19,8 @@ from typing import Any, Final, Self
 from sfms_robot.app.api.background import Background, Report
 from sfms_robot.app.api.named_head import head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
-from sfms_robot.app.session import RunOptions, prepare_head, run
+from sfms_robot.app.open_head import prepare_head
+from sfms_robot.app.session import RunOptions, run
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError, RobotError

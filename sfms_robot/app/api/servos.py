@@ -19,7 +19,8 @@ from sfms_robot.app.api.background import Background, Report
 from sfms_robot.app.api.named_head import head_name
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.report import run_report
-from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head
 from sfms_robot.errors import BusError, InputError, RobotError

@@ -16,9 +16,9 @@ from multiprocessing import get_context
 import numpy as np
 
 from sfms_robot.app.bench.measure import Row
-from sfms_robot.app.session import Motion, build_motion
+from sfms_robot.app.open_head import Motion, build_motion
 from sfms_robot.config import load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan
 from sfms_robot.runtime.loop import difference
 
@@ -46,7 +46,7 @@ def adversarial(frames: int, heads: tuple[str, ...] = (), seed: int = 0) -> dict
     Every `CHUNK` frames begin at rest with a seed of their own, and are spread over the processors. Blocks: a frame
     takes up to 2 ms of one, nearly all of it in the limiter and the neck that are tested.
     """
-    names = heads or shipped_names(data_dir("configs") / "heads", "head.yaml")
+    names = heads or head_names()
     starts = range(0, frames, CHUNK)
     parts = [(name, min(CHUNK, frames - start), seed + start // CHUNK) for name in names for start in starts]
     tallies = {name: Tally(0, 0, 0) for name in names}

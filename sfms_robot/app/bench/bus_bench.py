@@ -23,7 +23,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from sfms_robot.app.bench.measure import HEAD, Row, row, times
-from sfms_robot.app.session import build_bus
+from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch

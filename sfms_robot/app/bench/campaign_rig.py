@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.session import build_bus
+from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import calibration_of, emulated, firmware_maps, port_of
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch

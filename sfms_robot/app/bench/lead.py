@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from sfms_robot.app.bench.measure import HEAD, Row, row
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import calibration_of
 from sfms_robot.config import Head
 from sfms_robot.emulator.launch import Chain

@@ -9,7 +9,7 @@ import numpy as np
 from sfms_robot.app.bench.adversary import adversarial
 from sfms_robot.app.bench.measure import HEAD, Row, row, times
 from sfms_robot.app.head.faces import recorded_faces
-from sfms_robot.app.session import build_motion
+from sfms_robot.app.open_head import build_motion
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan

@@ -15,12 +15,14 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.app.head.pose import NobodyThere, WholeTimeline
-from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.runtime.recorder import FullPolicy, Recorder
-from sfms_robot.runtime.safety import EASE_S, Interrupt, smooth
+from sfms_robot.runtime.safety import EASE_S, Interrupt
+from sfms_robot.signals.minimum_jerk import ease
 
 ALONE_S: Final = 1.6  # up and down again
 TOGETHER_S: Final = 1.0  # from one random face to the next
@@ -82,7 +84,7 @@ class Faces(WholeTimeline):
         """Motion (N, 58) at each of (N,) instants."""
         after = np.clip(np.searchsorted(self._times_s, times_s), 1, len(self._times_s) - 1)
         begins, ends = self._times_s[after - 1], self._times_s[after]
-        share = smooth((times_s - begins) / (ends - begins))[:, None]
+        share = ease((times_s - begins) / (ends - begins))[:, None]
         motion = np.zeros((len(times_s), MOTION_DIM), dtype=np.float32)
         motion[:, SHAPES] = (1 - share) * self._shapes[after - 1] + share * self._shapes[after]
         return motion, None

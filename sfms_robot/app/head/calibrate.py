@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, Protocol
 
 from sfms_robot.app.calibrated_head import identify
 from sfms_robot.app.head.joint_probe import Probe, jumps, probe
-from sfms_robot.app.session import HeadOptions, build_motion, open_wires
+from sfms_robot.app.open_head import HeadOptions, build_motion, open_wires
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Head, Joint, load_head
 from sfms_robot.config.overlay import (

@@ -20,7 +20,7 @@ import numpy as np
 from sfms_robot.app.head.faces import named_faces
 from sfms_robot.app.head.fit import virtual_tracker
 from sfms_robot.config import load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.face.tracker import Skin, skin_motion
 from sfms_robot.frames import FRAME_S, POSE, POSE_CHANNELS, SHAPES, Doubles, Floats
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
@@ -43,7 +43,7 @@ class Fidelity:
 
 def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> dict[str, Any]:
     """Every shipped head (or those named) on every recorded face, and all faces together. Raises ConfigError."""
-    names = list(heads) or shipped_names(data_dir("configs") / "heads", "head.yaml")
+    names = list(heads) or head_names()
     faces: dict[str, list[Floats]] = {}
     for face, clip in named_faces(data):
         faces.setdefault(face, []).append(clip)

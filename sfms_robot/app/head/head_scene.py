@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.config import Head, load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.retarget.kinematics import build_neck
@@ -45,7 +45,7 @@ def draw_shipped_heads(png: Path) -> None:
     from sfms_robot.face.robot_drawing import render_robots
 
     robots = []
-    for name in shipped_names(data_dir("configs") / "heads", "head.yaml"):
+    for name in head_names():
         if (scene := scene_of(load_head(name))) is not None:
             robots.append((name, scene, scene.rest()))
     render_robots(png, robots, _COLUMNS, _CELL_PX)

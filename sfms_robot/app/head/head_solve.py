@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sfms_robot.config import find, load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
 from sfms_robot.retarget.kinematics import Solved, build_neck
@@ -40,8 +40,7 @@ def solve_poses(head_name: str, file: Path) -> SolvedPoses:
     head = load_head(head_name)
     if head.kinematics is None:
         file = find("heads", head_name, "head.yaml") / "head.yaml"
-        shipped = shipped_names(data_dir("configs") / "heads", "head.yaml")
-        with_neck = [name for name in shipped if load_head(name).kinematics]
+        with_neck = [name for name in head_names() if load_head(name).kinematics]
         raise ConfigError.at(file, "name", head.name, "has no kinematics", with_neck)
     neck = build_neck(head.kinematics, head.joints)
     poses, body_yaw_rad = read_poses(file)

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.app.session import build_bus
+from sfms_robot.app.open_head import build_bus
 from sfms_robot.config import Head, Joint, load_firmware_map
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ServoError

@@ -13,13 +13,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.session import HeadOptions, Programme, drive_head, open_head
+from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.runtime.feed import IDLE_FEED
-from sfms_robot.runtime.safety import EASE_S, Interrupt, smooth
+from sfms_robot.runtime.safety import EASE_S, Interrupt
+from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.5
 MOVED_DEG: Final = 0.1
@@ -136,7 +138,7 @@ class HeldFace(WholeTimeline):
 
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
         """Motion (N, 58) at each of (N,) instants."""
-        share = smooth((times_s - EASE_S) / RISE_S) - smooth((times_s - self._falls_s) / RISE_S)
+        share = ease((times_s - EASE_S) / RISE_S) - ease((times_s - self._falls_s) / RISE_S)
         return (share[:, None] * self._face).astype(np.float32), None
 
 

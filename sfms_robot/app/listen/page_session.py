@@ -23,7 +23,7 @@ from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_recorder import PageRecorder
 from sfms_robot.app.listen.preflight import begin_listening
 from sfms_robot.config import Calmness, load_head
-from sfms_robot.data import data_dir, shipped_names
+from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
 from sfms_robot.listeners.open_feed import NamedFeed
 from sfms_robot.ports import Observer, Tick
@@ -33,7 +33,7 @@ from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.browser import Visitor
 from sfms_robot.sources.registry import BROWSER, open_source, split_kind
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER, speakers
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
 
 AWAY_S: Final = 5.0  # nobody has looked for so long: a page that is loaded anew is back sooner
@@ -59,8 +59,7 @@ class PageSession:
     def __init__(self, page: PageProcess, options: session.RunOptions, folder: Path, choices: bool) -> None:
         self.page, self.options, self.released = page, options, False
         self._folder, self._choices = folder, choices
-        shipped = shipped_names(data_dir("configs") / "listeners", "config.yaml")
-        self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in shipped}}
+        self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in listener_names()}}
         self._person = Visitor()
         self._interrupt: Interrupt | None = None
         self._wanted: session.RunOptions | None = None
@@ -164,7 +163,7 @@ class PageSession:
         speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
         return page_facts(
             head, port=options.port, listener=options.listener, seed=options.seed, calmness=calmness,
-            speaker=speaker if speaker in speakers() else None, people=people_per_minute(options.listener),
+            speaker=speaker if speaker in speaker_names() else None, people=people_per_minute(options.listener),
             knobs=knobs, source={feed: self._choices or by for feed, by in by_visitor.items()}, choices=self._choices,
         )  # fmt: skip
 
@@ -174,7 +173,7 @@ class PageSession:
         if not self._choices:
             raise InputError(f"{what}: this run keeps what it was started with (`sfms-robot demo` lets you choose)")
         # By name alone: a visitor reaches no folder of this machine, and no address of another.
-        offered = {"listener": list(self._listeners), "speaker": speakers()}.get(what)
+        offered = {"listener": list(self._listeners), "speaker": speaker_names()}.get(what)
         if offered is not None and value not in offered:
             raise InputError(f"{what} {value!r} is not there ({', '.join(offered)})")
         changes: dict[str, dict[str, Any]] = {

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from sfms_robot.app.head.pose import NobodyThere
+from sfms_robot.app.head.pose import NobodyThere, WholeTimeline
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.report import figures_so_far
+from sfms_robot.app.open_head import HeadOptions, open_head
 from sfms_robot.app.replay.run_file import RunRecording, read_recording
-from sfms_robot.app.session import HeadOptions, Panel, Programme, drive_head, open_head, run_log
+from sfms_robot.app.session import Panel, Programme, drive_head, run_log
 from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
@@ -38,23 +39,14 @@ class PlaybackOptions:
     yes: bool = False
 
 
-class RecordedFace:
-    """`ports.Timeline` of a recording up to its way to rest: between two ticks the face is interpolated, before and
+class RecordedFace(WholeTimeline):
+    """The timeline of a recording up to its way to rest: between two ticks the face is interpolated, before and
     after them it stays.
     """
 
     def __init__(self, recording: RunRecording) -> None:
         listened = recording.times_s <= recording.listened_s
         self._times_s, self._motion = recording.times_s[listened], recording.motion[listened]
-
-    def start(self) -> None:
-        return None
-
-    def accept(self, plan: Any, state: None) -> None:
-        return None
-
-    def lead_limit_s(self, state: None) -> float:
-        return float("inf")
 
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
         """Motion (N, 58) at each of (N,) instants."""

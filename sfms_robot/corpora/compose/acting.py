@@ -7,7 +7,6 @@ when and how large, comes back as events. Nothing else of their kind is put ther
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final
@@ -16,6 +15,18 @@ import numpy as np
 
 from sfms_robot.config.drives import other_side
 from sfms_robot.corpora.compose.motions import SHAPE, Motions, edges, slow
+from sfms_robot.corpora.compose.splicing import (
+    FADE,
+    SMILE,
+    first_frame,
+    held,
+    laid_event,
+    over,
+    pick,
+    placed,
+    stretched,
+    tiled,
+)
 from sfms_robot.frames import (
     BLENDSHAPES,
     CHANNEL_INDEX,
@@ -25,7 +36,6 @@ from sfms_robot.frames import (
     MOTION_DIM,
     POSE,
     SHAPES,
-    SMILE_CORNERS,
     Doubles,
     Floats,
     ListenerEvent,
@@ -35,8 +45,6 @@ from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.events import runs
 
 NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay below 1800 deg/s^2
-_FADE: Final = FRAME_HZ
-_CORNERS: Final = [SHAPE[name] for name in SMILE_CORNERS]
 _LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
 _MIRROR: Final = [BLENDSHAPES.index(other_side(name)) for name in BLENDSHAPES]
 _TURNED: Final = [CHANNEL_INDEX[name] for name in LATERAL_POSE]
@@ -159,73 +167,6 @@ def _mirror_image(acted: Acted) -> Acted:
     return Acted(mirrored(acted.motion), events, head)
 
 
-# --- joining ----------------------------------------------------------------------------------------------------
-
-
-def tiled(pieces: Sequence[Floats], frames: int, rng: np.random.Generator, fade: int = _FADE) -> Floats:
-    """Random pieces (K, C) one after the other, each crossfaded over `fade` frames, cut to (frames, C)."""
-    usable = [piece for piece in pieces if len(piece) > 2 * fade] or [max(pieces, key=len)]
-    fade = min(fade, min(len(piece) for piece in usable) // 2)
-    total = frames + 2 * fade
-    out = np.zeros((total, usable[0].shape[1]), np.float32)
-    at = 0
-    while at < total:
-        piece = usable[rng.integers(len(usable))]
-        piece = piece[int(rng.integers(0, max(1, (len(piece) - 2 * fade) // 2))) :]
-        piece = piece * edges(len(piece), fade)[:, None]
-        out[at : at + len(piece)] += piece[: total - at]
-        at += len(piece) - fade
-    return out[fade : fade + frames]
-
-
-def stretched(curve: Floats, frames: int) -> Floats:
-    """A curve (K,) or (K, C) played over `frames` frames."""
-    at = np.linspace(0, len(curve) - 1, max(2, frames))
-    if curve.ndim == 1:
-        return np.interp(at, np.arange(len(curve)), curve).astype(np.float32)
-    low = np.minimum(at.astype(int), len(curve) - 2)
-    part = (at - low)[:, None]
-    return np.asarray(curve[low] * (1 - part) + curve[low + 1] * part, np.float32)
-
-
-def held(curve: Floats, frames: int) -> Floats:
-    """A rise and fall (K, 52) that is seen (mouthSmile above half of its height) for about `frames` frames.
-
-    Longer ones rest at their height, as long smiles do; shorter ones are played faster, to 0.6 of their length at most.
-    """
-    height = curve[:, _CORNERS].mean(axis=1)
-    peak, seen = int(height.argmax()), int((height > 0.5 * height.max()).sum())
-    if frames >= seen:
-        return np.concatenate(
-            [curve[:peak], np.repeat(curve[peak : peak + 1], frames - seen + 1, axis=0), curve[peak + 1 :]]
-        )
-    return stretched(curve, int(len(curve) * max(0.6, frames / seen)))
-
-
-def _first(start_s: float) -> int:
-    """The frame that something begins with."""
-    return int(round(start_s * FRAME_HZ))
-
-
-def _placed(curve: Floats, start_s: float, frames: int) -> Floats:
-    """Zeros (frames,) or (frames, C) with the curve from `start_s` on."""
-    out = np.zeros((frames, *curve.shape[1:]), np.float32)
-    first = _first(start_s)
-    low, high = max(0, first), min(frames, first + len(curve))
-    if high > low:
-        out[low:high] = curve[low - first : high - first]
-    return out
-
-
-def _event(kind: str, start_s: float, curve: Floats, size: float) -> ListenerEvent:
-    """Of a curve that was laid with `_placed`."""
-    return ListenerEvent(kind, _first(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
-
-
-def _pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    return pieces[int(rng.integers(len(pieces)))]
-
-
 # --- head -------------------------------------------------------------------------------------------------------
 
 
@@ -233,7 +174,7 @@ def _sway(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
     """Idle roll, pitch, yaw: recorded slow motion brought to about a degree."""
     unit = [piece / (piece.std(axis=0) + 1e-6) for piece in motions.sway]
     size = np.deg2rad(rng.uniform(0.4, 1.1)) * np.array([1.0, 0.8, 1.0], np.float32)
-    return np.asarray(tiled(unit, frames, rng, fade=2 * _FADE) * size * rng.choice([-1, 1], 3), np.float32)
+    return np.asarray(tiled(unit, frames, rng, fade=2 * FADE) * size * rng.choice([-1, 1], 3), np.float32)
 
 
 def _drift(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
@@ -246,7 +187,7 @@ def _talking_head(score: Score, motions: Motions, rng: np.random.Generator) -> F
     """The head (N, 6) of somebody who speaks, while he does."""
     talks = np.zeros(score.frames, np.float32)
     for start, end in score.talk:
-        talks[max(0, _first(start)) : max(0, _first(end))] = 1
+        talks[max(0, first_frame(start)) : max(0, first_frame(end))] = 1
     ramp = edges(FRAME_HZ, FRAME_HZ // 2)
     eased = np.convolve(talks, ramp / ramp.sum(), "same")[:, None]
     return np.asarray(eased * rng.uniform(0.2, 0.4) * tiled(motions.heads, score.frames, rng), np.float32)
@@ -290,7 +231,7 @@ def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> 
     out = np.zeros(frames)
     each_s = manner.duration_s / manner.swings
     size = min(manner.size_rad, NOD_RAD_S2 * each_s**2 / max(_bend(shape, each_s), 1.0))
-    low, high = max(0, _first(start_s) - 1), min(frames, _first(start_s + manner.duration_s) + 2)
+    low, high = max(0, first_frame(start_s) - 1), min(frames, first_frame(start_s + manner.duration_s) + 2)
     times = np.arange(low + 1, high + 1) * FRAME_S - start_s
     for swing in range(manner.swings):
         phase = times / each_s - swing
@@ -302,7 +243,7 @@ def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generato
     habit, events = nod_habit(rng), []
     for start, end in spans.tolist():
         manner = nod_manner(habit, end - start, rng)
-        curve = nod_curve(manner, _pick(motions.nods, rng), start, len(pose))
+        curve = nod_curve(manner, pick(motions.nods, rng), start, len(pose))
         pose[:, 1] += curve
         events.append(ListenerEvent("nod", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
     return events
@@ -314,13 +255,13 @@ def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Gener
     habit = nod_habit(rng)
     for start, end in score.shakes.tolist():
         manner = nod_manner(habit, end - start, rng)
-        curve = sizes.SHAKE * nod_curve(manner, _pick(motions.shakes, rng), start, len(pose))
+        curve = sizes.SHAKE * nod_curve(manner, pick(motions.shakes, rng), start, len(pose))
         pose[:, 2] += rng.choice([-1, 1]) * curve
         events.append(ListenerEvent("shake", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
     for start, end in score.tilts:
         curve = np.deg2rad(rng.uniform(*sizes.TILT_DEG)) * edges(max(12, int((end - start) * FRAME_HZ) + 12), 12)
-        pose[:, 0] += rng.choice([-1, 1]) * _placed(curve, start, len(pose))
-        events.append(_event("tilt", start, curve, curve.max()))
+        pose[:, 0] += rng.choice([-1, 1]) * placed(curve, start, len(pose))
+        events.append(laid_event("tilt", start, curve, curve.max()))
     return events
 
 
@@ -344,7 +285,7 @@ def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[Liste
         target = sizes.aside(sizes.aside_rad(far), side, up)
         if where.startswith("side"):  # the same person sits where he sat
             target = seats.setdefault(where, target)
-        out[max(0, _first(start)) : max(0, _first(end))] = target
+        out[max(0, first_frame(start)) : max(0, first_frame(end))] = target
     return out, _shifts(out)
 
 
@@ -415,7 +356,7 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
         if any(event.start_s - seen_s < start < event.end_s for event in events):
             continue
         curve = _lay_smile(shapes, start - 0.2, seen_s, size, jaw, motions, rng)
-        events.append(_event(kind, start - 0.2, curve, curve[:, _CORNERS].mean(axis=1).max()))
+        events.append(laid_event(kind, start - 0.2, curve, curve[:, SMILE].mean(axis=1).max()))
     return events
 
 
@@ -435,18 +376,13 @@ def _lay_smile(
     rng: np.random.Generator,
 ) -> Floats:
     """A recorded smile over the face (N, 52) from `start_s` on; the curve (K, 52) that was laid."""
-    curve = held(_pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
+    curve = held(pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
     knots = np.arange(0, len(curve) + FRAME_HZ, FRAME_HZ)
     breath = np.interp(np.arange(len(curve)), knots, rng.uniform(0.9, 1.0, len(knots)))  # no smile stands still
     curve = (size * curve * (breath * edges(len(curve), 9))[:, None]).astype(np.float32)
     curve[:, SHAPE["jawOpen"]] *= jaw
-    np.copyto(shapes, _over(shapes, _placed(curve, start_s, len(shapes))))
+    np.copyto(shapes, over(shapes, placed(curve, start_s, len(shapes))))
     return curve
-
-
-def _over(below: Floats, above: Floats) -> Floats:
-    """Two activations of the same muscles: sums while small, saturates at 1, smooth."""
-    return np.asarray(below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1), np.float32)
 
 
 def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
@@ -457,11 +393,11 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.
     for instant in sorted(at):
         if events and instant - 0.1 < events[-1].end_s:
             continue
-        curve, size = _pick(motions.brows, rng), rng.uniform(*sizes.BROW_RAISE)
+        curve, size = pick(motions.brows, rng), rng.uniform(*sizes.BROW_RAISE)
         length = int(len(curve) * rng.uniform(*sizes.BROW_STRETCH))
         curve = (size * stretched(curve, length) * edges(length, 6)[:, None]).astype(np.float32)
-        np.copyto(shapes, _over(shapes, _placed(curve, instant - 0.1, len(shapes))))
-        events.append(_event("brow_raise", instant - 0.1, curve, size))
+        np.copyto(shapes, over(shapes, placed(curve, instant - 0.1, len(shapes))))
+        events.append(laid_event("brow_raise", instant - 0.1, curve, size))
     return events
 
 
@@ -478,11 +414,11 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
         gain = rng.uniform(*sizes.MM_HM) if any(abs(start - other) < 0.3 for other in short) else rng.uniform(0.6, 0.9)
         offset = int(rng.integers(max(1, len(source) - length)))
         piece = source[offset : offset + length]
-        said = said + _placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
-    np.copyto(shapes, _over(shapes, said))
+        said = said + placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
+    np.copyto(shapes, over(shapes, said))
     events = []
     for start, end in score.mm_hms.tolist():
-        low, high = max(0, _first(start)), max(_first(start) + 1, _first(end))
+        low, high = max(0, first_frame(start)), max(first_frame(start) + 1, first_frame(end))
         jaw = float(said[low:high, SHAPE["jawOpen"]].max(initial=0.0))
         events.append(ListenerEvent("mm_hm", start, end - start, min(1.0, jaw)))
     return events
@@ -502,9 +438,9 @@ def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Gener
     for instant in sorted(times):
         if events and instant - events[-1].start_s < 0.5:
             continue
-        curve = _pick(motions.blinks, rng)
+        curve = pick(motions.blinks, rng)
         size = rng.uniform(*sizes.BLINK[0 if rng.random() < sizes.SLIGHT_BLINKS else 1])
         curve = (size * curve).astype(np.float32)
-        np.maximum(shapes, _placed(curve, instant, len(shapes)), out=shapes)
-        events.append(_event("blink", instant, curve, curve[:, _LIDS].mean(axis=1).max()))
+        np.maximum(shapes, placed(curve, instant, len(shapes)), out=shapes)
+        events.append(laid_event("blink", instant, curve, curve[:, _LIDS].mean(axis=1).max()))
     return events

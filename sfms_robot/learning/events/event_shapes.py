@@ -10,8 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.corpora.compose.acting import held, smile_s
+from sfms_robot.corpora.compose.acting import smile_s
 from sfms_robot.corpora.compose.motions import Motions
+from sfms_robot.corpora.compose.splicing import held
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles
 from sfms_robot.learning.events.event_trainer import Student
 from sfms_robot.listeners.events.hazards import Shape

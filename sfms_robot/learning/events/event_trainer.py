@@ -19,9 +19,9 @@ from sfms_robot.learning.events import logistic
 from sfms_robot.learning.events.labels import Lesson, Looks, lesson, looks_of, minutes, spans_of, steps_of
 from sfms_robot.learning.events.logistic import Logistic
 from sfms_robot.listeners.events.evidence import AT, NUMBERS, Bools, Scene, counts_in, done_in, heard_in
-from sfms_robot.listeners.events.hats import hats
 from sfms_robot.listeners.events.hazards import STEP_FRAMES, Hazard
 from sfms_robot.signals.events import rank_auc
+from sfms_robot.signals.hats import hats
 
 Knots = tuple[float, ...]
 Groups = Mapping[str, Knots]  # evidence -> knots of its curve; none for a number

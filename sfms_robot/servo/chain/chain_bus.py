@@ -33,8 +33,9 @@ from sfms_robot.errors import BusError, PacketError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
+from sfms_robot.servo.chain.fault_reporter import FaultReporter
 from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.member import ONLINE, REDUCED, REJOINING, FaultReporter, Member, members_of
+from sfms_robot.servo.chain.member import ONLINE, REDUCED, REJOINING, Member, members_of
 from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
 from sfms_robot.servo.chain.schedule import TURN_S, read_bytes
 from sfms_robot.servo.chain.settings import Settings
@@ -188,7 +189,7 @@ class ChainBus(WireBus[L], Generic[L]):
 
     def _present(self) -> list[int]:
         """Ids of those who are listed."""
-        return [member.id for member in self._members if member.presence.listed]
+        return [member.id for member in self._members if member.liveness.listed]
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """Torque on for `joints` without a jump, one after the other; angles held, rad, in the order of `joints`.
@@ -208,7 +209,7 @@ class ChainBus(WireBus[L], Generic[L]):
         for joint in joints:
             index = self.joints.index(joint)
             member = self._members[index]
-            if not member.presence.listed:
+            if not member.liveness.listed:
                 member.awaited()
                 servo = self._servos[index]
                 held.append(min(max(0.0, servo.min_rad), servo.max_rad))
@@ -409,7 +410,7 @@ class ChainBus(WireBus[L], Generic[L]):
     def statistics(self) -> Mapping[str, Any]:
         return {
             **self._counts,
-            "silent": [member.id for member in self._members if not member.presence.listed],
+            "silent": [member.id for member in self._members if not member.liveness.listed],
             "faults": list(self._reporter.said),
             "supply_mA": round(self._telemetry.supply_mA(), 1),
             "supply_peak_mA": round(self._peak_mA, 1),
@@ -469,7 +470,7 @@ class ChainBus(WireBus[L], Generic[L]):
             return
         self._writes.step(
             link,
-            lambda index: self._members[index].presence.listed,
+            lambda index: self._members[index].liveness.listed,
             lambda where, ids: self._poll.read_some(link, where, ids),
             lambda index, field, value: self._told(index, field, value, now_s),
         )

@@ -22,12 +22,13 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, Protocol
 
 from sfms_robot.config import Faults
 from sfms_robot.errors import ServoError
+from sfms_robot.servo.chain.fault_reporter import FaultReporter, about
+from sfms_robot.servo.chain.liveness import FIRST_PAUSE_S, LONGEST_PAUSE_S, Liveness
 from sfms_robot.servo.chain.startup import Silent, Steps
 from sfms_robot.servo.policy import BusServo, Measured, counts, load_rules
 from sfms_robot.servo.registers import Table
@@ -39,15 +40,12 @@ TORQUE_ON: Final = "torque is not off"  # though it was asked to be
 NO_ANSWER: Final = "no answer"
 GIVEN_UP: Final = "left alone"
 MISSES: Final = 2  # single lost answers in a row before a servo counts as silent
-FIRST_PAUSE_S: Final = 0.05  # between two probes of a silent servo
-LONGEST_PAUSE_S: Final = 1.0
 RETRY_S: Final = 0.2  # after a silence on the way back
 REFUSED_S: Final = 2.0  # after a refusal on the way back
 LIMP_S: Final = 3.0  # a joint that was pinched stays limp so long
 ATTEMPTS: Final = 3  # of coming back within `FORGET_S`, then it is given up
 FORGET_S: Final = 60.0
 NEAR: Final = 1 / 500  # of a turn: a goal this close to where a joint stands continues from there
-SAID_EVERY_S: Final = 10.0  # a loose contact comes and goes many times a second
 
 
 class State(Enum):
@@ -84,67 +82,6 @@ class Restart(Protocol):
     def bring_back(self, index: int, reboot: bool) -> Steps[int]: ...
 
 
-class FaultReporter:
-    """Logs every fault of every joint once, and keeps them for the report.
-
-    Attributes:
-        said: `joint: fault`, in the order of appearance.
-    """
-
-    def __init__(self) -> None:
-        self.said: dict[str, None] = {}
-        self._excused: set[tuple[str, str]] = set()
-
-    def say(self, servo: BusServo, fault: str) -> None:
-        named = f"{servo.joint}: {fault}"
-        if named not in self.said:
-            log.warning("%s: %s", about(servo), fault)
-        self.said[named] = None
-
-    def excuse(self, servo: BusServo, fault: str) -> None:
-        if (servo.joint, fault) not in self._excused:
-            self._excused.add((servo.joint, fault))
-            log.info("%s reports %s, which this head's configuration allows", about(servo), fault)
-
-
-def about(servo: BusServo) -> str:
-    return f"{servo.joint} (id {servo.id})"
-
-
-@dataclass
-class Presence:
-    """Whether a servo answers: misses, probes, and what is said of it.
-
-    Attributes:
-        listed: asked in every poll; otherwise it is probed alone, with growing pauses.
-        probe_s: when a servo that is not listed is asked next.
-    """
-
-    listed: bool = True
-    misses: int = 0
-    pause_s: float = FIRST_PAUSE_S
-    probe_s: float = -math.inf
-    said_s: float = -math.inf  # when it was last said to be silent
-    unsaid: int = 0  # silences since
-    told_silent: bool = False
-
-    def say_silent(self, name: str, now_s: float, again: bool) -> None:
-        """Once in ten seconds; what is held back is counted. `again`: it is a new silence, not the same one."""
-        if self.told_silent:
-            return
-        if now_s < self.said_s + SAID_EVERY_S:
-            self.unsaid += again
-            return
-        times = f" ({self.unsaid} times since the last word)" if self.unsaid else ""
-        log.warning("%s is silent%s", name, times)
-        self.said_s, self.unsaid, self.told_silent = now_s, 0, True
-
-    def say_back(self, name: str) -> None:
-        if self.told_silent:
-            self.told_silent = False
-            log.warning("%s answers again", name)
-
-
 class Member:
     """One servo. Events come in by methods; what it wants is read from its attributes.
 
@@ -157,7 +94,7 @@ class Member:
 
     Attributes:
         state: see the module.
-        presence: whether it answers.
+        liveness: whether it answers.
         identified: it has been checked against the head's file.
         torque_seen: what it last said; None where nobody knows.
         job: its way back, in steps of one exchange, and when the next is due.
@@ -172,7 +109,7 @@ class Member:
         self.id = servo.id
         self.servo = servo
         self.table = table
-        self.presence = Presence()
+        self.liveness = Liveness()
         self.identified = False
         self.state = State.OFF
         self.torque_seen: bool | None = None
@@ -235,12 +172,12 @@ class Member:
     def connected(self) -> None:
         """Identified and prepared by `connect`; torque as found."""
         self._reset(State.OFF)
-        self.presence, self.identified, self.torque_seen = Presence(), True, None
+        self.liveness, self.identified, self.torque_seen = Liveness(), True, None
 
     def absent(self) -> None:
         """It did not answer to `connect`."""
         self._reset(State.OFF)
-        self.presence, self.identified, self.torque_seen = Presence(listed=False), False, None
+        self.liveness, self.identified, self.torque_seen = Liveness(listed=False), False, None
         self._say(NO_ANSWER)
 
     def enabled(self) -> None:
@@ -272,40 +209,40 @@ class Member:
         self._bits, self._named, self._trouble, self.mismatch = 0, [], None, None
         self._over_s.clear()
 
-    # --- presence -----------------------------------------------------------------------------------------------
+    # --- liveness -----------------------------------------------------------------------------------------------
 
     def answered(self) -> bool:
         """It has answered a request; whether it was away."""
-        presence = self.presence
-        back = not presence.listed
-        presence.misses, presence.listed = 0, True
+        liveness = self.liveness
+        back = not liveness.listed
+        liveness.misses, liveness.listed = 0, True
         return back
 
     def unanswered(self, now_s: float) -> bool:
         """One answer was lost; whether that makes it suspect."""
-        self.presence.misses += 1
-        if self.presence.misses >= MISSES:
+        self.liveness.misses += 1
+        if self.liveness.misses >= MISSES:
             self.suspect(now_s)
-        return not self.presence.listed
+        return not self.liveness.listed
 
     def suspect(self, now_s: float, pause_s: float = FIRST_PAUSE_S) -> None:
         """Off the list, and probed alone. Its goals go on until a probe is in vain: it may have been the wire."""
-        presence = self.presence
-        presence.listed, presence.pause_s, presence.probe_s = False, FIRST_PAUSE_S, now_s + pause_s
+        liveness = self.liveness
+        liveness.listed, liveness.pause_s, liveness.probe_s = False, FIRST_PAUSE_S, now_s + pause_s
         if pause_s:
-            presence.say_silent(about(self.servo), now_s, again=True)
+            liveness.say_silent(about(self.servo), now_s, again=True)
 
     def probe_failed(self, now_s: float) -> None:
-        presence = self.presence
-        presence.pause_s = min(2.0 * presence.pause_s, LONGEST_PAUSE_S)
-        presence.probe_s = now_s + presence.pause_s
-        presence.say_silent(about(self.servo), now_s, again=False)
+        liveness = self.liveness
+        liveness.pause_s = min(2.0 * liveness.pause_s, LONGEST_PAUSE_S)
+        liveness.probe_s = now_s + liveness.pause_s
+        liveness.say_silent(about(self.servo), now_s, again=False)
         if self.state is not State.REBOOTING:  # a servo that reboots does not answer
             self.gone()
 
     def hurry(self, now_s: float) -> None:
         """Somebody else came back: perhaps this one does, too."""
-        self.presence.pause_s, self.presence.probe_s = FIRST_PAUSE_S, min(self.presence.probe_s, now_s)
+        self.liveness.pause_s, self.liveness.probe_s = FIRST_PAUSE_S, min(self.liveness.probe_s, now_s)
 
     def gone(self) -> None:
         """It does not answer, and not because of one lost packet; or the port is gone."""
@@ -319,7 +256,7 @@ class Member:
 
     def back(self, now_s: float) -> None:
         """A servo that was silent answers again."""
-        self.presence.say_back(about(self.servo))
+        self.liveness.say_back(about(self.servo))
         if self.state is State.SILENT:
             self._return(now_s)
         elif self._trouble == NO_ANSWER:

@@ -133,7 +133,7 @@ class Settings:
 
 
 def _compared(member: Member) -> bool:
-    return member.gets_goals and member.presence.listed
+    return member.gets_goals and member.liveness.listed
 
 
 def _blocks(fields: Iterable[Field]) -> list[Block]:

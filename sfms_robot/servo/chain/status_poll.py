@@ -160,7 +160,7 @@ class StatusPoll:
     # --- requests -----------------------------------------------------------------------------------------------
 
     def _listed(self) -> list[int]:
-        return [member.id for member in self._members if member.presence.listed]
+        return [member.id for member in self._members if member.liveness.listed]
 
     def fitting(self, link: RegisterLink, length: int, most: int) -> int:
         """How many servos, `most` at most, can be asked for `length` bytes in what is left of the poll."""
@@ -276,12 +276,12 @@ class StatusPoll:
     def _probe(self, link: RegisterLink, now_s: float) -> bool:
         """Ask members that are not listed and have waited long enough, one by one, until one does not answer."""
         answered = False
-        absent = [member for member in self._members if not member.presence.listed]
-        waiting = [member for member in absent if member.presence.probe_s <= now_s]
+        absent = [member for member in self._members if not member.liveness.listed]
+        waiting = [member for member in absent if member.liveness.probe_s <= now_s]
         for _ in range(_PROBES):
             if not waiting or not link.affords(read_bytes(1, self._telemetry.block[1], False), alone=True):
                 return answered
-            member = min(waiting, key=lambda each: each.presence.probe_s)
+            member = min(waiting, key=lambda each: each.liveness.probe_s)
             waiting.remove(member)
             self._counts["retries"] += 1
             where = self._telemetry.position if self._group is not None else self._telemetry.block
