@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 import time
 from enum import StrEnum
@@ -11,6 +10,7 @@ from pathlib import Path
 import typer
 
 from sfms_robot.app.bench import ALL, BENCHES
+from sfms_robot.cli.json_line import print_json
 
 EPILOG = "\n\n".join(
     f"[bold]{name}[/bold]{'' if bench.in_all else ' (not part of all)'}: {bench.about}"
@@ -64,7 +64,7 @@ def bench(
 
         performance_page.write(write, told.figures, (time.monotonic() - began_s) / 60)
     if json:
-        print(json_module.dumps(told.figures))
+        print_json(told.figures)
     else:
         from sfms_robot.cli.show import print_rows
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.cli.servo_wiring import Family, confirmation
 
 
@@ -33,7 +33,7 @@ def doctor(
     with bar("looking", hidden=json or fix) as progress:
         report = examine(port, head, family.value, baud, real_clock(), progress, confirm)
     if json:
-        print(json_module.dumps(report))
+        print_json(report)
     else:
         print_doctor(report)
     if report["exit_code"]:
