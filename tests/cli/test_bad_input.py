@@ -36,6 +36,10 @@ def listener(folder: Path, weights: bytes) -> Path:
         (["--head", "face99"], 2, ["head 'face99'", "face28"]),
         (["--listener", "psychic"], 2, ["listener 'psychic'", "sfms-small"]),
         (["--port", "/dev/ttyNowhere", "--duration", 1], 3, ["/dev/ttyNowhere", "no such device"]),
+        (["--port", "socket://nohost"], 3, ["--port socket://nohost", "socket://HOST:PORT"]),
+        (["--port", "main=ftp://host:1"], 3, ["--port ftp://host:1", "/dev/ttyUSB0", "socket://HOST:PORT"]),
+        (["--addressed", "perhaps"], 2, ["--addressed perhaps", "sense, assume, never"]),
+        (["--calmness", "addressed=1"], 2, ["--calmness addressed", "nod, shake"]),
         *(([option, "x" * 300], 2, ["x" * 300]) for option in ("--audio", "--face", "--head", "--listener")),
     ],
 )

@@ -19,7 +19,7 @@ from sfms_robot.errors import BusError, ConfigError, PortError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.chain.link import Found, RegisterLink
-from sfms_robot.servo.discovery import access_problem, list_ports
+from sfms_robot.servo.discovery import access_problem, is_address, list_ports
 from sfms_robot.servo.families import BusFamily, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
@@ -182,9 +182,9 @@ def only_port() -> str:
 
 def check_device(device: str) -> None:
     """Raises PortError for a path that cannot be a serial port, before anything is opened."""
-    if "://" in device:
-        return
     problem = access_problem(device)
+    if problem is not None and is_address(device):
+        raise PortError(f"{device}: {problem}")
     if problem is not None and "permission" not in problem:  # opening says what to do about permissions
         there = ", ".join(each.by_id or each.path for each in list_ports()) or "none"
         raise PortError(f"{device}: {problem} (serial ports here: {there})")
