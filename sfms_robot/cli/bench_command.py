@@ -52,7 +52,10 @@ def bench(
 ) -> None:
     """Measure, each figure beside that of a peer in the same run. Exit code 1: something is not as it should be."""
     from sfms_robot.app.bench import run_bench
+    from sfms_robot.app.out_files import checked_file
 
+    if write is not None:
+        checked_file(write, "--write")
     options = {
         "head": head, "frames": frames, "minutes": minutes, "audio": audio and audio.value, "torture": torture or None,
         "against": against, "hours": hours, "data": data, "budget": budget or None,

@@ -130,9 +130,10 @@ def dump(
     ids: Annotated[str | None, typer.Option("--ids", help="1-9,12. Default: everybody.")] = None,
 ) -> None:
     """All registers of servos into a YAML file."""
+    from sfms_robot.app.servo.dump import check_new, save_dump
     from sfms_robot.app.servo.dump import dump as taken
-    from sfms_robot.app.servo.dump import save_dump
 
+    check_new(file)
     with on.open() as wire, _bar("reading", hidden=on.json) as progress:
         servos = _chosen(wire, ids, progress)
         save_dump(taken(wire, servos), file)

@@ -32,7 +32,7 @@ from sfms_robot.app.servo.diagnosis import (
 )
 from sfms_robot.app.servo.protocol_hint import protocol_hint
 from sfms_robot.app.servo.register_view import State, read_all
-from sfms_robot.app.servo.serial_line import SIM, FoundServo, Wire, only_port, table_of
+from sfms_robot.app.servo.serial_line import SIM, FoundServo, Wire, check_baud, only_port, table_of
 from sfms_robot.app.servo.single_servo import Confirm, Progress, field_named, guard, has_duplicate, put, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay
@@ -99,6 +99,7 @@ def examine(
     family = DEFAULT_FAMILY if family is None else family
     if family not in servo_families():
         raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
+    check_baud(family, baud)
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
         buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress, fix) for line in lines]
