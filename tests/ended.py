@@ -11,11 +11,15 @@ class Ended(NamedTuple):
 
     @property
     def told(self):
-        """The last line of stdout, as JSON."""
-        return json.loads(self.out.splitlines()[-1])
+        """The last line of stdout, as JSON: NaN and Infinity are none."""
+        return json.loads(self.out.splitlines()[-1], parse_constant=_no_json)
 
     @property
     def complaint(self) -> str:
         """The one line on stderr."""
         (line,) = self.err.strip().splitlines()
         return line
+
+
+def _no_json(constant: str) -> None:
+    raise ValueError(f"{constant} is no JSON")

@@ -119,3 +119,15 @@ def test_no_two_modules_import_one_another() -> None:
         for name, path in modules.items()
     }
     assert not [(a, b) for a in modules for b in imported[a] - {a} if a in imported.get(b, ())]
+
+
+def test_the_vendors_sdk_is_known_to_one_file_and_to_the_bench_that_measures_it():
+    knows = {
+        str(module.relative_to(PACKAGE))
+        for module in MODULES
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in ([node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
+        if name and name.split(".")[0] == "dynamixel_sdk"
+    }
+    assert knows == {"servo/chain/sdk_packets.py", "app/bench/bus_bench.py"}

@@ -107,7 +107,7 @@ def prepare_head(options: HeadOptions) -> Head:
             f"({', '.join(jumping)}); keep clear, and confirm it with --yes"
         )
     for device in where.values():
-        if "://" not in device and (problem := access_problem(device)):
+        if problem := access_problem(device):
             raise PortError(f"{device}: {problem}")
     return head
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
+from sfms_robot.app.out_files import checked_file
 from sfms_robot.errors import ConfigError, MissingExtra
 
 if TYPE_CHECKING:
@@ -20,11 +21,7 @@ def checked_png(png: Path, option: str) -> Path:
     """The file, before anybody has worked for it. Raises ConfigError where no PNG can be written there."""
     if png.suffix.lower() != ".png":
         raise ConfigError(f"{option} {png}: is no name of a picture (FILE.png)")
-    if png.is_dir():
-        raise ConfigError(f"{option} {png}: cannot be written: is a folder")
-    if not png.parent.is_dir():
-        raise ConfigError(f"{option} {png}: cannot be written: no folder {png.parent}")
-    return png
+    return checked_file(png, option)
 
 
 def new_figure(width_in: float, height_in: float, dpi: int = _DPI) -> Figure:

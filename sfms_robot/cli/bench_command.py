@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 import time
 from enum import StrEnum
@@ -11,6 +10,7 @@ from pathlib import Path
 import typer
 
 from sfms_robot.app.bench import ALL, BENCHES
+from sfms_robot.cli.json_line import print_json
 
 EPILOG = "\n\n".join(
     f"[bold]{name}[/bold]{'' if bench.in_all else ' (not part of all)'}: {bench.about}"
@@ -52,7 +52,10 @@ def bench(
 ) -> None:
     """Measure, each figure beside that of a peer in the same run. Exit code 1: something is not as it should be."""
     from sfms_robot.app.bench import run_bench
+    from sfms_robot.app.out_files import checked_file
 
+    if write is not None:
+        checked_file(write, "--write")
     options = {
         "head": head, "frames": frames, "minutes": minutes, "audio": audio and audio.value, "torture": torture or None,
         "against": against, "hours": hours, "data": data, "budget": budget or None,
@@ -64,7 +67,7 @@ def bench(
 
         performance_page.write(write, told.figures, (time.monotonic() - began_s) / 60)
     if json:
-        print(json_module.dumps(told.figures))
+        print_json(told.figures)
     else:
         from sfms_robot.cli.show import print_rows
 

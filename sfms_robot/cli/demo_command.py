@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.data import head_names, listener_names
 
 # A lively one of the ten that `--seeds 10` tries: it nods 7 times, they 4.4 times in the mean.
@@ -57,7 +57,7 @@ def demo(
         else:
             told = app.demo(options, None if json else live_panel, page)
     if json:
-        print(json_module.dumps(told))
+        print_json(told)
     elif seeds is not None:
         nods = told["nods"]
         scatter = "-" if nods["variance_over_mean"] is None else nods["variance_over_mean"]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.cli.servo_wiring import Family, confirmation
 
 
@@ -16,7 +16,7 @@ def doctor(
     ),
     head: str | None = typer.Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
     baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: at all."),
-    family: Family = typer.Option(Family.dynamixel2, help="Without a head: how the servos speak."),
+    family: Family | None = typer.Option(None, help="Without a head: how the servos speak. Default: dynamixel2."),
     fix: bool = typer.Option(False, "--fix", help="Mend what servos have stored where that is safe; asks before each."),
     yes: bool = typer.Option(False, "--yes", "-y", help="With --fix: do not ask."),
     json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
@@ -31,9 +31,9 @@ def doctor(
 
     confirm = confirmation(yes) if fix else None
     with bar("looking", hidden=json or fix) as progress:
-        report = examine(port, head, family.value, baud, real_clock(), progress, confirm)
+        report = examine(port, head, family and family.value, baud, real_clock(), progress, confirm)
     if json:
-        print(json_module.dumps(report))
+        print_json(report)
     else:
         print_doctor(report)
     if report["exit_code"]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from enum import StrEnum
 from typing import Any, cast
 
 import typer
+
+from sfms_robot.cli.json_line import print_json
 
 
 class Timing(StrEnum):
@@ -64,7 +65,7 @@ def emulate(
     )
     with emulators(options) as chains:
         if json:
-            print(json_module.dumps(described(chains, head)), flush=True)
+            print_json(described(chains, head))
         else:
             for bus, chain in chains.items():
                 print(chain.device if len(chains) == 1 else f"{bus}={chain.device}", flush=True)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json as json_module
 from pathlib import Path
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.data import listener_names
 
 
@@ -30,7 +30,7 @@ def export(
 
     files = export_listener(listener, out, int8, weight_bits)
     if json:
-        print(json_module.dumps({"listener": listener, "int8": int8, "files": [str(file) for file in files]}))
+        print_json({"listener": listener, "int8": int8, "files": [str(file) for file in files]})
     else:
         for file in files:
             print(f"{file.stat().st_size / 1000:8.1f} kB  {file}")

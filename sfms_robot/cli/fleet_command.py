@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import getpass
-import json as json_module
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import typer
+
+from sfms_robot.cli.json_line import print_json
+from sfms_robot.errors import ConfigError
 
 app = typer.Typer(help="Heads that run with --fleet: who is there, halt, resume, a page.", no_args_is_help=False)
 
@@ -23,13 +26,16 @@ _HEADS = typer.Argument(None, metavar="[NAME]...", help="Heads; default: all.")
 def fleet(context: typer.Context, zenoh: Path | None = _ZENOH, json: bool = _JSON) -> None:
     """Who is there, and how."""
     if context.invoked_subcommand is not None:
+        if zenoh is not None or json:
+            flag = "--json" if zenoh is None else "--zenoh"
+            raise ConfigError(f"fleet {flag}: stands behind the command: fleet {context.invoked_subcommand} {flag} ...")
         return
     from sfms_robot.app.fleet.fleet_client import Fleet, tile
 
     with Fleet(zenoh) as found:
         tiles = [tile(str(each.get("name")), each) for each in found.states()]
     if json:
-        print(json_module.dumps({"heads": tiles}))
+        print_json({"heads": tiles})
     elif tiles:
         from sfms_robot.cli.show import print_rows
 
@@ -61,25 +67,26 @@ def resume(heads: list[str] = _HEADS, zenoh: Path | None = _ZENOH, json: bool = 
 def page(
     port: int = typer.Option(8776, min=0, max=65535, help="TCP port on loopback; 0: any free one."),
     zenoh: Path | None = _ZENOH,
+    json: bool = typer.Option(False, "--json", help="Print its address as one JSON object when it is served."),
 ) -> None:
-    """Serve a page with a tile per head and a button that halts all, until Ctrl-C."""
+    """Serve a page with a tile per head and a button that halts all, until Ctrl-C or SIGTERM."""
     from sfms_robot.app.fleet.fleet_client import Fleet
     from sfms_robot.app.fleet.fleet_page import FleetPage
 
-    with Fleet(zenoh) as found:
-        served = FleetPage(found, port)
-        print(f"fleet: {served.url}", file=sys.stderr, flush=True)
-        try:
+    with Fleet(zenoh) as found, closing(FleetPage(found, port)) as served:
+        if json:
+            print_json({"version": 1, "url": served.url})
+        else:
+            print(f"fleet: {served.url}", file=sys.stderr, flush=True)
+        with suppress(KeyboardInterrupt):
             threading.Event().wait()
-        finally:
-            served.close()
 
 
 def _told(answers: Sequence[Mapping[str, Any]], asked: Sequence[str], json: bool) -> None:
     """What heads said; exit code 1 when one that was named did not answer, or nobody did."""
     silent = [name for name in asked if name not in {each.get("name") for each in answers}]
     if json:
-        print(json_module.dumps({"answers": list(answers), "silent": silent}))
+        print_json({"answers": list(answers), "silent": silent})
     else:
         for each in answers:
             print(f"{each.get('name')}: {each.get('error') or each.get('done')}")

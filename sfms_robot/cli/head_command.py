@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-import json as json_module
 import sys
 from pathlib import Path
 
 import typer
 
 from sfms_robot.cli.head_fit import fit
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.errors import ConfigError
 
 INTERRUPTED = 130
@@ -33,7 +33,7 @@ def list_heads(
         draw_shipped_heads(checked_png(urdf, "--urdf"))
     heads = shipped_heads()
     if json:
-        print(json_module.dumps({"heads": heads}))
+        print_json({"heads": heads})
         return
     from sfms_robot.cli.show_head import print_heads
 
@@ -60,7 +60,7 @@ def check(
 
         draw(checked, plot)
     if json:
-        print(json_module.dumps(checked.as_dict()))
+        print_json(checked.as_dict())
     else:
         from sfms_robot.cli.show_head import print_check
 
@@ -91,7 +91,7 @@ def show(
         joints = {joint: joints[joint]}
     if json:
         told = {j: {key: {"value": v, "from": o} for key, (v, o) in values.items()} for j, values in joints.items()}
-        print(json_module.dumps({"name": name, "joints": told, "refused": refused}))
+        print_json({"name": name, "joints": told, "refused": refused})
         return
     from sfms_robot.cli.show_head import print_provenance
 
@@ -105,7 +105,7 @@ def _show_urdf(name: str, png: Path, json: bool) -> None:
     checked_png(png, "--urdf")
     told = draw_scene(name, png)
     if json:
-        print(json_module.dumps(told))
+        print_json(told)
         return
     from sfms_robot.cli.show_head import print_scene
 
@@ -126,7 +126,7 @@ def calibrate(
 
     outcome = lead_through(name, port, Terminal(), joint, again)
     if json:
-        print(json_module.dumps(outcome.as_dict()))
+        print_json(outcome.as_dict())
     else:
         print_calibration(outcome)
     if outcome.problems:
@@ -151,7 +151,7 @@ def pose(
 
     told = pose_head(PoseOptions(name, tuple(face), port, hold, fast, yes))
     if json:
-        print(json_module.dumps(told))
+        print_json(told)
     else:
         print_pose(told)
     if told["exit"] == "interrupted":
@@ -168,11 +168,15 @@ def solve(
         help="Columns x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad and, if wanted, body_yaw_rad.",
     ),
     residual: bool = typer.Option(False, "--residual", help="Also print what is missing: residual_rad,residual_m."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object, with what is missing."),
 ) -> None:
     """The neck's joints for each pose, as CSV in rad, and whether the pose is reached (1) or only approached (0)."""
     from sfms_robot.app.head.head_solve import solve_poses
 
     table = solve_poses(name, poses)
+    if json:
+        print_json(table.as_dict())
+        return
     solved = table.solved
     rest = [solved.residual_rad, solved.residual_m] if residual else []
     rows = csv.writer(sys.stdout, lineterminator="\n")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json as json_module
 import tempfile
 from pathlib import Path
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.errors import ConfigError
 
 
@@ -48,7 +48,10 @@ def fit(
             _tell(fit_head(name, folder, practice=True), json)
             return
     told = {"head": done.head.name, "exit": done.exit, "seconds": round(done.seconds, 1), "record": str(record)}
-    print(json_module.dumps(told) if json else f"{done.exit}: {folder}/run.mcap; put the face track beside it")
+    if json:
+        print_json(told)
+    else:
+        print(f"{done.exit}: {folder}/run.mcap; put the face track beside it")
 
 
 def _tell(result: object, json: bool) -> None:
@@ -57,6 +60,6 @@ def _tell(result: object, json: bool) -> None:
 
     assert isinstance(result, HeadFit)
     if json:
-        print(json_module.dumps(result.as_dict()))
+        print_json(result.as_dict())
     else:
         print_fit(result)

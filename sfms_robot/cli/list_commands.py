@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json as json_module
-
 import typer
+
+from sfms_robot.cli.json_line import print_json
 
 listener = typer.Typer(help="Listeners: list.", no_args_is_help=True)
 speaker = typer.Typer(help="Recorded people: list.", no_args_is_help=True)
@@ -50,7 +50,7 @@ def list_ports(json: bool = JSON) -> None:
         record, play, problem = [], [], str(error)
     if json:
         found = {"ports": ports, "microphones": record, "loudspeakers": play}
-        print(json_module.dumps({"version": 1, **found, "microphone_problem": problem}))
+        print_json({"version": 1, **found, "microphone_problem": problem})
         return
     print_list("serial ports", ports, json=False)
     if problem:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import logging
 import os
 import signal
@@ -31,6 +30,7 @@ from sfms_robot.cli import (
     servo_command,
     train_command,
 )
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.errors import ConfigError, RobotError
 
 NAME = "sfms-robot"
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ended = "interrupted" if code == INTERRUPTED else "failed"
         told = {"version": 1, "exit": ended, "error": problem, "exit_code": code}
         with suppress(OSError):
-            print(json_module.dumps(told), flush=True)
+            print_json(told)
     sys.exit(code)
 
 

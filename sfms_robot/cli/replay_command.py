@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from pathlib import Path
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 
@@ -48,7 +48,7 @@ def replay(
     if view is not None:
         _view(folder, view)
     if json:
-        print(json_module.dumps(told))
+        print_json(told)
     else:
         for key, value in told.items():
             if not isinstance(value, dict):

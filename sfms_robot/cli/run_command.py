@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.data import head_names, listener_names, speaker_names
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ def run(
 
             report = stack.enter_context(page_session(page, options)).run(panel, feed)
     if json:
-        print(json_module.dumps(report))
+        print_json(report)
     else:
         from sfms_robot.cli.show import print_dry_run, print_run
 
@@ -229,7 +229,7 @@ def _check(audio: str, duration_s: float | None, json: bool) -> None:
     with LevelMeter() as meter:
         told = check_sound("mic" if audio == "default" else audio, duration_s or CHECK_S, None if json else meter)
     if json:
-        print(json_module.dumps(told))
+        print_json(told)
         return
     from sfms_robot.cli.show import print_sound_check
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import signal
 import sys
 import threading
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.data import listener_names
 
 
@@ -45,7 +45,7 @@ def serve(
         signal.signal(number, lambda *_: over.set())
     figures = serve_until(ServeOptions(listener, name, zenoh, metrics, hop, processes, everybody, runs_on), over, _say)
     if json:
-        print(json_module.dumps(figures))
+        print_json(figures)
 
 
 def _say(line: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
@@ -130,9 +130,10 @@ def dump(
     ids: Annotated[str | None, typer.Option("--ids", help="1-9,12. Default: everybody.")] = None,
 ) -> None:
     """All registers of servos into a YAML file."""
+    from sfms_robot.app.servo.dump import check_new, save_dump
     from sfms_robot.app.servo.dump import dump as taken
-    from sfms_robot.app.servo.dump import save_dump
 
+    check_new(file)
     with on.open() as wire, _bar("reading", hidden=on.json) as progress:
         servos = _chosen(wire, ids, progress)
         save_dump(taken(wire, servos), file)
@@ -247,7 +248,7 @@ def monitor(
             title = f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends"
             live(looks(wire, servos, 1.0 / rate, count), title)
     if on.json:
-        print(json_module.dumps({"samples": taken}))
+        print_json({"samples": taken})
 
 
 @app.command()
@@ -262,7 +263,7 @@ def maps(
     if not check:
         rows = list_maps(files or [])
         if json:
-            print(json_module.dumps({"maps": rows}))
+            print_json({"maps": rows})
         else:
             from sfms_robot.cli.show import print_rows
 
@@ -270,7 +271,7 @@ def maps(
         return
     findings = check_maps(files or [])
     if json:
-        print(json_module.dumps({"sound": not findings, "findings": [each._asdict() for each in findings]}))
+        print_json({"sound": not findings, "findings": [each._asdict() for each in findings]})
     else:
         for each in findings:
             print(f"{each.file}: {each.problem}")
@@ -312,7 +313,7 @@ def _each(ids: str, on: Wiring, work: Callable[[Wire, FoundServo], list[dict[str
 
 def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, title: str | None = None) -> None:
     if json:
-        print(json_module.dumps(result))
+        print_json(result)
         return
     from sfms_robot.cli.show_servo import print_table
 

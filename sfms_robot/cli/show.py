@@ -5,7 +5,6 @@ A pipe gets whole rows: tables are as wide as the terminal, and as wide as they 
 
 from __future__ import annotations
 
-import json as json_module
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+from sfms_robot.cli.json_line import print_json
 
 _UNBROKEN = 1_000  # columns: wider than any table
 
@@ -96,7 +97,8 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def cell(value: object, otherwise: str = "-") -> str:
-    if value is None:
+    """A figure in a few digits; `otherwise` for what cannot be told (None, NaN)."""
+    if value is None or value != value:
         return otherwise
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
@@ -104,7 +106,7 @@ def cell(value: object, otherwise: str = "-") -> str:
 def print_list(key: str, rows: Sequence[Mapping[str, Any]], json: bool) -> None:
     """One line per row: its name, what is true of it, its description. As JSON: all of it, under `key`."""
     if json:
-        print(json_module.dumps({"version": 1, key: rows}))
+        print_json({"version": 1, key: rows})
         return
     console = screen(highlight=False)
     for row in rows:

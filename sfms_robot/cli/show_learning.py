@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sfms_robot.cli.json_line import print_json
 from sfms_robot.cli.show import cell, print_rows, screen
 
 _SHOWN = 3  # names of a problem; --json has them all
@@ -23,7 +23,7 @@ TITLES = {
 def show(figures: Mapping[str, Any], json: bool, printed: Callable[[Mapping[str, Any]], None] | None = None) -> None:
     """One JSON object, or what `printed` makes of the figures; without it, one of them a line."""
     if json:
-        print(json_module.dumps(figures))
+        print_json(figures)
     elif printed is not None:
         printed(figures)
     else:

@@ -72,6 +72,8 @@ def one_line(problem: ErrorDetails, where: str = "") -> str:
     """Key, value and what is wrong with it; `where` stands before the key."""
     key = ".".join(filter(None, (where, *(str(part) for part in problem["loc"]))))
     text = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "model_type":  # pydantic names the class
+        text = "is no mapping (key: value)"
     value = problem["input"]
     shown = f" = {value!r}" if isinstance(value, (str, int, float, bool)) or value is None else ""
     return f"{key}{shown}: {text}" if key else text

@@ -13,10 +13,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
+from urllib.parse import urlsplit
 
 DEV: Final = Path("/dev")
 SYS: Final = Path("/sys")
 PROC: Final = Path("/proc")
+NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs behind which servos can be
 
 _PATTERNS: Final = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttySC*", "ttyS*", "rfcomm*", "serial[0-9]")
 _NO_UART: Final = "0"  # /sys/class/tty/ttyS0/type, PORT_UNKNOWN: the name is there, the hardware is not
@@ -177,8 +179,15 @@ def holders(path: str, proc: Path = PROC) -> list[Holder]:
     return found
 
 
+def is_address(device: str) -> bool:
+    """socket://, rfc2217:// and the like; everything else is a path, relative ones too."""
+    return "://" in device
+
+
 def access_problem(path: str) -> str | None:
-    """Why this user cannot use `path` as a serial port; None when nothing speaks against it."""
+    """Why this user cannot use `path`, or an address, as a serial port; None when nothing speaks against it."""
+    if is_address(path):
+        return _address_problem(path)
     if os.name != "posix":
         return None  # COM3 is no file that could be looked at
     try:
@@ -194,6 +203,20 @@ def access_problem(path: str) -> str | None:
     if not os.access(path, os.R_OK | os.W_OK):
         return "no permission to open it"
     return None
+
+
+def _address_problem(url: str) -> str | None:
+    """What an address lacks: nobody is asked whether it answers."""
+    scheme = url.partition("://")[0]
+    if scheme not in NETWORKED:
+        choices = ", ".join(f"{each}://HOST:PORT" for each in NETWORKED)
+        return f"no servos can be behind {scheme}:// (a device such as /dev/ttyUSB0 or COM3, {choices})"
+    try:
+        parts = urlsplit(url)
+        complete = bool(parts.hostname) and parts.port is not None
+    except ValueError:  # a port that is no number, or none that there can be
+        complete = False
+    return None if complete else f"names no host and port to connect to ({scheme}://HOST:PORT)"
 
 
 def group_of(path: str) -> str:

@@ -21,11 +21,10 @@ import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
-from urllib.parse import urlsplit
 
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.ports import Clock
-from sfms_robot.servo.discovery import Holder, holders
+from sfms_robot.servo.discovery import Holder, access_problem, holders, is_address
 from sfms_robot.servo.serial_io import (
     DEVICE_ERRORS,
     WRITE_TIMEOUT_S,
@@ -42,7 +41,6 @@ log = logging.getLogger(__name__)
 
 _REPLY_TIMEOUT_S = 30.0  # real seconds: a stopped emulator, or one that waits for its turn on a busy machine
 _TERMINALS: Final = "/dev/pts/"
-_NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs behind which servos can be
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
 
 
@@ -146,7 +144,7 @@ class SerialPort:
             self._serial.baudrate = baud
         except (OSError, OverflowError, ValueError) as error:
             raise PortError(f"{self.name}: does not take {baud} baud: {error}") from error
-        if not _is_url(self.name):
+        if not is_address(self.name):
             _check_baud(self._serial, self.name)
 
     def close(self) -> None:
@@ -258,12 +256,9 @@ class VirtualTimePort:
 
 def _open(device: str, baud: int) -> serial.Serial:
     """Raises PortError of one line: missing, not permitted, held by somebody else, not a serial device."""
-    scheme = device.partition("://")[0] if _is_url(device) else ""
-    if scheme and scheme not in _NETWORKED:
-        choices = "a device such as /dev/ttyUSB0 or COM3, socket://HOST:PORT, rfc2217://HOST:PORT"
-        raise PortError(f"{device}: no servos can be behind {scheme}:// ({choices})")
-    if scheme and not _names_port(device):
-        raise PortError(f"{device}: names no host and port to connect to ({scheme}://HOST:PORT)")
+    scheme = device.partition("://")[0] if is_address(device) else ""
+    if scheme and (problem := access_problem(device)):
+        raise PortError(f"{device}: {problem}")
     import serial
 
     try:
@@ -305,19 +300,6 @@ def _check_baud(port: serial.Serial, device: str) -> None:
         raise PortError(f"{device}: the adapter cannot do {port.baudrate} baud (the nearest it has is {actual})")
 
 
-def _is_url(device: str) -> bool:
-    """socket://, rfc2217:// and the like; everything else is a path, relative ones too."""
-    return "://" in device
-
-
-def _names_port(url: str) -> bool:
-    try:
-        parts = urlsplit(url)
-        return bool(parts.hostname) and parts.port is not None
-    except ValueError:  # a port that is no number, or none that there can be
-        return False
-
-
 def _low_latency(port: serial.Serial) -> None:
     try:
         port.set_low_latency_mode(True)
@@ -326,7 +308,7 @@ def _low_latency(port: serial.Serial) -> None:
 
 
 def _reason(device: str, error: Exception) -> str:
-    if not _is_url(device) and os.name == "posix":
+    if not is_address(device) and os.name == "posix":
         if not os.path.exists(device):
             return "no such device"
         if os.path.isdir(device):

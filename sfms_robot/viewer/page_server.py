@@ -145,7 +145,7 @@ class PageServer:
         self._history.append((True, record))
 
     def tell(self, message: bytes, keep: bool = True) -> None:
-        """A message of docs/page.md, to everybody; `keep`: it belongs to the run."""
+        """A message of docs/protocol.md, to everybody; `keep`: it belongs to the run."""
         if keep:
             self._history.append((False, message))
         for visitor in self._visitors:

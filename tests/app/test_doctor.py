@@ -463,6 +463,21 @@ def test_every_command_that_is_proposed_is_one_that_the_program_has():
 
 def test_a_doctor_is_not_asked_about_unknown_things():
     with pytest.raises(ConfigError, match="dynamixel2"):
-        examine("sim", None, "dynamixel9", None, RealClock())
+        examine("/dev/null", None, "dynamixel9", None, RealClock())
     with pytest.raises(ConfigError, match="nobody"):
-        examine("sim", "nobody", "dynamixel2", None, RealClock())
+        examine("sim", "nobody", None, None, RealClock())
+
+
+@pytest.mark.parametrize("where", [{"port": "sim", "head": None}, {"port": "/dev/null", "head": "reachy_mini"}])
+@pytest.mark.parametrize(("flag", "value"), [("--baud", 57600), ("--family", "feetech")])
+def test_what_a_heads_file_says_is_not_said_once_more(where, flag, value):
+    said = {"family": None, "baud": None, flag.removeprefix("--"): value}
+    with pytest.raises(ConfigError, match=f"^{flag} {value}: head '{where['head'] or 'face28'}'"):
+        examine(**where, **said, clock=RealClock())
+
+
+@pytest.mark.parametrize("url", ["socket://nohost", "ftp://host:1"])
+def test_an_address_that_is_none_gets_no_advice_about_files(url):
+    report = examine(url, None, None, None, RealClock())
+    (finding,) = report["findings"]
+    assert report["exit_code"] == 3 and "://HOST:PORT" in finding["problem"] and "fuser" not in finding["fix"]

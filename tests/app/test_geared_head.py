@@ -101,5 +101,5 @@ def test_its_emulated_servo_hangs_where_its_turn_is_certain(tmp_path, end_deg):
 
 def test_the_doctor_wants_its_mode(tmp_path):
     geared(tmp_path)
-    report = examine("sim", str(tmp_path / "geared"), "dynamixel2", None, RealClock())
+    report = examine("sim", str(tmp_path / "geared"), None, None, RealClock())
     assert any("operating_mode is 3, wanted 4" in each["problem"] for each in report["findings"])

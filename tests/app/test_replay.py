@@ -109,7 +109,7 @@ def test_a_summary_counts(tmp_path):
     counted = summary(read_recording(record(tmp_path)))
     assert counted.pop("started_utc").startswith("20")
     assert counted == {
-        "head": "face28", "seed": "3", "duration_s": 1.99, "ticks": 200, "speaker_frames": 50, "plans": 50,
+        "head": "face28", "seed": 3, "duration_s": 1.99, "ticks": 200, "speaker_frames": 50, "plans": 50,
         "events": {}, "states": ["listening", "halted"], "hottest_C": 41.0, "joints": 3, "faults": 1, "whole": True,
     }  # fmt: skip
 

@@ -66,6 +66,10 @@ def test_a_recording_tells_what_ran_on_what_and_how(recorded):
     assert options["head"] == HEAD and options["fast"] and options["style"] == ["neck=1.5"]
 
 
+def test_the_seed_is_a_number_as_in_the_report(recorded, command_line):
+    assert repr(command_line("replay", recorded[0], "--json").told["seed"]) == repr(recorded[1]["seed"])
+
+
 def test_the_head_that_is_in_a_recording_is_a_head_file(recorded, tmp_path):
     (tmp_path / "head.yaml").write_text(read_recording(recorded[0]).about["head_yaml"])
     played = play_back(recorded[0], PlaybackOptions(str(tmp_path), fast=True))

@@ -36,6 +36,10 @@ def listener(folder: Path, weights: bytes) -> Path:
         (["--head", "face99"], 2, ["head 'face99'", "face28"]),
         (["--listener", "psychic"], 2, ["listener 'psychic'", "sfms-small"]),
         (["--port", "/dev/ttyNowhere", "--duration", 1], 3, ["/dev/ttyNowhere", "no such device"]),
+        (["--port", "socket://nohost"], 3, ["--port socket://nohost", "socket://HOST:PORT"]),
+        (["--port", "main=ftp://host:1"], 3, ["--port ftp://host:1", "/dev/ttyUSB0", "socket://HOST:PORT"]),
+        (["--addressed", "perhaps"], 2, ["--addressed perhaps", "sense, assume, never"]),
+        (["--calmness", "addressed=1"], 2, ["--calmness addressed", "nod, shake"]),
         *(([option, "x" * 300], 2, ["x" * 300]) for option in ("--audio", "--face", "--head", "--listener")),
     ],
 )
@@ -61,6 +65,40 @@ def test_a_picture_that_cannot_be_one(fails, tmp_path, option):
 def test_a_folder_without_maps_is_not_sound(fails, tmp_path):
     code, told = fails("servo", "maps", "--check", tmp_path)
     assert code == 2 and "no firmware map" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("bench", "startup", "--write"), "--write"),
+        (("export", "sfms-small", "--out"), "--out"),
+        (("servo", "dump", "--port", "sim"), "is there already"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_cannot_be_written_is_told_before_the_work(fails, tmp_path, words, said):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "file").write_text("mine")
+    where = tmp_path / ("there" if words[0] == "bench" else "file")
+    code, told = fails(*words, where)
+    assert code == 2 and said in told and str(where) in told and (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("words", [("servo", "scan"), ("doctor",)])
+def test_a_rate_that_no_servo_has_is_not_looked_at_for_minutes(fails, words):
+    code, told = fails(*words, "--port", "/dev/null", "--baud", 5)
+    assert code == 2 and "--baud 5" in told and "57600" in told
+
+
+def test_a_board_has_no_servos_to_look_at(fails):
+    code, told = fails("servo", "scan", "--port", "sim", "--head", "face24_maestro")
+    assert code == 2 and "--head face24_maestro" in told and "Maestro" in told
+
+
+def test_a_file_that_holds_no_keys(fails, tmp_path):
+    (tmp_path / "text.yaml").write_text("hello")
+    code, told = fails("servo", "restore", tmp_path / "text.yaml", "--port", "sim")
+    assert code == 2 and "text.yaml: is no mapping" in told
 
 
 def test_dyads_into_a_file(fails, tmp_path):

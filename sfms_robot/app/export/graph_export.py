@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import cast, get_args
 
+from sfms_robot.app.out_files import made_folder
 from sfms_robot.config.listener_kinds import LISTENER_KINDS
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
@@ -20,7 +21,7 @@ def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | 
     if weight_bits not in (None, *get_args(Bits)):
         raise ConfigError(f"--weight-bits {weight_bits}: must be 8, 16 or 32")
     folder = find("listeners", name, "config.yaml")
-    kind, target = LISTENER_KINDS[load_config(folder).kind], folder if out is None else out
+    kind, target = LISTENER_KINDS[load_config(folder).kind], folder if out is None else made_folder(out, "--out")
     weights = None if weight_bits is None else read_weights(folder / WEIGHTS)
     files = kind.export_folder(folder, target, int8)
     if weights is not None:

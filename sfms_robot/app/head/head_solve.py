@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +29,17 @@ log = logging.getLogger(__name__)
 class SolvedPoses:
     """One row per pose: the neck's joints in its own order (`solved.angles_rad` is (N, J))."""
 
+    head: str
     joints: Sequence[str]
     solved: Solved
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`: the joints, and of each pose their angles [rad], whether it is reached, and what is missing."""
+        columns = (each.tolist() for each in (self.solved.reached, self.solved.residual_rad, self.solved.residual_m))
+        rows = zip(self.solved.angles_rad.tolist(), *columns, strict=True)
+        keys = ("angles_rad", "reached", "residual_rad", "residual_m")
+        poses = [dict(zip(keys, row, strict=True)) for row in rows]
+        return {"version": 1, "head": self.head, "joints": list(self.joints), "poses": poses}
 
 
 def solve_poses(head_name: str, file: Path) -> SolvedPoses:
@@ -48,7 +58,7 @@ def solve_poses(head_name: str, file: Path) -> SolvedPoses:
         if body_yaw_rad.any():
             raise ConfigError(f"{file}: {BODY_COLUMN}: head {head.name!r} has no joint that turns its body")
         body_yaw_rad = None
-    return SolvedPoses(neck.joints, neck.solve(poses, body_yaw_rad))
+    return SolvedPoses(head.name, neck.joints, neck.solve(poses, body_yaw_rad))
 
 
 def read_poses(file: Path) -> tuple[Doubles, Doubles | None]:

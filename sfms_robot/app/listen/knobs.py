@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from threading import Lock
-from typing import Final
+from typing import Final, get_args
 
 from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import ConfigError, InputError
+from sfms_robot.frames import EVENT_KINDS
 from sfms_robot.retarget.channel_mapping import ChannelMapping as Face
 from sfms_robot.retarget.channel_mapping import Knobs
 
 STEP: Final = 0.1  # of a key
 MOST: Final = 2.0
 KNOB_KINDS: Final = ("intensity", "style")
+ADDRESSED: Final[tuple[str, ...]] = get_args(Calmness.model_fields["addressed"].annotation)
 
 
 class Knob:
@@ -110,6 +112,10 @@ def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ())
 def calmed(per_minute: Sequence[str] = (), addressed: str = "sense") -> Calmness:
     """What `--calmness` and `--addressed` ask for. Raises ConfigError for an unknown kind or a rate that cannot be."""
     asked = _values("--calmness", per_minute, "KIND=EVENTS A MINUTE")
+    if unknown := [kind for kind in asked if kind not in EVENT_KINDS]:
+        raise ConfigError(f"--calmness {unknown[0]}: no kind of event ({', '.join(EVENT_KINDS)})")
+    if addressed not in ADDRESSED:
+        raise ConfigError(f"--addressed {addressed}: none of {', '.join(ADDRESSED)}")
     return parse(Calmness, {**asked, "addressed": addressed}, "--calmness")
 
 

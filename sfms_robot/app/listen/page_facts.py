@@ -1,4 +1,4 @@
-"""What a page is told of a run when it begins: the `hello` of docs/page.md, but for what differs between visitors."""
+"""What a page is told of a run when it begins: the `hello` of docs/protocol.md, but for what visitors differ in."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.listeners.plugins import listener_folder
-from sfms_robot.servo.discovery import access_problem
+from sfms_robot.servo.discovery import access_problem, is_address
 from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
@@ -45,8 +45,8 @@ def check_names(
         StatusServer(status).close()
     for part in port.split(","):
         device = part.rpartition("=")[2]
-        if device.startswith("/") and (problem := access_problem(device)):
-            raise PortError(f"{device}: {problem}")
+        if (device.startswith("/") or is_address(device)) and (problem := access_problem(device)):
+            raise PortError(f"--port {device}: {problem}")
 
 
 def engine_named(name: str) -> EngineName:

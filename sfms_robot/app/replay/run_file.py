@@ -144,8 +144,11 @@ def states_of(folder: Path) -> list[tuple[float, str, tuple[str, ...]]]:
 
 def summary(recording: RunRecording) -> dict[str, Any]:
     """What is in a recording, for the command line."""
+    told: dict[str, Any] = {key: value for key, value in recording.about.items() if key not in LONG}
+    if told.get("seed", "").isdecimal():  # what a run writes about itself is text
+        told["seed"] = int(told["seed"])
     return {
-        **{key: value for key, value in recording.about.items() if key not in LONG},
+        **told,
         "duration_s": round(recording.listened_s, 3),
         "ticks": len(recording.times_s),
         "speaker_frames": len(recording.heard_s),

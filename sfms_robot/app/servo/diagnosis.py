@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 from sfms_robot.app.servo.budget import Budget
 from sfms_robot.app.servo.register_view import State
 from sfms_robot.app.servo.serial_line import SIM, FoundServo
-from sfms_robot.servo.discovery import Holder, SerialDevice
+from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
 
@@ -116,6 +116,9 @@ def judge_port(path: str, problem: str | None, group: str, ports: Sequence[Seria
     """Before opening: is it there, is it a port, may we."""
     if problem is None:
         return
+    if is_address(path):
+        yield Finding("error", path, problem, "correct --port")
+        return
     if "permission" in problem:
         yield Finding("error", path, problem, f"sudo usermod -aG {group} $USER, then log out and in again")
         return
@@ -127,7 +130,9 @@ def judge_port(path: str, problem: str | None, group: str, ports: Sequence[Seria
 def judge_opening(path: str, failure: str, held_by: Sequence[Holder]) -> Iterator[Finding]:
     """It could not be opened."""
     problem = failure.removeprefix(f"{path}: ")
-    if not held_by:
+    if is_address(path):
+        yield Finding("error", path, problem, "is the address right, and does whoever serves it run?")
+    elif not held_by:
         yield Finding("error", path, problem, f"see who has it open: sudo fuser -v {path}")
     for holder in held_by:
         yield Finding("error", path, f"is open in process {holder.pid} ({holder.command})", f"kill {holder.pid}")

@@ -32,7 +32,7 @@ from sfms_robot.app.servo.diagnosis import (
 )
 from sfms_robot.app.servo.protocol_hint import protocol_hint
 from sfms_robot.app.servo.register_view import State, read_all
-from sfms_robot.app.servo.serial_line import SIM, FoundServo, Wire, only_port, table_of
+from sfms_robot.app.servo.serial_line import SIM, FoundServo, Wire, check_baud, only_port, table_of
 from sfms_robot.app.servo.single_servo import Confirm, Progress, field_named, guard, has_duplicate, put, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay
@@ -49,6 +49,8 @@ from sfms_robot.servo.stored_settings import JointNeeds
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_RATE_HZ: Final = 100.0
+DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
+DEFAULT_FAMILY: Final = "dynamixel2"
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
 _NOTHING_SEEN: Final[dict[str, Any]] = {
     "adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": [],
@@ -76,7 +78,7 @@ class Line:
 def examine(
     port: str | None,
     head: str | None,
-    family: str,
+    family: str | None,
     baud: int | None,
     clock: Clock,
     progress: Progress | None = None,
@@ -84,12 +86,20 @@ def examine(
 ) -> dict[str, Any]:
     """Every bus of a head, or one port; the report, whose `exit_code` is that of the command.
 
+    `family` (None: dynamixel2) and `baud` (None: every rate) are of a port alone: a head's file says both of each bus.
     `fix` is asked before each stored value that can be mended without harm is; None mends nothing.
 
     Raises ConfigError for a head, a family or a port description that cannot be used.
     """
+    if head is None and port == SIM:
+        head = DEFAULT_HEAD
+    for key, value in (("--family", family), ("--baud", baud)):
+        if head is not None and value is not None:
+            raise ConfigError(f"{key} {value}: head {head!r} says that of each of its buses; leave out one of the two")
+    family = DEFAULT_FAMILY if family is None else family
     if family not in servo_families():
         raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
+    check_baud(family, baud)
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
         buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress, fix) for line in lines]
@@ -110,7 +120,7 @@ def examine_line(
 ) -> dict[str, Any]:
     """One port: report with `adapter`, `servos`, `budget`, `fixed`, `findings`, `exit_code`."""
     path = line.device
-    problem = None if "://" in path else access_problem(path)
+    problem = access_problem(path)
     report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
     findings = list(judge_port(path, problem, group_of(path), list_ports()))
     if problem is None:
@@ -144,12 +154,9 @@ def _is_terminal(path: str) -> bool:
 
 def _lines(port: str | None, head: str | None, family: str, baud: int | None, stack: ExitStack) -> Iterator[Line]:
     if head is None:
-        if port == SIM:
-            head = "face28"
-        else:
-            device = port or only_port()
-            yield Line(None, device, device, family, baud, DEFAULT_RATE_HZ, {})
-            return
+        device = port or only_port()
+        yield Line(None, device, device, family, baud, DEFAULT_RATE_HZ, {})
+        return
     from sfms_robot.app.wiring import devices, plugged_in  # slow to load, and only a head needs it
 
     described = load_head(head)

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import yaml
 
+from sfms_robot.app.out_files import checked_file
 from sfms_robot.app.servo.register_view import read_all
 from sfms_robot.app.servo.serial_line import FoundServo, Wire
 from sfms_robot.app.servo.single_servo import Confirm, guard, put, set_baud, set_id
@@ -42,6 +43,13 @@ def dump(wire: Wire, servos: list[FoundServo]) -> Dump:
             id=seen.id, model=model, model_number=seen.model_number, firmware=seen.firmware, registers=values
         ))  # fmt: skip
     return Dump(servos=tuple(found))
+
+
+def check_new(file: Path) -> None:
+    """Whether a dump can be written there. Raises ConfigError, as `save_dump` does for a file that is there already."""
+    if file.exists():
+        raise ConfigError(f"{file}: is there already, name another file")
+    checked_file(file, "servo dump")
 
 
 def save_dump(what: Dump, file: Path) -> None:

@@ -19,8 +19,8 @@ from sfms_robot.errors import BusError, ConfigError, PortError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.chain.link import Found, RegisterLink
-from sfms_robot.servo.discovery import access_problem, list_ports
-from sfms_robot.servo.families import BusFamily, servo_families
+from sfms_robot.servo.discovery import access_problem, is_address, list_ports
+from sfms_robot.servo.families import BusFamily, family_named, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 
@@ -151,11 +151,18 @@ def open_wire(
     `baud` None means: look at every rate. Raises PortError, ConfigError.
     """
     kind = _family(family)
+    check_baud(family, baud)
     with ExitStack() as stack:
         if port == SIM:
             from sfms_robot.app.wiring import plugged_in  # its numerics take longer to load than most tools to run
 
-            servos = next(iter(plugged_in(head, load_head(head)).values()))
+            described = load_head(head)
+            hangs_on = family_named(next(iter(described.buses.values())).family)
+            if hangs_on.board:
+                raise ConfigError(
+                    f"--head {head}: its servos hang on a {hangs_on.title}: no ids or registers to look at"
+                )
+            servos = next(iter(plugged_in(head, described).values()))
             device, first = stack.enter_context(launch(servos)).device, servos[0].baud
         else:
             device, first = port or only_port(), kind.bauds[0]
@@ -163,6 +170,14 @@ def open_wire(
         line = SerialPort(device, baud or first, clock)
         stack.callback(line.close)
         yield Wire(line, family, clock, baud or first, baud is not None, model)
+
+
+def check_baud(family: str, baud: int | None) -> None:
+    """Raises ConfigError for a rate beyond those of the family: at 5 baud a question takes minutes."""
+    kind = _family(family)
+    if baud is not None and kind.bauds and not min(kind.bauds) <= baud <= max(kind.bauds):
+        rates = ", ".join(str(each) for each in sorted(kind.bauds))
+        raise ConfigError(f"--baud {baud}: no rate of {kind.title} servos ({rates})")
 
 
 def real_clock() -> Clock:
@@ -182,9 +197,9 @@ def only_port() -> str:
 
 def check_device(device: str) -> None:
     """Raises PortError for a path that cannot be a serial port, before anything is opened."""
-    if "://" in device:
-        return
     problem = access_problem(device)
+    if problem is not None and is_address(device):
+        raise PortError(f"{device}: {problem}")
     if problem is not None and "permission" not in problem:  # opening says what to do about permissions
         there = ", ".join(each.by_id or each.path for each in list_ports()) or "none"
         raise PortError(f"{device}: {problem} (serial ports here: {there})")

@@ -1,11 +1,11 @@
 """Requests to Dynamixel Protocol 2.0 servos and their answers, over a `Port`.
 
-The vendor SDK builds what is sent on every tick, and this is the only file that knows it. A request that is sent
-again is not built again: reads go out as they were, and of a sync write only the data and the crc are new. Single
-writes are built by our own codec, because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
+The vendor's SDK builds what is sent on every tick (`sdk_packets`). A request that is sent again is not built again:
+reads go out as they were, and of a sync write only the data and the crc are new. Single writes are built by our own
+codec, because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
 
-Answers are not read by the SDK, which waits at least 34 ms, spins meanwhile and stops at the first failure, but from
-the byte stream: by id and length, so that a late or foreign reply can never be taken for another one.
+Answers are read from the byte stream: by id and length, so that a late or foreign reply can never be taken for another
+one.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
 
-from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
+from sfms_robot.servo.chain.sdk_packets import SdkPackets2
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, maybe_packet
 from sfms_robot.servo.port import Port
@@ -31,30 +30,12 @@ _BODY: Final = 7  # where the instruction of a packet stands
 _SYNC_DATA: Final = 12  # where the first id of a sync write stands
 
 
-class _Draft:
-    """Our port as the SDK's packet builders see one: what they send is kept instead."""
-
-    def __init__(self) -> None:
-        self.is_using = False
-        self.packet = b""
-
-    def clearPort(self) -> None:
-        """Sending does that."""
-
-    def writePort(self, packet: Sequence[int]) -> int:
-        self.packet = bytes(packet)
-        return len(packet)
-
-    def setPacketTimeout(self, packet_length: int) -> None:
-        """The SDK sets it after each request; we have our own deadlines."""
-
-
 class Dynamixel2Link(RegisterLink):
     """One wire of Protocol 2.0 servos."""
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
-        self._sdk = Protocol2PacketHandler()
+        self._sdk = SdkPackets2()
         self._requests: dict[tuple[object, ...], bytes] = {}
         self._writes: dict[tuple[int, int, tuple[int, ...]], _SyncWrite] = {}
         self._sent = 0
@@ -90,11 +71,7 @@ class Dynamixel2Link(RegisterLink):
         return self._answer(servo, 0)
 
     def read(self, servo: int, address: int, length: int) -> Answer | None:
-        self._send(
-            self._request(
-                ("read", servo, address, length), lambda draft: self._sdk.readTx(draft, servo, address, length)
-            )
-        )
+        self._send(self._request(("read", servo, address, length), lambda: self._sdk.read(servo, address, length)))
         return self._answer(servo, length)
 
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
@@ -122,9 +99,7 @@ class Dynamixel2Link(RegisterLink):
         if write is None:
             if len(self._writes) >= _WRITES_KEPT:
                 self._writes.clear()
-            blank = [byte for servo in servos for byte in (servo, *[0] * length)]
-            build = self._build(lambda draft: self._sdk.syncWriteTxOnly(draft, address, length, blank, len(blank)))
-            write = self._writes[key] = _SyncWrite(build, length)
+            write = self._writes[key] = _SyncWrite(self._sdk.sync_write(address, length, servos), length)
         self._send(write.packet(data))
 
     def sync_read(self, address: int, length: int, servos: Sequence[int]) -> dict[int, Answer]:
@@ -175,23 +150,16 @@ class Dynamixel2Link(RegisterLink):
     def _read_request(self, address: int, length: int, servos: Sequence[int], fast: bool) -> bytes:
         return self._request(
             (address, length, fast, *servos),
-            lambda draft: self._sdk.syncReadTx(draft, address, length, servos, len(servos), fast),
+            lambda: self._sdk.sync_read(address, length, servos, fast),
         )
 
-    def _request(self, key: tuple[object, ...], build: Callable[[_Draft], int]) -> bytes:
+    def _request(self, key: tuple[object, ...], build: Callable[[], bytes]) -> bytes:
         packet = self._requests.get(key)
         if packet is None:
             if len(self._requests) >= _REQUESTS_KEPT:
                 self._requests.clear()
-            packet = self._requests[key] = self._build(build)
+            packet = self._requests[key] = build()
         return packet
-
-    def _build(self, build: Callable[[_Draft], int]) -> bytes:
-        draft = _Draft()
-        result = build(draft)
-        if result != COMM_SUCCESS:
-            raise PacketError(f"{self.port.name}: the request cannot be built: {self._sdk.getTxRxResult(result)}")
-        return draft.packet
 
     def _send(self, packet: bytes) -> None:
         self.port.discard_input()

@@ -1,6 +1,6 @@
 """Requests to servos that speak the FF FF frame, Dynamixel 1.0 or Feetech, and their answers, over a `Port`.
 
-The vendor SDK builds the Dynamixel packets, our codec those of Feetech, which differ in instructions only.
+The vendor's SDK builds the Dynamixel packets (`sdk_packets`), our codec those of Feetech: other instructions alone.
 
 The frame does not say what an answer answers, so an answer that comes late could pass for the next one. Three rules
 keep it out: an answer counts only from an id that was asked and with the number of bytes that was asked for; what
@@ -14,10 +14,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Literal
 
-from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler
-
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
+from sfms_robot.servo.chain.sdk_packets import SdkPackets1
 from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, OVERHEAD, Frame, encode, maybe_frame, salvage
 from sfms_robot.servo.port import Port
@@ -29,29 +28,13 @@ _FENCES: Final = 2  # of a group at most: answers share one wire, so those behin
 _STAGGER_S: Final = 0.003  # lerobot @7427f31, motors/feetech/feetech.py: what a broadcast ping may take per id
 
 
-class _SdkPort:
-    """Our port as the SDK's packet builder sees one: it clears, then writes."""
-
-    def __init__(self, write: Callable[[bytes], None]) -> None:
-        self.is_using = False
-        self._write = write
-
-    def clearPort(self) -> None:
-        """The link does, whoever built the packet."""
-
-    def writePort(self, packet: Sequence[int]) -> int:
-        self._write(bytes(packet))
-        return len(packet)
-
-
 class Protocol1Link(RegisterLink):
     """One wire; `family` is whose instructions are spoken."""
 
     def __init__(self, port: Port, baud: int, silence_s: float, family: Family) -> None:
         super().__init__(port, baud, silence_s)
         self.family = family
-        self._sdk = Protocol1PacketHandler()
-        self._sdk_port = _SdkPort(self._write)
+        self._build = SdkPackets1().instruction if family == "dynamixel" else encode
         self._sent = b""
         self._owed: dict[int, dict[int, float]] = {}
         self._echoed = False
@@ -177,16 +160,7 @@ class Protocol1Link(RegisterLink):
 
     def _send(self, servo: int, code: int, params: bytes) -> None:
         self.port.discard_input()
-        if self.family == "feetech":
-            self._write(encode(servo, code, params))
-            return
-        packet = [0, 0, servo, len(params) + 2, code, *params, 0]
-        result = self._sdk.txPacket(self._sdk_port, packet)
-        self._sdk_port.is_using = False
-        if result != COMM_SUCCESS:
-            raise PacketError(f"{self.port.name}: the request was not sent: {self._sdk.getTxRxResult(result)}")
-
-    def _write(self, packet: bytes) -> None:
+        packet = self._build(servo, code, params)
         self.port.write(packet)
         self._sent = packet
 

@@ -1,0 +1,73 @@
+"""docs/protocol.md says of the page's WebSocket what the code does: every message, every key, every limit."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sfms_robot
+from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.page_facts import page_facts
+from sfms_robot.config import Calmness, load_head
+from sfms_robot.frames import MOTION_DIM
+from sfms_robot.viewer.frame_record import Picture, frame_json, pack_picture, rare_json
+from sfms_robot.viewer.visitor_commands import COMMANDS, LONGEST_COMMAND, LONGEST_PERSON, VERSION
+from sfms_robot.viewer.visitors import COMMAND_S, MOST_MALFORMED, OUTBOX, PERSON_S
+
+DOCS = Path(sfms_robot.__file__).parents[1] / "docs"
+PAGE = (DOCS / "protocol.md").read_text(encoding="utf-8").partition("## The page's WebSocket\n")[2]
+TOLD, ASKED = PAGE.partition("### What a page is told\n")[2].split("### What a page asks for\n")
+OF_VISITORS = {"controls", "needs_token", "over", "record"}  # of a hello: they differ between visitors, or change
+
+
+def rows(part: str) -> dict[str, set[str]]:
+    """Message -> every word in backticks of what a table says of it."""
+    table = [re.findall(r"^\| (`.+?) \| (.*) \|$", line) for line in part.splitlines()]
+    words = [
+        (re.findall(r"`(\w+)`", names), set(re.findall(r"`(\w+)`", text))) for [(names, text)] in filter(None, table)
+    ]
+    return {name: found for names, found in words for name in names}
+
+
+def test_every_command_is_described_with_all_its_keys():
+    described = rows(ASKED)
+    assert set(described) == set(COMMANDS)
+    for name, keys in COMMANDS.items():
+        assert set(keys) - {"seconds"} <= described[name], name
+        assert ("seconds" in described[name]) == ("seconds" in keys), name
+
+
+def test_every_message_to_a_page_is_described():
+    kinds = ("hello", "frame", "event", "status", "controls", "record", "over", "error", "pong")
+    assert tuple(rows(TOLD)) == kinds
+
+
+def test_every_key_of_a_hello_is_described():
+    head = load_head("face28")
+    facts = page_facts(
+        head, port="sim", listener="sfms-small", speaker=None, seed=0, calmness=Calmness(), people={},
+        knobs=turned(head), source={"voice": False, "face": False}, choices=True,
+    )  # fmt: skip
+    keys = set(facts) | OF_VISITORS | set(facts["joints"][0]) | set(facts["listeners"][0]) | set(facts["source"])
+    assert keys <= rows(TOLD)["hello"]
+
+
+def test_every_key_of_a_frame_is_described():
+    picture = Picture(0.0, np.zeros(MOTION_DIM), np.zeros(1), np.zeros(1, np.float32), rare_json("idle", (), {}, None))
+    assert set(json.loads(frame_json(pack_picture(picture)))) - {"type"} <= rows(TOLD)["frame"]
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        f"version {VERSION},",
+        f"{LONGEST_COMMAND} characters",
+        f"{LONGEST_PERSON} bytes",
+        f"{1 / COMMAND_S:g} a second, sound and faces at {1 / PERSON_S:g}",
+        f"{OUTBOX} messages unread",
+    ],
+)
+def test_limits_are_those_of_the_code(said):
+    assert said in PAGE and MOST_MALFORMED == 100  # "the hundred and first"

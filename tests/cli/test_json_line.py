@@ -1,0 +1,71 @@
+"""`--json`: every command has it, prints it in one place, and what it prints is JSON to a reader that is strict."""
+
+import ast
+import io
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import pytest
+import typer
+from ended import Ended
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.cli import json_line
+from sfms_robot.cli.main import app
+from sfms_robot.cli.show import cell
+
+FILES = sorted(Path(json_line.__file__).parent.glob("*.py"))
+FIGURES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.lists(inner).map(tuple) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+def finite(value):
+    """Two lists of figures are the same where these are: tuples are lists, what is no number is nothing."""
+    if isinstance(value, dict):
+        return {key: finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(each) for each in value]
+    return None if value in (float("inf"), float("-inf")) or value != value else value
+
+
+@given(told=st.dictionaries(st.text(), FIGURES))
+def test_whatever_a_command_tells_is_one_line_of_json(told):
+    with redirect_stdout(io.StringIO()) as out:
+        json_line.print_json(told)
+    assert out.getvalue().count("\n") == 1 and Ended(0, out.getvalue(), "").told == finite(told)
+
+
+def test_figures_that_cannot_be_told_are_null(capsys):
+    nothing = float("nan")
+    json_line.print_json({"auc": nothing, "interval": (nothing, float("inf")), "rows": [{"share": -float("inf")}]})
+    assert capsys.readouterr().out == '{"auc": null, "interval": [null, null], "rows": [{"share": null}]}\n'
+    assert cell(nothing) == "-" == cell(None)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_json_is_printed_in_one_place(file):
+    found = {
+        alias.name
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
+    assert not found & {"json", "orjson"} or file.stem == "json_line"
+
+
+def commands(command, words=()):
+    """Every command of the program, as (words, command)."""
+    inner = getattr(command, "commands", {})
+    for name, each in inner.items():
+        yield from commands(each, (*words, name))
+    if not inner:
+        yield " ".join(words), command
+
+
+@pytest.mark.parametrize(("words", "command"), [*commands(typer.main.get_command(app))])
+def test_every_command_has_it(words, command):
+    assert any("--json" in each.opts for each in command.params), words
