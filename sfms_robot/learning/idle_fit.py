@@ -2,21 +2,23 @@
 
 Both are cut into windows of two seconds in which nothing of the face is under way: no blink, no smile, no word. By band
 the covariance of people's channels less that of the listener's is what it lacks; its largest eigenvectors, region by
-region, are the patterns, and their powers by band the spectrum. The slowest band is what differs from window to window,
-and where people rest less where the listener does is what it lacks of the mean.
+region, are the patterns, and their powers by band the spectrum, less what such short windows show of other bands. The
+slowest band is what differs from window to window, of whichever person. Where the listener and its patterns together
+rest, and where people do, are quantiles of all frames of these windows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
-from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, IdleMotion
+from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, KNOTS, STEEPEST, IdleMotion
 from sfms_robot.signals.events import runs
 
 WINDOW: Final = 2 * FRAME_HZ
@@ -29,6 +31,7 @@ REGIONS: Final = {
 }
 PATTERNS: Final = 4  # of each region, at most
 LEAST: Final = 0.001  # deviation of a pattern that is worth drawing, in every channel together
+AT: Final = (0.01, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99)  # quantiles
 _SOUND: Final = 1e-3
 
 
@@ -61,49 +64,88 @@ def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
     if not people or not listener:
         raise ValueError("no two seconds in which a face rests")
     lacking = covariances(people) - covariances(listener)  # (BANDS, C, C)
-    off = _mean(people) - _mean(listener)
-    rest, loadings, amplitudes = np.zeros(len(BLENDSHAPES), np.float32), [], []
-    for prefixes in REGIONS.values():
-        rows = np.array([at for at, name in enumerate(BLENDSHAPES) if name.startswith(prefixes)])
-        rest[rows] = off[rows]  # where eyes look is not the face's
+    loadings, amplitudes = [], []
+    for rows in map(_of_region, REGIONS):
         part = lacking[:, rows[:, None], rows]
         power, patterns = np.linalg.eigh(part.sum(0))
         for value, pattern in sorted(zip(power.tolist(), patterns.T, strict=True), key=lambda one: -one[0])[:PATTERNS]:
             if value < LEAST**2:
                 break
-            by_band = np.clip(np.einsum("c,bcd,d->b", pattern, part, pattern), 0, None)
+            by_band = unleaked(np.einsum("c,bcd,d->b", pattern, part, pattern))
             loading = np.zeros(len(BLENDSHAPES))
-            loading[rows] = np.sqrt(value) * pattern
+            loading[rows] = np.sqrt(by_band.sum()) * pattern
             loadings.append(loading)
             amplitudes.append(np.sqrt(by_band / by_band.sum()))
-    return IdleMotion(
+    idle = IdleMotion(
         np.array(loadings, np.float32).reshape(-1, len(BLENDSHAPES)),
         np.array(amplitudes, np.float32).reshape(-1, BANDS).T,
         _spread(people),
-        rest,
+        *np.zeros((2, KNOTS, len(BLENDSHAPES)), np.float32),
     )
+    held, shown = _quantiles(idle, people, listener)
+    return replace(idle, held=held, shown=shown)
 
 
-def _mean(faces: Sequence[Floats]) -> Doubles:
-    """(C,) of all windows (W, 50, C)."""
-    return np.asarray(np.concatenate(faces).mean(axis=(0, 1), dtype=np.float64), np.float64)
+def _of_region(region: str) -> NDArray[np.intp]:
+    return np.array([at for at, name in enumerate(BLENDSHAPES) if name.startswith(REGIONS[region])])
+
+
+def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """(KNOTS, C) each: of the listener's windows with what it lacks, and of people's; where eyes look is not the
+    face's, and stays. Neighbours of people's are no further apart than a map may be steep, told from the middle.
+    """
+    rng = np.random.default_rng(0)
+    rest = np.concatenate(listener).reshape(-1, len(BLENDSHAPES)).astype(np.float64)
+    lots = rng.standard_normal((len(rest), len(idle.loadings)))
+    lots *= np.exp(idle.spread * rng.standard_normal((len(rest), 1)) - idle.spread**2)
+    held = np.quantile(rest + lots @ idle.loadings, AT, axis=0)
+    shown = held.copy()
+    wanted = np.quantile(np.concatenate(people).reshape(-1, len(BLENDSHAPES)), AT, axis=0)
+    middle = KNOTS // 2
+    steps = np.minimum(np.diff(wanted, axis=0), STEEPEST * np.diff(held, axis=0))
+    at = np.concatenate([np.zeros((1, len(BLENDSHAPES))), np.cumsum(steps, axis=0)])
+    for rows in map(_of_region, REGIONS):
+        shown[:, rows] = (at - at[middle] + wanted[middle])[:, rows]
+    return held.astype(np.float32), shown.astype(np.float32)
+
+
+def unleaked(seen: Doubles) -> Doubles:
+    """(BANDS,) powers of a process of which windows of two seconds show `seen` (BANDS,): none is negative.
+
+    A line of a band is seen in others too, above all one that is slower than a window is long.
+    """
+    return np.asarray(nnls(_leakage(), seen)[0], np.float64)
+
+
+def _leakage() -> Doubles:
+    """(BANDS, BANDS): what `covariances` finds in each band, mean over windows, of power 1 in another."""
+    edges = np.array(BANDS_HZ)
+    hz = edges[:-1] + (np.arange(64)[:, None] + 0.5) / 64 * np.diff(edges)  # (64, BANDS)
+    turn = np.exp(2j * np.pi * hz.T[:, :, None] / FRAME_HZ * np.arange(WINDOW))  # (BANDS, 64, 50)
+    power = np.abs(np.fft.fft(turn, axis=-1) / WINDOW) ** 2  # of lines a + ib: half of it at f, half at -f
+    both = (power + np.roll(power[..., ::-1], 1, axis=-1)) / 2
+    found = np.zeros((BANDS, BANDS))
+    found[0] = both[..., 0].mean(1)
+    band = np.searchsorted(BANDS_HZ, np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ), side="right") - 1
+    for at in range(1, BANDS):
+        found[at] = 2 * both[..., : WINDOW // 2 + 1][..., band == at].sum(-1).mean(1)
+    return found
 
 
 def covariances(faces: Sequence[Floats]) -> Doubles:
-    """(BANDS, C, C) of windows (W, 50, C) of several people, each about his own mean."""
+    """(BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
+    windows = np.concatenate(faces)
     hz = np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ)
     band = np.searchsorted(BANDS_HZ, hz, side="right") - 1
-    channels = faces[0].shape[-1]
+    channels = windows.shape[-1]
+    means = windows.mean(axis=1, dtype=np.float64)
     found = np.zeros((BANDS, channels, channels))
-    count = sum(map(len, faces))
-    for windows in faces:
-        means = windows.mean(axis=1, dtype=np.float64)
-        off = means - means.mean(0)
-        found[0] += off.T @ off / count
-        lines = np.fft.rfft(windows - means[:, None], axis=1) / WINDOW  # (W, F, C)
-        for at in range(1, BANDS):
-            chosen = lines[:, band == at].reshape(-1, channels)
-            found[at] += 2 * np.real(chosen.conj().T @ chosen) / count
+    off = means - means.mean(0)
+    found[0] = off.T @ off / len(windows)
+    lines = np.fft.rfft(windows - means[:, None], axis=1) / WINDOW  # (W, F, C)
+    for at in range(1, BANDS):
+        chosen = lines[:, band == at].reshape(-1, channels)
+        found[at] = 2 * np.real(chosen.conj().T @ chosen) / len(windows)
     return found
 
 

@@ -12,6 +12,7 @@ HEAD = frozenset(
 )
 
 LATERAL = frozenset((*LATERAL_POSE, "rotation_y", "rotation_z", "translation_x", "head_y", "head_z"))
+SHIFTING = frozenset(("x", "y", "z", *(f"translation_{axis}" for axis in "xyz")))
 
 
 def head_channels(channels: Sequence[str]) -> list[int]:
@@ -22,3 +23,8 @@ def head_channels(channels: Sequence[str]) -> list[int]:
 def lateral_channels(channels: Sequence[str]) -> list[int]:
     """Which of the `head_channels` a mirror turns around, by their place among those."""
     return [at for at, index in enumerate(head_channels(channels)) if channels[index] in LATERAL]
+
+
+def shifting_channels(channels: Sequence[str]) -> list[int]:
+    """Which of the `head_channels` move the head without turning it, by their place among those."""
+    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in SHIFTING]

@@ -4,12 +4,16 @@ Keyframes pay for events: what moves by a hundredth is drawn as stillness, and a
 with the slow sway of a head there is nothing to predict in it, so it is drawn from what recorded faces do and tokens
 leave out (Shinozuka's spectral representation of a stationary Gaussian process),
 
-    x(t) = rest + size * sum over k of  loadings[k] * sum over l of  amplitude[l, k] (a cos 2 pi f t + b sin 2 pi f t),
+    x(t) = size * sum over k of  loadings[k] * sum over l of  amplitude[l, k] (a cos 2 pi f t + b sin 2 pi f t),
 
 components k, lines l, a, b ~ N(0, 1), `LINES` frequencies drawn from each of the `BANDS_HZ` per component, `size` a
-stream's own. Components are patterns of channels that move together; `rest` is how far from people the codes rest. A
-function of the seed and of time alone: a plan may be made anew, or in other pieces, and shows the same. It sets in over
-the first `EASE_S`. Faces never go below 0 nor above 1.
+stream's own. Components are patterns of channels that move together. A function of the seed and of time alone: a plan
+may be made anew, or in other pieces, and shows the same. It sets in over the first `EASE_S`.
+
+What a listener draws and this together rest elsewhere than people do, and not as bells do: a muscle is slack for a
+third of the time, and hardly ever far above its middle. So each channel goes through a map that never falls, from its
+own quantiles at rest (`held`) to people's (`shown`), and above them, where events are, goes on by the last difference.
+Faces never go below 0 nor above 1.
 """
 
 from __future__ import annotations
@@ -32,27 +36,62 @@ LINES: Final = 3  # of each band
 LARGEST: Final = 0.5  # no resting face moves so far
 _SEED: Final = 0x1D1E  # apart from what else a stream draws by its seed
 _COUNT: Final = MOTION_DIM - SHAPES.start
-_TENSORS: Final = ("loadings", "amplitude", "spread", "rest")
+KNOTS: Final = 9  # of the map of each channel
+STEEPEST: Final = 2.0
+_ROUNDING: Final = 1e-6
+_TENSORS: Final = ("loadings", "amplitude", "spread", "held", "shown")
+
+
+@dataclass(frozen=True)
+class RestMap:
+    """Maps of 52 channels, pieces of straight lines: below the first knot and above the last a channel is moved, no
+    more. 0 and above stays so.
+
+    Attributes:
+        base: (52,) what is added everywhere.
+        low: (52, J) where each piece begins.
+        width: (52, J) how long it is.
+        gain: (52, J) how much steeper than 1.
+    """
+
+    base: Doubles
+    low: Doubles
+    width: Doubles
+    gain: Doubles
+
+    @classmethod
+    def between(cls, held: Floats, shown: Floats) -> RestMap:
+        """From values (J + 1, 52), which never fall, to others."""
+        low, width = held[:-1].T.astype(np.float64), np.diff(held, axis=0).T.astype(np.float64)
+        gain = np.diff(shown, axis=0).T / np.maximum(width, 1e-9) - 1
+        return cls((shown[0] - held[0]).astype(np.float64), low, width, gain)
+
+    def off(self, shapes: Doubles) -> Doubles:
+        """How far the map takes shapes (N, 52)."""
+        part = shapes[:, :, None] - self.low
+        np.minimum(np.maximum(part, 0, out=part), self.width, out=part)
+        return np.asarray(self.base + np.einsum("ncj,cj->nc", part, self.gain), np.float64)
 
 
 @dataclass(frozen=True)
 class IdleStream:
     """One stream's own: of every line, which is one cosine, frequency [rad/s], size and phase [rad], (L, K) each;
-    loadings (K, 52), rest (52,).
+    loadings (K, 52), and the map of where it rests.
     """
 
     frequency: Doubles
     size: Doubles
     phase: Doubles
     loadings: Doubles
-    rest: Doubles
+    rest: RestMap
 
     def added(self, frames: Floats, times_s: Doubles) -> Floats:
         """Motion (N, 58) with the idle motion of times (N,) since the stream began: a new array."""
-        parts = sum_of_lines(times_s, self.frequency, self.size, self.phase)  # (N, K)
-        eased = (parts @ self.loadings + self.rest) * set_in(times_s)[:, None]
+        parts = sum_of_lines(times_s[:, None], self.frequency, self.size, self.phase)  # (N, K)
+        idle = parts @ self.loadings  # (N, 52)
+        idle += self.rest.off(frames[:, SHAPES] + idle)
         out = frames.copy()
-        out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + eased, 0), 1)
+        out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + idle * set_in(times_s)[:, None], 0), 1)
         return out
 
 
@@ -64,13 +103,14 @@ class IdleMotion:
         loadings: (K, 52) how far each blendshape goes with a component, of deviation 1.
         amplitude: (BANDS, K) deviation of each component within each band; of all bands together about 1.
         spread: deviation of the logarithm of sizes between people.
-        rest: (52,) mean of people's resting faces less that of the listener's.
+        held, shown: (KNOTS, 52) quantiles of what the listener's resting face does with this, and of people's.
     """
 
     loadings: Floats
     amplitude: Floats
     spread: float
-    rest: Floats
+    held: Floats
+    shown: Floats
 
     def start(self, seed: int) -> IdleStream:
         """A stream's own, by lot of its seed."""
@@ -82,8 +122,9 @@ class IdleMotion:
         factors = size * rng.standard_normal((2, bands, LINES, parts)) * (self.amplitude / math.sqrt(LINES))[:, None]
         cosine, sine = factors.reshape(2, bands * LINES, parts)
         sizes, phase = as_cosines(cosine, sine)
-        frequency = 2 * math.pi * frequency_hz.reshape(-1, parts)
-        return IdleStream(frequency, sizes, phase, self.loadings.astype(np.float64), self.rest.astype(np.float64))
+        frequency = 2 * math.pi * frequency_hz.reshape(bands * LINES, parts)
+        rest = RestMap.between(self.held, self.shown)
+        return IdleStream(frequency, sizes, phase, self.loadings.astype(np.float64), rest)
 
     def save(self, file: Path) -> None:
         """Raises ModelError where it cannot be written."""
@@ -109,21 +150,25 @@ class IdleMotion:
             raise ModelError(f"{file}: not a readable safetensors file: {error}") from error
         if set(found) != {*_TENSORS}:
             raise ModelError(f"{file}: holds {', '.join(sorted(found))}, not {', '.join(_TENSORS)}")
-        loadings, amplitude, spread, rest = (found[name] for name in _TENSORS)
+        loadings, amplitude, spread, held, shown = (found[name] for name in _TENSORS)
         parts = len(loadings) if loadings.ndim else 0
-        shapes = [(parts, _COUNT), (BANDS, parts), (_COUNT,)]
-        if [one.shape for one in (loadings, amplitude, rest)] != shapes or spread.size != 1:
+        shapes = [(parts, _COUNT), (BANDS, parts), (KNOTS, _COUNT), (KNOTS, _COUNT)]
+        if [one.shape for one in (loadings, amplitude, held, shown)] != shapes or spread.size != 1:
             raise ModelError(
-                f"{file}: loadings {loadings.shape}, amplitude {amplitude.shape}, spread {spread.shape}, rest "
-                f"{rest.shape}; idle motion has (K, {_COUNT}), ({BANDS}, K), one number and ({_COUNT},)"
+                f"{file}: loadings {loadings.shape}, amplitude {amplitude.shape}, spread {spread.shape}, held "
+                f"{held.shape}, shown {shown.shape}; idle motion has (K, {_COUNT}), ({BANDS}, K), one number and twice "
+                f"({KNOTS}, {_COUNT})"
             )
         if not all(np.isfinite(value).all() for value in found.values()):
             raise ModelError(f"{file}: holds values that are not finite")
+        steps = np.diff(np.stack([held, shown]).astype(np.float64), axis=1)
+        if steps.min() < 0 or (steps[1] > STEEPEST * steps[0] + _ROUNDING).any():
+            raise ModelError(f"{file}: a map of where a face rests falls, or is steeper than {STEEPEST:g}")
         largest = float(np.abs(loadings).max(initial=0.0) * np.linalg.norm(amplitude, axis=0).max(initial=0.0))
-        largest = max(largest, float(np.abs(rest).max()))
+        largest = max(largest, float(np.abs(shown - held).max()))
         if largest > LARGEST or not 0 <= float(spread.item()) <= 1:
             raise ModelError(
                 f"{file}: moves a face by {largest:.3g}, with a spread of {float(spread.item()):.3g}; "
                 f"at rest none moves by more than {LARGEST:g}, nor differ people by more than 1"
             )
-        return cls(loadings, amplitude, float(spread.item()), rest)
+        return cls(loadings, amplitude, float(spread.item()), held, shown)

@@ -22,8 +22,10 @@ def as_cosines(a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
 
 
 def sum_of_lines(times_s: NDArray[np.floating], frequency: Doubles, size: Doubles, phase: Doubles) -> Doubles:
-    """Lines (..., L, K), frequency [rad/s], at times (T,) of all or (..., T) of each -> (..., T, K)."""
-    turn = times_s[..., None, None] * frequency[..., None, :, :]  # (..., T, L, K)
+    """Lines (..., L, K), frequency [rad/s], at times (T, 1) of all, (..., T, 1) of each, or (..., T, K), where every
+    column goes by a clock of its own -> (..., T, K).
+    """
+    turn = times_s[..., None, :] * frequency[..., None, :, :]  # (..., T, L, K)
     turn -= phase[..., None, :, :]
     waves: Doubles = size[..., None, :, :] * np.cos(turn, out=turn)
     return np.asarray(waves.sum(-2))

@@ -12,8 +12,13 @@ of which every line is one cosine a channel (`spectral_lines`).
 `LINES` frequencies drawn from each of the `BANDS_HZ`, `M M^T` of each band what heads do together there: who leans
 forward also comes down. Over the lines of a band sum a a^T + b b^T = 1: which way a head goes is by lot, how far it
 goes in all is not. Only `size` says that, a stream's own manner, and within what people's is. Every other stream is
-somebody seen in a mirror: people lean to either side alike. A function of time alone: any frame of the future is known,
-nothing adds up, and after an hour it is where it was. It sets in over the first `EASE_S`.
+somebody seen in a mirror: people lean to either side alike.
+
+Heads do not sway evenly, they stand for a second or two and shift then. So t is the time of a clock that goes faster
+and slower, by `UNEVEN` of its pace, once in some `CLOCK_S`; turns of the head have one, shifts of it another. Where the
+head is how often stays the same; how far it goes in two seconds differs from one to the next as much as it does of
+people. A function of time alone: any frame of the future is known, nothing adds up, and after an hour it is where it
+was. It sets in over the first `EASE_S`.
 """
 
 from __future__ import annotations
@@ -26,7 +31,7 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.frames import FRAME_S, Doubles, Floats
-from sfms_robot.listeners.head_channels import head_channels, lateral_channels
+from sfms_robot.listeners.head_channels import head_channels, lateral_channels, shifting_channels
 from sfms_robot.listeners.lots import Use, normals, uniforms
 from sfms_robot.listeners.spectral_lines import as_cosines, set_in, sum_of_lines
 
@@ -34,6 +39,8 @@ BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6
 BANDS = len(BANDS_HZ) - 1
 LINES = 6  # of each band; twice as many are no fewer than channels of a head
 WIDEST = 2.0  # deviations by which a manner is off the mean one, at most
+UNEVEN = 0.85
+CLOCK_S = (4.0, 8.0)  # least and most
 
 
 class HeadSway:
@@ -46,18 +53,20 @@ class HeadSway:
     def __init__(self, settings: config.Listener, tensors: Mapping[str, Floats]) -> None:
         self._head = head_channels(settings.channels) if settings.sway else []
         self._lateral = lateral_channels(settings.channels)
+        self._shifting = shifting_channels(settings.channels)
         self._tensors = tensors
 
     def start(self, seed: int) -> Doubles:
         """A stream's own, as `sway_at` takes it; empty without."""
         if not self._head:
             return np.zeros((3, 0, 0))
-        return draw_sway(self._tensors["sway_mixture"], float(self._tensors["sway_spread"]), seed, self._lateral)
+        mixture, spread = self._tensors["sway_mixture"], float(self._tensors["sway_spread"])
+        return draw_sway(mixture, spread, seed, self._lateral, self._shifting)
 
     def added(self, motion: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
-        """Motion (..., N, C) of frames `first`, `first` + 1, ... with the sway (..., 3, L, S) of each stream, in place.
+        """Motion (..., N, C) of frames `first`, `first` + 1, ... with the sway of each stream, in place.
 
-        `first` is of all streams, or (...) of each.
+        `sway`: (..., 3, 1 + L, S). `first` is of all streams, or (...) of each.
         """
         if self._head:
             frames = np.asarray(first)[..., None] + 1.0 + np.arange(motion.shape[-2])
@@ -65,7 +74,9 @@ class HeadSway:
         return motion
 
 
-def draw_sway(mixture: Floats, spread: float, seed: int, lateral: Sequence[int] = ()) -> Doubles:
+def draw_sway(
+    mixture: Floats, spread: float, seed: int, lateral: Sequence[int] = (), shifting: Sequence[int] = ()
+) -> Doubles:
     """What one stream's sway is made of.
 
     Args:
@@ -73,14 +84,16 @@ def draw_sway(mixture: Floats, spread: float, seed: int, lateral: Sequence[int] 
         spread: deviation of the logarithm of sizes between people.
         seed: of the stream.
         lateral: channels that a mirror turns around.
+        shifting: channels that go by the second clock.
 
     Returns:
-        (3, BANDS * LINES, S) frequencies [rad/s], sizes in units of the motion, and phases [rad].
+        (3, 1 + BANDS * LINES, S) frequencies [rad/s], sizes in units of the motion, and phases [rad]; first those of
+        each channel's clock, whose sizes are seconds.
     """
     bands, channels, _ = mixture.shape
     edges = np.array(BANDS_HZ)
-    uniform = uniforms(seed, 0, Use.SWAY, 1 + bands * LINES)
-    frequency_hz = edges[:-1, None] + uniform[1:].reshape(bands, LINES) * np.diff(edges)[:, None]
+    uniform = uniforms(seed, 0, Use.SWAY, 1 + bands * LINES + 4)
+    frequency_hz = edges[:-1, None] + uniform[1:-4].reshape(bands, LINES) * np.diff(edges)[:, None]
     drawn = normals(seed, 1, Use.SWAY, 1 + 2 * bands * LINES * channels).astype(np.float64)
     lots, _ = np.linalg.qr(drawn[1:].reshape(bands, 2 * LINES, channels))  # of each band: orthonormal columns
     factors = np.einsum("bsc,bplc->pbls", mixture.astype(np.float64), lots.reshape(bands, 2, LINES, channels))
@@ -89,12 +102,27 @@ def draw_sway(mixture: Floats, spread: float, seed: int, lateral: Sequence[int] 
         factors[..., list(lateral)] *= -1
     size, phase = as_cosines(*factors)
     turns = np.broadcast_to(2 * math.pi * frequency_hz[..., None], size.shape)
-    return np.stack([turns, size, phase]).reshape(3, bands * LINES, channels)
+    lines = np.stack([turns, size, phase]).reshape(3, bands * LINES, channels)
+    return np.concatenate([_clocks(uniform[-4:], channels, shifting)[:, None], lines], axis=1)
+
+
+def _clocks(uniform: Doubles, channels: int, shifting: Sequence[int]) -> Doubles:
+    """(3, S) of each channel's clock, of two that are drawn: `uniform` (4,) are their lengths and phases."""
+    second = np.zeros(channels, np.intp)
+    second[list(shifting)] = 1
+    turn = 2 * math.pi / (CLOCK_S[0] + (CLOCK_S[1] - CLOCK_S[0]) * uniform[:2])
+    return np.stack([turn, UNEVEN / turn, 2 * math.pi * uniform[2:]])[:, second]
 
 
 def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
-    """Sway (..., 3, L, S) at times (T,) since the stream began, or (..., T) of each -> (..., T, S) in units of the
+    """Sway (..., 3, 1 + L, S) at times (T,) since the stream began, or (..., T) of each -> (..., T, S) in units of the
     motion; 0 before that.
     """
-    frequency, size, phase = (sway[..., part, :, :] for part in range(3))
-    return np.asarray(sum_of_lines(times_s, frequency, size, phase) * set_in(times_s)[..., None], np.float32)
+    lines, clocks = sway[..., 1:, :], sway[..., :1, :]
+    own_s = times_s[..., None] + sum_of_lines(times_s[..., None], *_parts(clocks))  # (..., T, S)
+    return np.asarray(sum_of_lines(own_s, *_parts(lines)) * set_in(times_s)[..., None], np.float32)
+
+
+def _parts(lines: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+    """Frequencies, sizes, phases of lines (..., 3, L, S)."""
+    return lines[..., 0, :, :], lines[..., 1, :, :], lines[..., 2, :, :]

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, SHAPES, ListenerEvent
-from sfms_robot.learning.idle_fit import explained, fit_idle, resting
-from sfms_robot.listeners.idle_motion import BANDS, IdleMotion
+from sfms_robot.learning.idle_fit import Resting, explained, fit_idle, resting
+from sfms_robot.listeners.idle_motion import BANDS, KNOTS, IdleMotion
 
 SMILES = [BLENDSHAPES.index(f"mouthSmile{side}") for side in ("Left", "Right")]
 FROWN = BLENDSHAPES.index("mouthFrownLeft")
+HELD = np.repeat(np.linspace(0.3, 0.7, KNOTS, dtype=np.float32)[:, None], len(BLENDSHAPES), axis=1)
 
 
 def learned():
@@ -20,7 +21,7 @@ def learned():
     loadings[1, FROWN] = 0.02
     amplitude = np.zeros((BANDS, 2), np.float32)
     amplitude[:3, 0] = amplitude[2:5, 1] = 3**-0.5
-    return IdleMotion(loadings, amplitude, 0.0, np.zeros(len(BLENDSHAPES), np.float32))
+    return IdleMotion(loadings, amplitude, 0.0, HELD, HELD)
 
 
 def people(idle, count=16, frames=3000):
@@ -46,12 +47,39 @@ def test_what_a_listener_shows_already_is_not_added_twice():
     assert explained(fit_idle(people(half), people(learned()))).max() < 0.005
 
 
-def test_where_people_rest_elsewhere_is_found():
-    elsewhere = replace(learned(), rest=np.linspace(-0.1, 0.1, len(BLENDSHAPES)).astype(np.float32))
-    found = fit_idle(people(elsewhere), people(None)).rest
+def test_where_people_rest_elsewhere_and_how_unevenly_is_shown():
+    """People whose muscles are slack a third of the time, and a listener that rests somewhere else, as bells do."""
+    elsewhere = replace(learned(), shown=HELD + np.linspace(-0.1, 0.1, len(BLENDSHAPES), dtype=np.float32))
+    slack = [Resting(np.maximum(one.windows, 0.5).astype(np.float32)) for one in people(learned())]
+    found = fit_idle(slack, people(elsewhere))
+    shown = [Resting(with_idle(found, seed, one.windows)) for seed, one in enumerate(people(elsewhere))]
+    for channel in (*SMILES, FROWN):
+        ours, theirs = (np.concatenate([one.windows for one in faces])[..., channel] for faces in (shown, slack))
+        np.testing.assert_allclose(
+            *(np.quantile(one, [0.1, 0.3, 0.5, 0.8, 0.95]) for one in (ours, theirs)), atol=0.006
+        )
     looks = np.array([name.startswith("eyeLook") for name in BLENDSHAPES])
-    np.testing.assert_allclose(found[~looks], elsewhere.rest[~looks], atol=0.005)
-    assert not found[looks].any()
+    np.testing.assert_array_equal(found.shown[:, looks], found.held[:, looks])
+
+
+def with_idle(idle, seed, windows):
+    motion = np.zeros((windows[..., 0].size, MOTION_DIM), np.float32)
+    motion[:, SHAPES] = windows.reshape(-1, len(BLENDSHAPES))
+    return idle.start(seed).added(motion, 5 + np.arange(len(motion)) / FRAME_HZ)[:, SHAPES].reshape(windows.shape)
+
+
+def test_slow_motion_is_not_taken_for_faster_motion_nor_for_less_than_it_is():
+    """Two seconds show a third of what drifts in five as motion within them."""
+    slow = replace(learned(), amplitude=np.eye(BANDS, 1, dtype=np.float32) * np.ones(2, np.float32))
+    found = fit_idle(people(slow), people(None))
+    np.testing.assert_allclose(explained(found)[[*SMILES, FROWN]], [0.03, 0.03, 0.02], rtol=0.2)
+    assert np.square(found.amplitude[0]).min() > 0.85
+
+
+def test_people_who_rest_apart_from_one_another_differ_slowly():
+    still = [Resting(np.full((9, 50, 52), 0.5 + off, np.float32)) for off in (-0.03, 0.03)]
+    found = fit_idle(still, people(None))
+    assert explained(found)[FROWN] > 0.02 and np.square(found.amplitude[0]).min() > 0.99
 
 
 def test_a_face_that_smiles_blinks_or_talks_does_not_rest():

@@ -10,7 +10,7 @@ from sfms_robot.errors import ModelError
 from sfms_robot.frames import BLENDSHAPES, EVENT_KINDS, MOTION_DIM, SHAPES
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, IdleMotion
+from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, KNOTS, IdleMotion, RestMap
 from sfms_robot.listeners.spectral_lines import EASE_S
 
 BROW = BLENDSHAPES.index("browInnerUp")
@@ -20,7 +20,8 @@ def made(size=0.02, spread=0.0, rest=0.0):
     loadings = np.zeros((2, len(BLENDSHAPES)), np.float32)
     loadings[0, BROW], loadings[1, BROW + 1] = size, size
     amplitude = np.full((BANDS, 2), BANDS**-0.5, np.float32)
-    return IdleMotion(loadings, amplitude, spread, np.full(len(BLENDSHAPES), rest, np.float32))
+    held = np.tile(np.linspace(0.4, 0.6, KNOTS, dtype=np.float32)[:, None], len(BLENDSHAPES))
+    return IdleMotion(loadings, amplitude, spread, held, held + np.float32(rest))
 
 
 def test_where_it_rests_is_added_once_it_has_set_in_and_no_face_leaves_its_range():
@@ -28,6 +29,21 @@ def test_where_it_rests_is_added_once_it_has_set_in_and_no_face_leaves_its_range
     shown = stream.added(faces(3), np.array([0.0, EASE_S, 60.0]))[:, SHAPES]
     np.testing.assert_allclose(shown, np.array([0.5, 0.4, 0.4])[:, None] * np.ones((3, 52)), atol=1e-6)
     assert not stream.added(faces(1, 0.05), np.array([60.0]))[:, SHAPES].any()
+
+
+def test_a_map_takes_quantiles_to_quantiles_never_falls_and_beyond_them_moves_a_face_by_as_much_as_at_the_end():
+    rng = np.random.default_rng(0)
+    held, shown = np.sort(rng.uniform(0.2, 0.4, (2, KNOTS, len(BLENDSHAPES))), axis=1).astype(np.float32)
+    rest = RestMap.between(held, shown)
+    np.testing.assert_allclose(held + rest.off(held), shown, atol=1e-6)
+    grid = np.repeat(np.linspace(0, 1, 200, dtype=np.float32)[:, None], len(BLENDSHAPES), axis=1)
+    assert np.diff(grid + rest.off(grid), axis=0).min() > -1e-6
+    np.testing.assert_allclose(rest.off(grid)[[0, -1]], np.stack([shown[0] - held[0], shown[-1] - held[-1]]), atol=1e-6)
+
+
+def test_a_channel_that_never_varies_is_moved_and_no_more():
+    held = np.full((KNOTS, len(BLENDSHAPES)), 0.3, np.float32)
+    np.testing.assert_allclose(RestMap.between(held, held - 0.1).off(faces(3)[:, SHAPES]), -0.1, atol=1e-6)
 
 
 def faces(frames, level=0.5):
@@ -78,15 +94,21 @@ def test_what_is_saved_is_loaded(tmp_path):
     made(spread=0.2).save(tmp_path / "a.safetensors")
     found = IdleMotion.load(tmp_path / "a.safetensors")
     np.testing.assert_array_equal(found.loadings, made().loadings)
+    np.testing.assert_array_equal([found.held, found.shown], [made().held, made().shown])
     assert found.spread == pytest.approx(0.2)
 
 
+FLAT = np.zeros((KNOTS, len(BLENDSHAPES)), np.float32)
+RISING = np.repeat(np.linspace(0, 1, KNOTS, dtype=np.float32)[:, None], len(BLENDSHAPES), axis=1)
 BROKEN = {
     "holds": {"spread": None},
     "not finite": {"loadings": np.full((2, 52), np.nan, np.float32)},
     "has \\(K, 52\\)": {"loadings": np.zeros((2, 51), np.float32)},
-    "and \\(52,\\)": {"rest": np.zeros(51, np.float32)},
-    "by 0.6": {"rest": np.full(52, -0.6, np.float32)},
+    "and twice": {"held": FLAT[:, :51]},
+    "shown": {"shown": FLAT[1:]},
+    "falls": {"held": -RISING},
+    "steeper": {"held": 0.1 * RISING, "shown": 0.3 * RISING},
+    "by 0.6": {"shown": FLAT - 0.6},
     "amplitude": {"amplitude": np.zeros((BANDS, 3), np.float32)},
     "moves a face by": {"loadings": np.ones((2, 52), np.float32)},
     "a spread of": {"spread": np.float32([7.0])},
@@ -97,7 +119,7 @@ BROKEN = {
 def test_a_broken_file_is_one_line(tmp_path, problem):
     file, good = tmp_path / "a.safetensors", made()
     tensors = {"loadings": good.loadings, "amplitude": good.amplitude, "spread": np.float32([0.0])}
-    tensors |= {"rest": good.rest} | BROKEN[problem]
+    tensors |= {"held": FLAT, "shown": FLAT} | BROKEN[problem]
     save_file({name: np.ascontiguousarray(value) for name, value in tensors.items() if value is not None}, file)
     with pytest.raises(ModelError, match=problem) as raised:
         IdleMotion.load(file)
