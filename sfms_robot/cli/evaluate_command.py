@@ -163,6 +163,7 @@ def timing(
     jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
     hop: int | None = HOP,
     engine: str = typer.Option("torch", metavar=ENGINES, help=ENGINE_HELP),
+    own_voice: bool = typer.Option(False, "--own-voice", help="It speaks when the person did; else it never does."),
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
@@ -172,7 +173,7 @@ def timing(
 
     runs_on = engine_named(engine)
     options = TimingOptions(
-        listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop, runs_on
+        listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop, runs_on, own_voice
     )
     show(evaluate_timing(options), json, print_timing)
 

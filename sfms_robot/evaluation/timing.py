@@ -117,18 +117,25 @@ def people_sums(one: ListenerMeeting, within: Bools) -> Sums:
     return sums
 
 
-def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]]) -> Sums:
-    """What a listener decided, left to itself, once for each seed."""
+def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]], own_voice: bool = False) -> Sums:
+    """What a listener decided, left to itself, once for each seed. `own_voice`: it spoke when he did, and a minute of
+    its nods moved would be moved against that too, so how they hang on the others is not told.
+    """
     nods = [spans_of(decided, "nod") for decided in streams]
     sums = nod_sums("decided_", one, nods)
-    sums |= nod_contingency("decided_", nods, one, np.ones(one.frames, bool))
+    if not own_voice:
+        sums |= nod_contingency("decided_", nods, one, np.ones(one.frames, bool))
     for kind in (*ANNOTATED, "smile", "blink"):
         sums |= other_sums("decided_", one, kind, [spans_of(decided, kind) for decided in streams])
     return sums
 
 
-def motion_sums(one: ListenerMeeting, motions: Floats, first: int, calibration: Calibration) -> Sums:
+def motion_sums(
+    one: ListenerMeeting, motions: Floats, first: int, calibration: Calibration, own_voice: bool = False
+) -> Sums:
     """What is to be seen in motion (S, N', 58) that was made of the meeting's frames from `first` on.
+
+    `own_voice`: see `decided_sums`.
 
     Nods are set right by what their finder makes of known ones: it is late or early by so much, and misses so many.
     """
@@ -142,7 +149,7 @@ def motion_sums(one: ListenerMeeting, motions: Floats, first: int, calibration: 
     minutes = runs * frames * FRAME_S / 60
     return {
         **nod_sums("", one, nods, played, calibration.nods_per_seen_nod),
-        **nod_contingency("", nods, one, played),
+        **({} if own_voice else nod_contingency("", nods, one, played)),
         "nod_deg_sizes": np.histogram(sizes, SIZES_DEG)[0].astype(np.float64),
         "blinks_per_minute": np.array([sum(map(len, found["blink"])), minutes]),
         "smiles_per_minute": np.array([sum(map(len, found["smile"])), minutes]),

@@ -130,6 +130,21 @@ def test_timing_tells_people_decisions_motion_and_the_reference_apart(command_li
 
 
 @pytest.mark.slow
+def test_a_listener_that_speaks_when_the_person_did_is_told_so_and_nothing_of_how_its_nods_hang_on_the_others(
+    command_line, tables
+):
+    words = ("evaluate", "timing", "--data", tables, "--minutes", 0.5, "--seeds", 2, "--jobs", 1, "--json")
+    silent, speaking = (command_line(*words, *more).told for more in ((), ("--own-voice",)))
+    assert (silent["own_voice"], speaking["own_voice"]) == (False, True)
+    assert speaking["decided_gaze_shifts_per_minute"] > silent["decided_gaze_shifts_per_minute"], "talk looks aside"
+    assert speaking["gaze_shifts_per_minute"] != silent["gaze_shifts_per_minute"]
+    for name in ("nod_hazard_auc", "shifted_nod_hazard_auc", "people_nods_per_minute"):
+        assert speaking[name] == silent[name]
+    assert {name for name in silent if name.startswith(("nod_auc", "decided_nod_auc"))}
+    assert not {name for name in speaking if name.startswith(("nod_auc", "decided_nod_auc"))}
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("lacking", "figure"), [("gaze_shift", "gaze_shifts"), ("laugh", "laughs")])
 def test_what_nobody_annotated_of_the_people_is_not_told(command_line, tmp_path, lacking, figure):
     data = write_tables(tmp_path, lacking, tuple(SERIES.values()), 120.0)

@@ -55,6 +55,7 @@ class TimingOptions:
         seeds: how often a listener is left to itself in each.
         jobs: processes; None: as many as there are cores.
         hop, engine: see `load_at_hop`.
+        own_voice: a listener that is left to itself speaks when the person did; else it never says anything.
     """
 
     listener: str
@@ -68,6 +69,7 @@ class TimingOptions:
     jobs: int | None = None
     hop: int | None = None
     engine: EngineName = "torch"
+    own_voice: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "meetings": len(played),
         "minutes": round(sum(one.minutes for one in played), 2),
         "minutes_of_motion_each": options.minutes,
+        "own_voice": options.own_voice,
         "seeds": options.seeds,
         "hop": None if isinstance(heard_by, EventModel) else heard_by.hop,
         "engine": None if isinstance(heard_by, EventModel) else engine_name(heard_by),
@@ -129,7 +132,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "interval_level": LEVEL,
         "detector": calibration.report(),
         "asked_and_seen": _asked(added_up(one.sightings for one in played), calibration),
-        "notes": list(_notes(found)),
+        "notes": list(_notes(found, options.own_voice)),
         "rows": _rows(options.listener, found),
     }
 
@@ -192,13 +195,14 @@ def _play(task: _Task) -> _Played:
         sums |= timing.hazard_sums("r2_", one, *task.reference.scores(task.person, one.frames))
     seeds = range(1000 * (options.seed + task.number), 1000 * (options.seed + task.number) + options.seeds)
     if isinstance(listener, EventfulListener):
-        sums |= _by_events(listener.when, listener.calmness, task.person, one, seeds)
+        sums |= _by_events(listener.when, listener.calmness, task.person, one, seeds, options.own_voice)
     if isinstance(listener, EventModel):
-        sums |= _by_events(listener, Calmness(), task.person, one, seeds)
+        sums |= _by_events(listener, Calmness(), task.person, one, seeds, options.own_voice)
     sightings: Mapping[str, Sightings] = {}
     if frames and not isinstance(listener, EventModel):
-        rolled = rollout(listener, without_own_voice(part(one.speaker, first, frames)), seeds)
-        sums |= timing.motion_sums(one, rolled.motion, first, task.calibration)
+        speaker = part(one.speaker, first, frames)
+        rolled = rollout(listener, speaker if options.own_voice else without_own_voice(speaker), seeds)
+        sums |= timing.motion_sums(one, rolled.motion, first, task.calibration, options.own_voice)
         streams = zip(rolled.events, rolled.motion, strict=True)
         sightings = added_up(asked_and_seen(events, motion, task.calibration.lag_s) for events, motion in streams)
     return _Played(one.participant, one.frames / FRAME_HZ / 60, sums, sightings)
@@ -211,7 +215,7 @@ def middle(frames: int, minutes: float) -> tuple[int, int]:
 
 
 def _by_events(
-    model: EventModel, calmness: Calmness, person: Person, one: ListenerMeeting, seeds: Sequence[int]
+    model: EventModel, calmness: Calmness, person: Person, one: ListenerMeeting, seeds: Sequence[int], own_voice: bool
 ) -> Sums:
     """How its hazards, given his own history, rank what he did, once as annotators saw the others, without what sensing
     loses; and what it decides, left to itself.
@@ -227,7 +231,8 @@ def _by_events(
     sums |= timing.hazard_sums("annotated_", one, *seen)
     for kind in timing.ANNOTATED:
         sums[f"{kind}_hazard_auc"] = timing.ranked(speaking[kind], one, kind)
-    return sums | timing.decided_sums(one, decisions(model, heard, seeds, calmness))
+    streams = decisions(model, with_voice if own_voice else heard, seeds, calmness)
+    return sums | timing.decided_sums(one, streams, own_voice)
 
 
 @cache
@@ -277,9 +282,11 @@ def _asked(told: Mapping[str, Sightings], calibration: Calibration) -> dict[str,
     return found
 
 
-def _notes(found: Mapping[str, Estimate]) -> Iterator[str]:
+def _notes(found: Mapping[str, Estimate], own_voice: bool) -> Iterator[str]:
     """What the figures do not say by themselves."""
     yield "people's smiles and blinks were not annotated; laughs are only laid beside laughs"
+    if own_voice:
+        yield "it spoke when the person did, so how its own nods hang on the others is not told"
     if "nod_hazard_auc" not in found:
         yield "this listener has no hazards that could be asked: nod_hazard_auc and its kin cannot be told"
     if "nods_per_minute" not in found:
