@@ -73,13 +73,12 @@ def page(
     from sfms_robot.app.fleet.fleet_client import Fleet
     from sfms_robot.app.fleet.fleet_page import FleetPage
 
-    with Fleet(zenoh) as found, closing(FleetPage(found, port)) as served:
+    with Fleet(zenoh) as found, closing(FleetPage(found, port)) as served, suppress(KeyboardInterrupt):
         if json:
             print_json({"version": 1, "url": served.url})
         else:
             print(f"fleet: {served.url}", file=sys.stderr, flush=True)
-        with suppress(KeyboardInterrupt):
-            threading.Event().wait()
+        threading.Event().wait()
 
 
 def _told(answers: Sequence[Mapping[str, Any]], asked: Sequence[str], json: bool) -> None:
