@@ -1,5 +1,7 @@
 """`--port FAMILY=DEVICE[,MODEL:IDS[@BAUD]]` runs the contract of the servo buses on real servos."""
 
+import sys
+
 import pytest
 from ended import Ended
 from sound_server import SoundServer
@@ -48,6 +50,9 @@ def sound_server(_sound_servers, monkeypatch):
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("PULSE_SERVER", raising=False)
     _sound_servers.start("person")
+    if portaudio := sys.modules.get("sounddevice"):  # it sees the devices that were there when it was loaded
+        portaudio._terminate()
+        portaudio._initialize()
     yield _sound_servers
     _sound_servers.stop()
 
