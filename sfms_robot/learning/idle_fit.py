@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
-from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, KNOTS, STEEPEST, IdleMotion
+from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
 from sfms_robot.signals.events import runs
 
 WINDOW: Final = 2 * FRAME_HZ
@@ -27,7 +27,7 @@ MARGIN_FRAMES: Final = 4
 REGIONS: Final = {
     "brows": ("brow",),
     "lids": ("eyeSquint", "eyeWide", "eyeBlink"),
-    "mouth": ("jaw", "mouth", "cheek", "nose", "tongue"),
+    "mouth": MOUTH,
 }
 PATTERNS: Final = 4  # of each region, at most
 LEAST: Final = 0.001  # deviation of a pattern that is worth drawing, in every channel together

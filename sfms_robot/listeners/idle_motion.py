@@ -13,7 +13,8 @@ may be made anew, or in other pieces, and shows the same. It sets in over the fi
 What a listener draws and this together rest elsewhere than people do, and not as bells do: a muscle is slack for a
 third of the time, and hardly ever far above its middle. So each channel goes through a map that never falls, from its
 own quantiles at rest (`held`) to people's (`shown`), and above them, where events are, goes on by the last difference.
-Faces never go below 0 nor above 1.
+Faces never go below 0 nor above 1. A mouth that speaks does not rest: it goes through no map until half a second after
+its own voice, and through all of it half a second later.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import MOTION_DIM, SHAPES, Doubles, Floats
+from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.listeners.spectral_lines import as_cosines, set_in, sum_of_lines
 
 FILE: Final = "idle_motion.safetensors"  # in a listener's folder; without it a listener has none
@@ -38,6 +39,9 @@ _SEED: Final = 0x1D1E  # apart from what else a stream draws by its seed
 _COUNT: Final = MOTION_DIM - SHAPES.start
 KNOTS: Final = 9  # of the map of each channel
 STEEPEST: Final = 2.0
+AFTER_SPEECH_S: Final = 0.5  # a mouth rests; so much later it rests as people's do
+MOUTH: Final = ("jaw", "mouth", "cheek", "nose", "tongue")  # what names of its channels begin with
+_SPEAKS: Final = np.array([name.startswith(MOUTH) for name in BLENDSHAPES])
 _ROUNDING: Final = 1e-6
 _TENSORS: Final = ("loadings", "amplitude", "spread", "held", "shown")
 
@@ -85,14 +89,25 @@ class IdleStream:
     loadings: Doubles
     rest: RestMap
 
-    def added(self, frames: Floats, times_s: Doubles) -> Floats:
-        """Motion (N, 58) with the idle motion of times (N,) since the stream began: a new array."""
+    def added(self, frames: Floats, times_s: Doubles, silent_s: Doubles | float = math.inf) -> Floats:
+        """Motion (N, 58) with the idle motion of times (N,) since the stream began: a new array.
+
+        `silent_s`: (N,), how long its own voice has not been heard; `inf`: never.
+        """
         parts = sum_of_lines(times_s[:, None], self.frequency, self.size, self.phase)  # (N, K)
         idle = parts @ self.loadings  # (N, 52)
-        idle += self.rest.off(frames[:, SHAPES] + idle)
+        rest = self.rest.off(frames[:, SHAPES] + idle)
+        rest[:, _SPEAKS] *= np.broadcast_to(_at_rest(silent_s), len(frames))[:, None]
+        idle += rest
         out = frames.copy()
         out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + idle * set_in(times_s)[:, None], 0), 1)
         return out
+
+
+def _at_rest(silent_s: Doubles | float) -> Doubles | float:
+    """0 while a mouth speaks, 1 long after; no faster than its lips close."""
+    share: Doubles | float = np.minimum(np.maximum(np.divide(silent_s, AFTER_SPEECH_S) - 1, 0), 1)
+    return share
 
 
 @dataclass(frozen=True)

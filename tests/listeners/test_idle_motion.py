@@ -7,10 +7,10 @@ from tiny_sfms import speech, told_listener
 
 from sfms_robot.config import Calmness
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import BLENDSHAPES, EVENT_KINDS, MOTION_DIM, SHAPES
+from sfms_robot.frames import BLENDSHAPES, EVENT_KINDS, FRAME_S, MOTION_DIM, SHAPES, changed
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, KNOTS, IdleMotion, RestMap
+from sfms_robot.listeners.idle_motion import AFTER_SPEECH_S, BANDS, BANDS_HZ, KNOTS, IdleMotion, RestMap
 from sfms_robot.listeners.spectral_lines import EASE_S
 
 BROW = BLENDSHAPES.index("browInnerUp")
@@ -29,6 +29,13 @@ def test_where_it_rests_is_added_once_it_has_set_in_and_no_face_leaves_its_range
     shown = stream.added(faces(3), np.array([0.0, EASE_S, 60.0]))[:, SHAPES]
     np.testing.assert_allclose(shown, np.array([0.5, 0.4, 0.4])[:, None] * np.ones((3, 52)), atol=1e-6)
     assert not stream.added(faces(1, 0.05), np.array([60.0]))[:, SHAPES].any()
+
+
+def test_a_mouth_that_speaks_is_not_where_it_rests_and_comes_back_there_after_its_voice():
+    stream, silent_s = made(size=0.0, rest=-0.1).start(1), AFTER_SPEECH_S * np.array([0.0, 1.0, 1.5, 2.0, np.inf])
+    shown = stream.added(faces(5), np.full(5, 60.0), silent_s)[:, SHAPES]
+    np.testing.assert_allclose(shown[:, BLENDSHAPES.index("jawOpen")], [0.5, 0.5, 0.45, 0.4, 0.4], atol=1e-6)
+    np.testing.assert_allclose(shown[:, BROW], 0.4, atol=1e-6)
 
 
 def test_a_map_takes_quantiles_to_quantiles_never_falls_and_beyond_them_moves_a_face_by_as_much_as_at_the_end():
@@ -133,18 +140,31 @@ def test_a_file_that_is_none_is_one_line(tmp_path, content):
         IdleMotion.load(tmp_path / "a.safetensors")
 
 
-def test_a_listener_adds_it_to_every_plan_whatever_the_hop_and_nothing_else_changes():
-    when, nothing = EventModel.load(), Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))
+def planned(hop, idle, said=range(0)):
+    """What a listener with this idle motion plans, which speaks itself in these frames."""
+    nothing = Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))
+    listener = EventfulListener(told_listener(hop=hop), EventModel.load(), nothing, idle)
+    memory, plans = listener.start(5), []
+    for index, frame in enumerate(speech(120)):
+        own = frame.audio if index in said else None
+        plan, memory = listener.step(changed(frame, agent_audio=own), memory)
+        plans += [] if plan is None else [plan]
+    return plans
 
-    def shown(hop, idle):
-        listener = EventfulListener(told_listener(hop=hop), when, nothing, idle)
-        memory, plans = listener.start(5), []
-        for frame in speech(120):
-            plan, memory = listener.step(frame, memory)
-            plans += [] if plan is None else [plan]
-        return plans
 
-    for hop in (2, 4):
-        for still, moving in zip(shown(hop, None), shown(hop, made(0.01)), strict=True):
-            expected = made(0.01).start(5).added(still.frames, still.times_s)
-            np.testing.assert_allclose(moving.frames, expected, atol=1e-6)
+@pytest.mark.parametrize("hop", [2, 4])
+def test_a_listener_adds_it_to_every_plan_whatever_the_hop_and_nothing_else_changes(hop):
+    for still, moving in zip(planned(hop, None), planned(hop, made(0.01)), strict=True):
+        expected = made(0.01).start(5).added(still.frames, still.times_s)
+        np.testing.assert_allclose(moving.frames, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("hop", [2, 4])
+def test_a_listener_tells_it_how_long_its_own_voice_has_been_silent(hop):
+    idle, said = made(0.01, rest=0.02), range(40, 70)
+    for still, moving in zip(planned(hop, None, said), planned(hop, idle, said), strict=True):
+        newest = round(still.times_s[0] / FRAME_S) - 2
+        before = [index for index in said if index <= newest]
+        silent_s = (newest - before[-1]) * FRAME_S + still.times_s - still.times_s[0] if before else np.inf
+        expected = idle.start(5).added(still.frames, still.times_s, silent_s)
+        np.testing.assert_allclose(moving.frames, expected, atol=1e-6)
