@@ -239,7 +239,7 @@ class EventfulListener:
         frames[:, :3] += head_rad
         frames[:, EYES] = eyes
         if memory.idle is not None:
-            silent_s = memory.when.sensed.own_silence_s + plan.times_s - plan.times_s[0]
+            silent_s = memory.when.sensed.hearing.own_voice_s + plan.times_s - plan.times_s[0]
             frames = memory.idle.added(frames, plan.times_s, silent_s)
         told = changed(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
         return told, changed(memory, news=(), gaze=(newest[0], *states))

@@ -41,7 +41,7 @@ KNOTS: Final = 9  # of the map of each channel
 STEEPEST: Final = 2.0
 AFTER_SPEECH_S: Final = 0.5  # a mouth rests; so much later it rests as people's do
 MOUTH: Final = ("jaw", "mouth", "cheek", "nose", "tongue")  # what names of its channels begin with
-_SPEAKS: Final = np.array([name.startswith(MOUTH) for name in BLENDSHAPES])
+_OF_MOUTH: Final = np.array([name.startswith(MOUTH) for name in BLENDSHAPES])
 _ROUNDING: Final = 1e-6
 _TENSORS: Final = ("loadings", "amplitude", "spread", "held", "shown")
 
@@ -97,17 +97,12 @@ class IdleStream:
         parts = sum_of_lines(times_s[:, None], self.frequency, self.size, self.phase)  # (N, K)
         idle = parts @ self.loadings  # (N, 52)
         rest = self.rest.off(frames[:, SHAPES] + idle)
-        rest[:, _SPEAKS] *= np.broadcast_to(_at_rest(silent_s), len(frames))[:, None]
+        at_rest = np.minimum(np.maximum(np.divide(silent_s, AFTER_SPEECH_S) - 1, 0), 1)  # 0: the mouth speaks
+        rest[:, _OF_MOUTH] *= np.reshape(at_rest, (-1, 1))
         idle += rest
         out = frames.copy()
         out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + idle * set_in(times_s)[:, None], 0), 1)
         return out
-
-
-def _at_rest(silent_s: Doubles | float) -> Doubles | float:
-    """0 while a mouth speaks, 1 long after; no faster than its lips close."""
-    share: Doubles | float = np.minimum(np.maximum(np.divide(silent_s, AFTER_SPEECH_S) - 1, 0), 1)
-    return share
 
 
 @dataclass(frozen=True)

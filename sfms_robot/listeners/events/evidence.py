@@ -174,6 +174,11 @@ class Hearing:
     nodded: float = -math.inf
     smiled: float = -math.inf
 
+    @property
+    def own_voice_s(self) -> float:
+        """Since the newest own voice; `inf`: there has been none."""
+        return (self.frame - 1 - self.spoke[_MINE]) * FRAME_S
+
 
 def hearing(people: int = 2) -> Hearing:
     """Nothing heard yet of a conversation of so many, oneself among them."""
@@ -214,7 +219,7 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
         float(holder == _MINE),
         (now - held) * FRAME_S if another else math.nan,
         (now - spoke[holder]) * FRAME_S if another else math.nan,
-        (now - spoke[_MINE]) * FRAME_S,
+        after.own_voice_s,
         float(any(look == look for look in counts)),
         float(looked is not None),
         math.nan if looked is None else (now - looked) * FRAME_S,

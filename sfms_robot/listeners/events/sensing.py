@@ -53,11 +53,6 @@ class SenseMemory:
     face: FaceState = FaceState()
     hearing: Hearing = field(default_factory=hearing)
 
-    @property
-    def own_silence_s(self) -> float:
-        """How long oneself has said nothing, as the newest frame leaves it; `inf`: ever since."""
-        return (self.hearing.frame - 1 - self.hearing.spoke[0]) * FRAME_S
-
 
 @dataclass(frozen=True)
 class Sensed:
