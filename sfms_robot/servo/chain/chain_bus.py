@@ -34,12 +34,12 @@ from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.fault_reporter import FaultReporter
-from sfms_robot.servo.chain.link import RegisterLink
+from sfms_robot.servo.chain.link import AWAY_LATE_S, RegisterLink
 from sfms_robot.servo.chain.member import ONLINE, REDUCED, REJOINING, Member, members_of
 from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
 from sfms_robot.servo.chain.schedule import TURN_S, read_bytes
 from sfms_robot.servo.chain.settings import Settings
-from sfms_robot.servo.chain.startup import PATIENCE_S, Startup
+from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup
 from sfms_robot.servo.chain.status_poll import StatusPoll
 from sfms_robot.servo.chain.telemetry import Telemetry
 from sfms_robot.servo.chain.verified_write import finish
@@ -53,7 +53,7 @@ READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
 _CONFIRM_S: Final = 0.2  # that `stop` waits for servos to confirm, at most
 _STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
 _EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
-_EXCHANGE_BYTES: Final = 160  # of the longest of them: a whole control table
+_EXCHANGE_BYTES: Final = LONGEST_READ + 32  # of the longest of them: a part of the control table
 _SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
 BUS_WATCHDOG: Final = "bus_watchdog"
 _NOBODY: Final = np.zeros(0, np.intp)
@@ -163,6 +163,7 @@ class ChainBus(WireBus[L], Generic[L]):
             bits = self._begin(link).run()
             present = [self._servos[index] for index in bits]
             self._read_deadline_s = link.adapt(present[0].id, *self._telemetry.position)
+            self._poll.read_deadline_s = self._read_deadline_s
             self._telemetry.forget()
             self._release_packet = self._packet_off(range(len(self._servos)))
             self._attach(link)
@@ -317,7 +318,7 @@ class ChainBus(WireBus[L], Generic[L]):
             if not rest or not link.affords(read_bytes(1, field.size, False)):
                 break
             ids = [self._servos[i].id for i in rest]
-            got = self._attempt(partial(self._poll.read_some, link, (field.address, field.size), ids))
+            got = self._attempt(partial(self._poll.read_some, link, "stop", (field.address, field.size), ids))
             if got is None:
                 break  # the port is gone
             off = field.to_bytes(0)
@@ -471,7 +472,7 @@ class ChainBus(WireBus[L], Generic[L]):
         self._writes.step(
             link,
             lambda index: self._members[index].liveness.listed,
-            lambda where, ids: self._poll.read_some(link, where, ids),
+            lambda where, ids: self._poll.read_some(link, "confirmed", where, ids),
             lambda index, field, value: self._told(index, field, value, now_s),
         )
         for member in released:
@@ -486,7 +487,7 @@ class ChainBus(WireBus[L], Generic[L]):
         left = _EXCHANGES
         for member in [member for member in self._members if member.state is not ONLINE]:
             while left and member.waits and member.due(now_s):
-                if not link.affords(_EXCHANGE_BYTES, alone=True):
+                if not link.grants("return", _EXCHANGE_BYTES, alone=True, late_s=AWAY_LATE_S):
                     return
                 left -= 1
                 member.step(now_s)

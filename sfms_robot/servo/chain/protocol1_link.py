@@ -124,8 +124,11 @@ class Protocol1Link(RegisterLink):
     ) -> dict[int, Answer]:
         late = [servo for servo in servos if self._owes(servo, length)]
         closed: list[int] = []
+        judged = False
         for servo in late[:_FENCES]:
-            if self._fence(servo):
+            answered = self._fence(servo)
+            judged |= self.judged
+            if answered:
                 for each in servos:  # nothing older than that answer can come, from nobody
                     self._owed.pop(each, None)
                 break
@@ -134,6 +137,7 @@ class Protocol1Link(RegisterLink):
             closed = late  # nothing says that what they owe will not come yet
         asked = [servo for servo in servos if servo not in closed]
         if not asked:
+            self.judged = judged  # by one of them: the last may have had no time left
             return {}
         self._send(BROADCAST, *request(asked))
         return self._answers(asked, length)

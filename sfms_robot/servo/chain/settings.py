@@ -95,13 +95,13 @@ class Settings:
         if not self._round:
             return
         where, indices = self._round[0]
-        count = poll.fitting(link, where[1], min(_TOGETHER, len(indices)))
+        count = poll.fitting(link, "settings", where[1], min(_TOGETHER, len(indices)))
         asked, self._round[0] = indices[:count], (where, indices[count:])
         self._due_s = now_s + self._part_s * count
         if count == len(indices):
             del self._round[0]
         there = {self._members[index].id: index for index in asked if _compared(self._members[index])}
-        for servo, answer in poll.read_some(link, where, list(there)).items():
+        for servo, answer in poll.read_some(link, "settings", where, list(there)).items():
             if len(answer.data) == where[1]:
                 self._judge(there[servo], where[0], answer.data)
 

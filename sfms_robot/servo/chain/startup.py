@@ -46,7 +46,7 @@ L = TypeVar("L", bound=RegisterLink)
 log = logging.getLogger(__name__)
 
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms
-LONGEST_READ: Final = 128
+LONGEST_READ: Final = 64
 _LOOK_S: Final = 0.05  # between two looks at a servo that is moved inside its limits
 _STILL_TICKS: Final = 1  # between two looks: it stands
 

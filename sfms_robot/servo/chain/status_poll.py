@@ -10,6 +10,9 @@ is always made, everything else only when it would be over in time even if nobod
 servos costs a poll one read deadline, once; whom a request had no time to wait for is not blamed.
 
     budget = the larger of  0.8 / rate - goals,  first read + read deadline + a turn of the adapter
+
+Where that never has room for something (a slow wire, an adapter that holds answers back), it gets one request a few
+times a second all the same (`RegisterLink.grants`), and the poll is so much longer.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from sfms_robot.config import Bus as BusConfig
-from sfms_robot.servo.chain.link import Answer, RegisterLink
+from sfms_robot.servo.chain.link import AWAY_LATE_S, Answer, RegisterLink
 from sfms_robot.servo.chain.member import Member
 from sfms_robot.servo.chain.schedule import TURN_S, USE, Rotation, blocks_per_tick, read_bytes, read_s, write_s
 from sfms_robot.servo.chain.telemetry import Block, Telemetry
@@ -64,7 +67,8 @@ class StatusPoll:
         counts: of the bus: reads, errors and retries are counted up in place.
 
     Attributes:
-        budget_s: time that a poll may take, waiting for answers included.
+        read_deadline_s: silence that makes a servo silent on this wire.
+        budget_s: time that a poll may take, waiting for answers included; what is granted beside it is not.
         quiet_polls: polls in a row in which nobody answered.
     """
 
@@ -78,6 +82,7 @@ class StatusPoll:
         self._telemetry = telemetry
         self._config = config
         self._counts = counts
+        self.read_deadline_s = config.read_deadline_ms / 1e3
         self._tells = {each.id for each in members if telemetry.currents[each.index] is not None}
         self._error_bits = [ALERT if telemetry.error is not None else _status_bits(member) for member in members]
         self._restart(None, None)
@@ -124,11 +129,12 @@ class StatusPoll:
         if self._group is None:
             first = read_s(1, block, config.baud, False)
         spare_s = USE / config.rate_hz - write_s(count, goal, config.baud)
-        self.budget_s = max(spare_s, first + config.read_deadline_ms / 1e3 + TURN_S)
+        self.budget_s = max(spare_s, first + self.read_deadline_s + TURN_S)
 
     def measure(self, link: RegisterLink, now_s: float) -> None:
         """Everything of everybody who is listed, once; nobody is blamed."""
-        self._take(link, self._telemetry.block, self.read_some(link, self._telemetry.block, self._listed()), now_s)
+        where = self._telemetry.block
+        self._take(link, where, self.read_some(link, "blocks", where, self._listed()), now_s)
 
     def step(self, link: RegisterLink, now_s: float) -> bool:
         """Ask; whether anybody answered. Raises BusError when the port fails."""
@@ -151,10 +157,10 @@ class StatusPoll:
     def blocks(self, link: RegisterLink, now_s: float) -> None:
         """What is left of the poll, where it has no time for everything of everybody: everything of some."""
         where = self._telemetry.block
-        count = self.fitting(link, where[1], self._blocks) if self._answered else 0
+        count = self.fitting(link, "blocks", where[1], self._blocks) if self._answered else 0
         if count:
             chosen = self._rotation.take(self._answered, count)
-            fresh = self._take(link, where, self.read_some(link, where, chosen), now_s)
+            fresh = self._take(link, where, self.read_some(link, "blocks", where, chosen), now_s)
             self._look_at_alerts(link, fresh, now_s)
 
     # --- requests -----------------------------------------------------------------------------------------------
@@ -162,18 +168,21 @@ class StatusPoll:
     def _listed(self) -> list[int]:
         return [member.id for member in self._members if member.liveness.listed]
 
-    def fitting(self, link: RegisterLink, length: int, most: int) -> int:
-        """How many servos, `most` at most, can be asked for `length` bytes in what is left of the poll."""
+    def fitting(self, link: RegisterLink, purpose: str, length: int, most: int) -> int:
+        """How many servos, `most` at most, can be asked for `length` bytes in what is left of the poll; one where
+        the purpose has waited for too long."""
+        if most <= 0:
+            return 0
         if self._group is None:
-            return int(link.affords(read_bytes(1, length, False), alone=True))
-        while most and not link.affords(read_bytes(most, length, False)):
+            return int(link.grants(purpose, read_bytes(1, length, False), alone=True))
+        while most > 1 and not link.affords(read_bytes(most, length, False)):
             most -= 1
-        return most
+        return most if link.grants(purpose, read_bytes(most, length, False)) else 0
 
-    def read_some(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
+    def read_some(self, link: RegisterLink, purpose: str, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
         """Answers of a few, of as many as there is time for: by one request where the wire has one."""
         if self._group is not None:
-            ids = ids[: self.fitting(link, where[1], len(ids))]
+            ids = ids[: self.fitting(link, purpose, where[1], len(ids))]
             if not ids:
                 return {}
             self._counts["reads"] += 1
@@ -181,7 +190,7 @@ class StatusPoll:
             return (fast or self._group)(*where, ids)
         answers: dict[int, Answer] = {}
         for servo in ids:
-            if not link.affords(read_bytes(1, where[1], False), alone=True):
+            if not link.grants(purpose, read_bytes(1, where[1], False), alone=True):
                 break
             self._counts["reads"] += 1
             if (answer := link.read(servo, *where)) is not None:
@@ -254,6 +263,8 @@ class StatusPoll:
                 if len(out.gaps) >= _SILENCES:
                     break
         out.judged = bool(out.gaps)
+        if not out.answers:  # the servo, or the wire? Whoever does not answer in the next round either is suspect
+            out.missed, out.gaps = out.gaps, []
         return out
 
     # --- who is there -------------------------------------------------------------------------------------------
@@ -278,8 +289,9 @@ class StatusPoll:
         answered = False
         absent = [member for member in self._members if not member.liveness.listed]
         waiting = [member for member in absent if member.liveness.probe_s <= now_s]
+        request = read_bytes(1, self._telemetry.block[1], False)
         for _ in range(_PROBES):
-            if not waiting or not link.affords(read_bytes(1, self._telemetry.block[1], False), alone=True):
+            if not waiting or not link.grants("probe", request, alone=True, late_s=AWAY_LATE_S):
                 return answered
             member = min(waiting, key=lambda each: each.liveness.probe_s)
             waiting.remove(member)
@@ -300,7 +312,7 @@ class StatusPoll:
             for other in absent:
                 other.hurry(now_s)
             waiting = list(absent)
-            self._take_health(self.read_some(link, self._telemetry.health, [member.id]), now_s)
+            self._take_health(self.read_some(link, "health", self._telemetry.health, [member.id]), now_s)
             member.back(now_s)
         return answered
 
@@ -356,15 +368,15 @@ class StatusPoll:
         if tells and (self._group is not None or self._polls % 2):
             self._look_at_current(link, self._currents.take(tells, 1)[0], now_s)
         due = self._polls % _HEALTH_POLLS == 0 if self._group is not None else not (tells and self._polls % 2)
-        count = self.fitting(link, self._telemetry.health[1], _HEALTH_SHARE) if due else 0
+        count = self.fitting(link, "health", self._telemetry.health[1], _HEALTH_SHARE) if due else 0
         if count:
             chosen = self._looks.take(ids, count)
-            self._take_health(self.read_some(link, self._telemetry.health, chosen), now_s)
+            self._take_health(self.read_some(link, "health", self._telemetry.health, chosen), now_s)
 
     def _look_at_current(self, link: RegisterLink, servo: int, now_s: float) -> None:
         index = self._by_id[servo].index
         register = self._telemetry.currents[index]
-        if register is None or not link.affords(read_bytes(1, register.size, False), alone=True):
+        if register is None or not link.grants("current", read_bytes(1, register.size, False), alone=True):
             return
         answer = link.read(servo, register.address, register.size)
         if answer is not None and len(answer.data) == register.size:
@@ -374,7 +386,7 @@ class StatusPoll:
     def _look_at_alerts(self, link: RegisterLink, fresh: Sequence[int], now_s: float) -> None:
         """Ask those whose alert bit has just come on what is wrong; who is not told of now is asked next time."""
         asked = fresh[:_ALERTS_READ]
-        told = self.read_some(link, self._telemetry.health, asked) if asked else {}
+        told = self.read_some(link, "alerts", self._telemetry.health, asked) if asked else {}
         self._flagged -= set(fresh) - told.keys()
         self._take_health(told, now_s)
 

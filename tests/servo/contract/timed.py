@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from chain_rig import BusRig, bus_of
 from emulated_devices import device_of, servos_of
-from emulated_port import EmulatedPort
+from emulated_port import BAUD, EmulatedPort
 from families import FAMILIES, LIMIT_RAD, Family
 from virtual_time import Time
 
@@ -20,22 +20,25 @@ from sfms_robot.servo.families import family_named
 
 CHAINS = [name for name, family in FAMILIES.items() if not family_named(family.bus).board]
 READ_DEADLINE_S = 0.003
+FRAME_S = 0.001  # of a USB adapter
 
 
 @dataclass
 class TimedPort(EmulatedPort):
-    """Bytes take their time on the wire, and so does waiting.
+    """Bytes take their time on the wire, and so does waiting. What has come is handed over every `FRAME_S`.
 
     Attributes:
         mute: ids that hear and obey, and do not answer; on a chain those behind them do not either.
         lose: whether an answer of an id is lost on its way.
         deaf: what the host sends is lost.
+        held_s: how long the adapter holds an answer back.
         sent_at_s: when, of everything in `sent`.
     """
 
     mute: set[int] = field(default_factory=set)
     lose: Callable[[int], bool] = lambda servo: False
     deaf: bool = False
+    held_s: float = 0.0
     sent_at_s: list[float] = field(default_factory=list)
     _coming: deque[tuple[float, bytes]] = field(default_factory=deque)
 
@@ -45,22 +48,28 @@ class TimedPort(EmulatedPort):
         self.sent_at_s.append(self.clock.t)
         if self.deaf:
             return
-        due_s = self.clock.t
+        due_s = self.clock.t + self.held_s
         for servos, answer, pause_s in replies_of(self.device, data, self.baud, self.clock.t):
             if self.mute & set(servos):
                 if len(servos) > 1:  # a fast read: one packet that stops where somebody is silent
                     whole = (len(answer) - 8) // len(servos)
                     first = min(servos.index(servo) for servo in self.mute if servo in servos)
                     answer = answer[: 8 + first * whole] if first else b""
-                    self._coming.append((due_s + len(answer) * 10 / self.baud, answer))
+                    self._comes(answer, due_s)
                 return
-            due_s += pause_s + len(answer) * 10 / self.baud
+            due_s += pause_s
             if not any(self.lose(servo) for servo in servos):
-                self._coming.append((due_s, answer))
+                self._comes(answer, due_s)
+            due_s += len(answer) * 10 / self.baud
+
+    def _comes(self, answer, begins_s):
+        byte_s = 10 / self.baud
+        size = max(1, math.floor(FRAME_S / byte_s))
+        for first in range(0, len(answer), size):
+            part = answer[first : first + size]
+            self._coming.append((begins_s + (first + len(part)) * byte_s, part))
 
     def read(self, n: int, deadline_s: float) -> bytes:
-        while self._coming and not self._coming[0][1]:
-            self._coming.popleft()
         if not self._coming or self._coming[0][0] > deadline_s:
             self.clock.wait_until(deadline_s)
             return b""
@@ -90,7 +99,7 @@ class Timed(BusRig):
 
     def tick(self, goals_rad):
         """Write, then poll; how long the poll took is kept."""
-        self.clock.wait_until((math.floor(self.clock.t / self.period_s) + 1) * self.period_s)
+        self.clock.wait_until((math.floor(self.clock.t / self.period_s + 1e-6) + 1) * self.period_s)
         self.bus.write(np.asarray(goals_rad, float), self.clock.t - self.loop_origin_s)
         began_s = self.clock.t
         readings = self.bus.poll(self.clock.t - self.loop_origin_s)
@@ -102,11 +111,20 @@ class Timed(BusRig):
             readings = self.tick(goals_rad)
         return readings
 
+    def ticks_for(self, duration_s: float, goals_rad):
+        """As many as a time has room for."""
+        end_s = self.clock.t + duration_s
+        while self.clock.t < end_s:
+            readings = self.tick(goals_rad)
+        return readings
 
-def timed(name: str, count: int = 28, clock: Time | None = None, **more) -> Timed:
+
+def timed(name: str, count: int = 28, clock: Time | None = None, held_s: float = 0.0, **more) -> Timed:
     """`count` servos with ids from 1 on, standing in the middle. `more`: as for `bus_of`."""
     family = FAMILIES[name]
     ids, maps = range(1, count + 1), [load_firmware_map(family.model)] * count
-    port = TimedPort(device_of(*servos_of(family.model, *ids)), clock=clock or Time(), name="timed")
+    baud = more.get("baud", BAUD)
+    servos = servos_of(family.model, *ids, baud=baud)
+    port = TimedPort(device_of(*servos), baud, clock or Time(), "timed", held_s=held_s)
     bus = bus_of(maps, ids, lambda: port, LIMIT_RAD, read_deadline_s=READ_DEADLINE_S, **more)
     return Timed(port, bus, family, count, 1 / bus._config.rate_hz)
