@@ -72,8 +72,8 @@ def test_everybody_is_back_after_a_bad_time(family):
     assert rig.bus.statistics()["silent"] == [] and rig.torques() == [1] * 12
 
 
-@pytest.mark.parametrize("held_s", [0.0, 0.002, 0.007, 0.016, 0.03])
-@pytest.mark.parametrize(("baud", "rate_hz"), [(1_000_000, 100), (57_600, 100), (57_600, 20)])
+@pytest.mark.parametrize("held_s", [0.0, 0.002, 0.016])
+@pytest.mark.parametrize(("baud", "rate_hz"), [(1_000_000, 100), (57_600, 20)])
 @pytest.mark.parametrize("away", [{2}, {1, 2, 3, 4}], ids=["one", "all"])
 @pytest.mark.parametrize("family", CHAINS)
 def test_who_was_away_is_back_however_slow_the_wire_and_its_adapter(family, away, baud, rate_hz, held_s):
@@ -91,7 +91,7 @@ def test_who_was_away_is_back_however_slow_the_wire_and_its_adapter(family, away
     assert all(reading.fault is None and reading.age_s < 0.5 for reading in readings.values())
 
 
-@pytest.mark.parametrize("held_s", [0.0, 0.007, 0.016])
+@pytest.mark.parametrize("held_s", [0.0, 0.016])
 @pytest.mark.parametrize("baud", [1_000_000, 57_600])
 @pytest.mark.parametrize("family", CHAINS)
 def test_lost_torque_and_changed_registers_are_heard_of_however_slow_the_wire_and_its_adapter(family, baud, held_s):
