@@ -1,7 +1,10 @@
-"""A process of its own for a part of the program: a plain interpreter, spoken to over its stdin and stdout.
+"""Child processes: plain interpreters that talk over stdin and stdout, and pools for work in parallel.
 
-Not a copy of this program, so a script, a notebook and a thread may all start one. It is in a session of its own:
-Ctrl-C in a terminal is the parent's alone, since the head must reach rest first.
+A child is not a copy of this program, so a script, a notebook and a thread may all start one. It has its own session:
+only the parent receives Ctrl-C from a terminal, since the head must reach rest first.
+
+Every child computes with one thread unless it asks for more. With as many threads as cores in each of several
+processes, the threads of one spin in wait while another has their core (OpenMP), and everything slows down.
 """
 
 from __future__ import annotations
@@ -12,8 +15,27 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
-from typing import IO, Any
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
+from typing import IO, Any, Final
+
+# Read by OpenMP (torch), OpenBLAS (numpy, scipy) and MKL when they are loaded; onnxruntime sets its own per session.
+ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+@contextmanager
+def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Start a pool whose processes compute with one thread each. On leaving, tasks that have not begun are dropped."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)  # a pool starts its processes as tasks come, with the environment of that moment
+    pool = ProcessPoolExecutor(processes, get_context("spawn"))  # torch's threads do not survive a fork
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def start_child(call: str, quiet: bool = False) -> subprocess.Popen[bytes]:
@@ -29,7 +51,7 @@ def start_child(call: str, quiet: bool = False) -> subprocess.Popen[bytes]:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL if quiet else None,
         start_new_session=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        env={**os.environ, **ONE_THREAD, "PYTHONPATH": os.pathsep.join(paths)},
     )
 
 

@@ -1,6 +1,11 @@
 """`--port FAMILY=DEVICE[,MODEL:IDS[@BAUD]]` runs the contract of the servo buses on real servos."""
 
+import os
 import sys
+
+from sfms_robot.child_process import ONE_THREAD
+
+os.environ.update(ONE_THREAD)  # before numpy and torch are loaded, here and in the workers that pytest starts
 
 import pytest
 from ended import Ended

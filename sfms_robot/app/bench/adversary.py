@@ -7,16 +7,14 @@ that is refused leaves the limiter without a reference. The judge is `motion.aud
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 
 from sfms_robot.app.bench.measure import Row
 from sfms_robot.app.open_head import Motion, build_motion
+from sfms_robot.child_process import cores, process_pool
 from sfms_robot.config import load_head
 from sfms_robot.data import head_names
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan
@@ -50,7 +48,7 @@ def adversarial(frames: int, heads: tuple[str, ...] = (), seed: int = 0) -> dict
     starts = range(0, frames, CHUNK)
     parts = [(name, min(CHUNK, frames - start), seed + start // CHUNK) for name in names for start in starts]
     tallies = {name: Tally(0, 0, 0) for name in names}
-    with ProcessPoolExecutor(min(len(parts), os.cpu_count() or 1), get_context("spawn")) as pool:
+    with process_pool(min(len(parts), cores())) as pool:
         for (name, _, _), tally in zip(parts, pool.map(torment, *zip(*parts, strict=True)), strict=True):
             tallies[name] += tally
     return {f"retarget.wild.{name}": _row(tally) for name, tally in tallies.items()}

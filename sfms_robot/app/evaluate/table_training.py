@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.app.train.train_runs import device_of
+from sfms_robot.child_process import process_pool
 from sfms_robot.corpora.takes import Take
 from sfms_robot.evaluation.paper.recipes import SizeName, recipes
 from sfms_robot.evaluation.paper.table_trainer import train
@@ -75,22 +74,15 @@ def _one_by_one(orders: Sequence[_Order]) -> None:
 
 
 def _side_by_side(orders: Sequence[_Order], jobs: int) -> None:
-    spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    with Progress(console=Console(stderr=True)) as bar, ProcessPoolExecutor(jobs, spawn) as pool:
+    with Progress(console=Console(stderr=True)) as bar, process_pool(jobs) as pool:
         task = bar.add_task(f"training {len(orders)} tokenizers", total=len(orders))
-        running = [pool.submit(_train_alone, order) for order in orders]
-        try:
-            for done in as_completed(running):
-                done.result()
-                bar.advance(task)
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+        for done in as_completed([pool.submit(_train, order, _unwatched) for order in orders]):
+            done.result()
+            bar.advance(task)
 
 
-def _train_alone(order: _Order) -> None:
-    torch.set_num_threads(1)
-    _train(order, lambda report: None)
+def _unwatched(report: object) -> None:
+    """Ignore a report of progress: several trainings share one bar."""
 
 
 def _train(order: _Order, watch: Watch) -> None:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
+from sfms_robot.child_process import process_pool
 from sfms_robot.listeners.registry import one_thread
 
 _Task = TypeVar("_Task")
@@ -35,13 +35,9 @@ def done_in_processes(
                 results.append(work(task))
                 progress.advance(bar)
             return results
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=one_thread)
-        try:
+        with process_pool(workers) as pool:
             waiting = [pool.submit(work, task) for task in tasks]
             for done in as_completed(waiting):
                 done.result()
                 progress.advance(bar)
             return [one.result() for one in waiting]
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
