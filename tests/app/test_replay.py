@@ -57,7 +57,9 @@ def test_the_heads_own_voice_and_jaws_are_read_back_beside_the_persons_and_older
     for index in range(3):
         face = replace(FaceFrame.of(0.0, np.zeros(58)), jaw_rad=np.float32([0, 0.25, 0])) if index else None
         said = np.full(640, 0.25 * (index + 1), np.float32)  # of the frame that comes next, as sources give it
-        recorder.heard(SpeakerFrame((index + 1) * FRAME_S, np.zeros(640, np.float32), face, said, 0.5 if index else None))
+        recorder.heard(
+            SpeakerFrame((index + 1) * FRAME_S, np.zeros(640, np.float32), face, said, 0.5 if index else None)
+        )
     recorder.close()
     run = read_recording(tmp_path / "new")
     np.testing.assert_allclose(run.agent_audio[::640], [0.0, 0.25, 0.5], atol=2e-5)
