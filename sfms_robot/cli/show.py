@@ -44,9 +44,8 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
         ("bus", f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
                 f"silent: {bus['silent'] or 'none'}"),
     ]  # fmt: skip
-    if recorded := report.get("recording"):
-        per_hour_MB = recorded["bytes"] * 3.6e-3 / max(report["duration_s"], 1.0)
-        rows.append(("recording", f"{recorded['bytes'] * 1e-6:.1f} MB, {per_hour_MB:.0f} MB an hour"))
+    if "recording" in report:
+        rows.append(("recording", f"{report['recording']['bytes'] * 1e-6:.1f} MB"))
     for name, text in rows:
         table.add_row(name, text)
     console = screen()

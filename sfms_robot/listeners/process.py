@@ -127,9 +127,9 @@ class ListenerProcess:
         """
         began_s = self._clock()
         while self._state == "starting" and self._clock() - began_s <= limit_s:
-            kind, value, _ = self._child.next(_LOOK_S)
-            if kind == "loaded":
-                self._loaded(value)
+            kind, value, number = self._child.next(_LOOK_S)
+            if kind != "error":
+                self._take(kind, value, number, began_s)
             elif value is not None:
                 self.close()
                 raise ModelError(value)
@@ -202,7 +202,8 @@ class ListenerProcess:
             self._skipped += int(number)
             self._answered(int(number), now_s)
         elif kind == "loaded":
-            self._loaded(value)
+            self._state, self._engine = "building", value
+            self._waits_since_s = self._phase_since_s = None
         elif kind == "probed":
             self._probe = value
             self._tell_hop()
@@ -218,10 +219,6 @@ class ListenerProcess:
                 self._lateness.came(value, now_s)
                 return value  # type: ignore[no-any-return]
         return None
-
-    def _loaded(self, engine: str | None) -> None:
-        self._state, self._engine = "building", engine
-        self._waits_since_s = self._phase_since_s = None
 
     def _tell_hop(self) -> None:
         """Answer a probe, as soon as that can be."""

@@ -293,8 +293,8 @@ def _plan_body(plan: Plan) -> dict[str, Any]:
     return {
         "made_at_s": plan.made_at_s,
         "times_s": _numbers(plan.times_s),
-        "frames": [_numbers(frame) for frame in plan.frames],
-        "jaw_rad": None if plan.jaw_rad is None else [_numbers(jaw) for jaw in plan.jaw_rad],
+        "frames": _numbers(plan.frames),
+        "jaw_rad": None if plan.jaw_rad is None else _numbers(plan.jaw_rad),
         "hazards_hz": {kind: _number(hazard) for kind, hazard in plan.hazards_hz.items()},
     }
 
@@ -350,6 +350,6 @@ def _number(value: float) -> float:
     return round(float(value), _DIGITS)
 
 
-def _numbers(values: NDArray[np.floating]) -> list[float]:
-    rounded: list[float] = values.astype(np.float64).round(_DIGITS).tolist()
+def _numbers(values: NDArray[np.floating]) -> list[Any]:
+    rounded: list[Any] = values.astype(np.float64).round(_DIGITS).tolist()
     return rounded

@@ -94,11 +94,11 @@ def test_a_recording_of_a_head_that_speaks_moves_a_head_and_a_listener_as_the_ru
     assert recording.agent_audio.shape == recording.audio.shape
     with closing(open_source(duration_s=3.0, agent_audio=said)) as source:
         given = source.read(3.0)
-    heard = speaker_frames(recording.audio, recording.speaker, recording.agent_audio, recording.attention)
+    heard = speaker_frames(recording.audio, recording.speaker, recording.agent_audio)
     for one, other in zip(heard[:-1], given[:-1], strict=True):  # what is said after the last frame is not in its file
         np.testing.assert_allclose(one.agent_audio, other.agent_audio, atol=2e-5)
     planned = np.array([body["frames"][0] for kind, body in _records(tmp_path / "run" / RUN_FILE) if kind == "/plan"])
-    mute = speaker_frames(recording.audio, recording.speaker, None, recording.attention)
+    mute = speaker_frames(recording.audio, recording.speaker, None)
     away = [np.abs(answers(seeded, frames[: len(planned)]) - planned).max() for frames in (heard, mute)]
     assert away[0] < 1e-3 < 0.02 < away[1]
     own_db = [json.loads(frame_json(record))["own"] for record in pictures(recording)]

@@ -15,7 +15,7 @@ from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
-from sfms_robot.signals.audio import energies_db
+from sfms_robot.signals.audio import energy_db
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 from sfms_robot.viewer.frame_record import NOTHING, Picture, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
@@ -55,19 +55,17 @@ def pictures(recording: RunRecording) -> Iterator[bytes]:
     talks = recording.talks_at(times_s)
     heard = np.searchsorted(recording.heard_s, times_s, side="right") - 1
     said = recording.agent_audio
-    own_db = None if said is None else energies_db(said.reshape(-1, FRAME_SAMPLES))
     states = [(-np.inf, "starting", ()), *recording.states]
     for time_s, row, talking, frame in zip(times_s.tolist(), rows.tolist(), talks, heard.tolist(), strict=True):
         while len(states) > 1 and states[1][0] <= time_s:
             states.pop(0)
         faults = {recording.joints[joint]: FAULTY for joint in np.flatnonzero(recording.faults[row])}
-        inside = 0 <= frame < len(recording.heard_s)
         yield pack_picture(
             Picture(
                 time_s, recording.motion[row], recording.goals_rad[row].astype(np.float64), recording.present_rad[row],
                 rare_json(states[0][1], states[0][2], faults, None),
-                voice_db=float(recording.energy_db[frame]) if inside else NOTHING,
-                own_voice_db=own_db[frame] if inside and own_db is not None else NOTHING,
+                voice_db=float(recording.energy_db[frame]) if 0 <= frame < len(recording.heard_s) else NOTHING,
+                own_voice_db=NOTHING if said is None else energy_db(said[frame * FRAME_SAMPLES :][:FRAME_SAMPLES]),
                 talking=bool(talking),
             )
         )  # fmt: skip

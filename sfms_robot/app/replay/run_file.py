@@ -43,7 +43,6 @@ class RunRecording:
         agent_audio: (M * 640,) voice of the head itself, sample by sample beside `audio`; None where the recording has
             none, as those of version 0.1.
         energy_db: (M,). speaker: (M, 58) NaN where no face was seen. speaker_jaw_rad: (M, 3) NaN where no jaw was.
-        attention: (M,) NaN where it is not known.
         plans: how many the listener made.
         states: (time_s, name, why) of every change, in order; none in a file of version 0.1.
         events: (start_s, kind) of the nods, blinks and smiles that plans held.
@@ -65,7 +64,6 @@ class RunRecording:
     energy_db: Doubles
     speaker: Floats
     speaker_jaw_rad: Floats
-    attention: Doubles
     plans: int
     states: Sequence[tuple[float, str, tuple[str, ...]]]
     events: Sequence[tuple[float, str]]
@@ -197,7 +195,7 @@ class _Found:
         self.whole = False
         self._joints: tuple[str, ...] = ()
         self._plans = 0
-        self._times_s, self._heard_s, self._energy_db, self._attention = (array("d") for _ in range(4))
+        self._times_s, self._heard_s, self._energy_db = (array("d") for _ in range(3))
         self._motion, self._goals_rad, self._present_rad, self._speaker, self._jaw_rad = (array("f") for _ in range(5))
         self._faults, self._pcm16, self._agent_pcm16 = bytearray(), bytearray(), bytearray(2 * FRAME_SAMPLES)
         self._speaks = False
@@ -229,10 +227,8 @@ class _Found:
             self._energy_db.append(value["energy_db"])
             self._speaker.extend(_by_channel(value["face"]))
             self._jaw_rad.extend(value.get("jaw_rad") or [math.nan] * 3)  # no key in a recording of version 0.1
-            self._attention.append(_or_nan(value.get("attention")))
             self._pcm16 += _samples(value["audio_pcm16"])
-            said = value.get("agent_audio_pcm16")
-            self._speaks |= said is not None
+            self._speaks |= (said := value.get("agent_audio_pcm16")) is not None
             self._agent_pcm16 += _samples(said or "")
         elif kind == "/state":
             self._states.append((value["time_s"], value["state"], tuple(value["why"])))
@@ -275,7 +271,6 @@ class _Found:
             energy_db=np.array(self._energy_db),
             speaker=np.array(self._speaker, dtype=np.float32).reshape(-1, MOTION_DIM),
             speaker_jaw_rad=np.array(self._jaw_rad, dtype=np.float32).reshape(-1, 3),
-            attention=np.array(self._attention),
             plans=self._plans,
             states=self._states,
             events=self._events,
