@@ -23,8 +23,7 @@ for half a second, its hop is chosen. Every ten seconds the choice is held again
 that does not fit any more gives way to a shorter one, and never to a longer one, so that it settles.
 
     parent -> child    pickle: (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
-                       int: the hop, which it waits for and which may change; whenever somebody asks for it, another
-                       Calmness
+                       int: the hop, which it waits for and which may change; at any time another Calmness
     child -> parent    pickle: (kind, value, number)
         loaded         nothing is wrong with it; value names its engine
         probed         value is a `Probe`; it waits for its hop
@@ -171,7 +170,7 @@ class ListenerProcess:
 
     @property
     def lost(self) -> bool:
-        """Whether it hangs, restarts, is given up, or always comes too late."""
+        """Return whether it hangs, restarts, is given up, or always comes too late."""
         away = self._state == "given up" or (self._restarts > 0 and self._state != "listening")
         return self._hung or away or self._lateness.lasting
 

@@ -3,7 +3,7 @@
 The loop only drops a value into a bounded queue; a thread of its own encodes and writes. When the queue is full a
 value is dropped and counted, never waited for - except in virtual time, where waiting costs nothing and the file must
 be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
-goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
+continues in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
 Topics: /speaker (25 Hz: sound, level, face, attention, place, and what the robot says next), /plan (per plan), /event
 (what was decided, and why; of a listener that decides nothing, nods, blinks and smiles found in its plans), /face (per

@@ -1,4 +1,4 @@
-"""The page's server in a process of its own: whatever visitors do, it costs the servo loop no tick.
+"""The page's server in a process of its own: visitors cost the servo loop no tick.
 
 Both directions are messages behind a header, over the child's stdin and stdout:
 
