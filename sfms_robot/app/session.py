@@ -208,6 +208,7 @@ def run(
     overlay: Callable[[Floats, Doubles], Floats] | None = None,
     interrupt: Interrupt | None = None,
     halt: HaltLatch | None = None,
+    more: Callable[[], Mapping[str, Any]] = dict,
     signals: bool = True,
 ) -> dict[str, Any]:
     """Listen until the duration is over or somebody interrupts. Returns the report.
@@ -223,6 +224,7 @@ def run(
         observers, overlay: see `Programme`.
         interrupt: asked to end the run from another thread.
         halt: closed and opened from other threads.
+        more: what else the status and the report hold.
 
     Raises RobotError before torque came on.
     """
@@ -250,7 +252,7 @@ def run(
         live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
         recorder = _recorder(options, opened.config, stack)
         log = run_log(opened)
-        status = _status(options, {**facts, "duration_s": duration_s}, opened, log, person, feed, live)
+        status = _status(options, {**facts, "duration_s": duration_s}, opened, log, person, feed, live, more)
         if panel is not None:
             stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
         tellers = [stack.enter_context(closing(RunTeller(outlet))) for outlet in person.outlets]
@@ -267,7 +269,7 @@ def run(
             observers=[status, *watchers, *observers, *tellers, *([] if recorder is None else [recorder])],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt, signals=False, log=log)
-        report = _report(options, opened, drove, feed, person) | {"limitation": limited}
+        report = _report(options, opened, drove, feed, person) | {"limitation": limited, **more()}
         if recorder is not None:
             recorder.close()
             report["recording"] = recorder.statistics()
@@ -320,7 +322,7 @@ def _make_ready(feed: PlanFeed, person: Source, opened: OpenHead) -> None:
 
 def _status(
     options: RunOptions, facts: Mapping[str, Any], opened: OpenHead, log: RunLog, person: Source, feed: PlanFeed,
-    live: LiveKnobs,
+    live: LiveKnobs, more: Callable[[], Mapping[str, Any]],
 ) -> RunStatus:  # fmt: skip
     """How it goes, for whoever asks meanwhile."""
 
@@ -330,6 +332,7 @@ def _status(
             "source": dict(person.statistics()),
             "listener_state": dict(feed.statistics()),
             "intensity": live.values["intensity"],
+            **more(),
         }
 
     return RunStatus(list(opened.config.joints), facts, figures)

@@ -44,6 +44,8 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
         ("bus", f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
                 f"silent: {bus['silent'] or 'none'}"),
     ]  # fmt: skip
+    if "recording" in report:
+        rows.append(("recording", f"{report['recording']['bytes'] * 1e-6:.1f} MB"))
     for name, text in rows:
         table.add_row(name, text)
     console = screen()

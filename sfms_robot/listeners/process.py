@@ -4,9 +4,17 @@ In one process networks and the servo loop share a lock, and ticks slip by tens 
 model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it. It ends
 when its pipe does, so it never outlives its parent, whatever killed that.
 
-The child says of every frame that it is done. One that is silent for `HUNG_S` is named as hung; after `RESTART_S`, or
-when it died, it is started anew and listens from then on, while the head goes on by itself. Too many of those in a
-minute and it stays down.
+The child says of every frame that it is done. Until it listens, its main thread's processor time is the sign of life:
+loading from a slow disk uses some all the time, a child that is stopped or waits for a lock uses none. A child without
+a sign for `HUNG_S` is named as hung, and restarted after the limit of its phase; the head continues without it. After
+`RESTARTS` in a minute it stays down.
+
+    phase      no sign of life           restarted after it lasts    or after, in all
+    starting   no processor time         `LOAD_RESTART_S`            `PHASE_LIMIT_S`
+    building   no processor time         `RESTART_S`                 `PHASE_LIMIT_S`
+    listening  an answer is due          `RESTART_S`                 -
+
+Where the system does not report processor time (`_Child.worked_ns`), only `PHASE_LIMIT_S` limits the first two.
 
 What a slow machine did not hear (`inbox`) is counted, and said once.
 
@@ -15,8 +23,7 @@ for half a second, its hop is chosen. Every ten seconds the choice is held again
 that does not fit any more gives way to a shorter one, and never to a longer one, so that it settles.
 
     parent -> child    pickle: (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
-                       int: the hop, which it waits for and which may change; whenever somebody asks for it, another
-                       Calmness
+                       int: the hop, which it waits for and which may change; at any time another Calmness
     child -> parent    pickle: (kind, value, number)
         loaded         nothing is wrong with it; value names its engine
         probed         value is a `Probe`; it waits for its hop
@@ -33,10 +40,12 @@ import math
 import pickle
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.child_process import end_child, messages, start_child
@@ -53,8 +62,11 @@ START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
 CLOSE_LIMIT_S: Final = 0.2
 HUNG_S: Final = 1.0
 RESTART_S: Final = 3.0
+LOAD_RESTART_S: Final = 10.0  # starting: a listener of another package may wait for a network or a device
+PHASE_LIMIT_S: Final = START_LIMIT_S  # a child that computes and gets nowhere
 RESTARTS: Final = 5  # in a minute; more than that is no accident
 REVIEW_S: Final = 10.0
+_LOOK_S: Final = 0.1  # at a child that loads, while nothing else runs
 SETTLED_FRAMES: Final = FRAME_HZ // 2  # after so many a source has measured how late it is
 _MINUTE_S: Final = 60.0
 
@@ -69,9 +81,17 @@ class ListenerProcess:
         seed: of the stream.
         calmness: how often a listener that decides events does what.
         engine: what its networks are computed by.
+        clock: seconds, for `wait_loaded`; `push` and `poll` are given theirs.
     """
 
-    def __init__(self, name: str, seed: int, calmness: Calmness | None = None, engine: EngineName = "auto") -> None:
+    def __init__(
+        self,
+        name: str,
+        seed: int,
+        calmness: Calmness | None = None,
+        engine: EngineName = "auto",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._name, self._seed, self._calmness, self._wanted = name, seed, calmness, engine
         self._engine: str | None = None
         self._step_ms = Quantiles()
@@ -80,7 +100,11 @@ class ListenerProcess:
         self._restarted_s: list[float] = []
         self._restarts = 0
         self._state = "starting"
-        self._waits_since_s: float | None = None  # for the answer to the oldest frame that has none yet
+        self._hung = False
+        self._waits_since_s: float | None = None  # for a sign of life, or the answer to the oldest frame without one
+        self._phase_since_s: float | None = None  # starting or building, other than for us
+        self._worked_ns = 0
+        self._clock = clock
         self._unanswered = 0
         self._latencies: Callable[[Probe], Latencies] | None = None
         self._probe: Probe | None = None  # that is to be answered with a hop
@@ -96,15 +120,24 @@ class ListenerProcess:
         self._child.tell(calmness)
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
-        """Block until the listener is loaded. Raises ModelError with its own message when it cannot be."""
-        if self._state != "starting":
-            return
-        kind, value, _ = self._child.next(limit_s)
-        if kind == "loaded":
-            self._state, self._engine = "building", value
-            return
-        self.close()
-        raise ModelError(value or f"the listener process was not loaded after {limit_s:g} s")
+        """Block until the listener is loaded, and restart a child that hangs.
+
+        Raises ModelError with the child's own message where it cannot be loaded.
+        """
+        began_s = self._clock()
+        while self._state == "starting" and self._clock() - began_s <= limit_s:
+            kind, value, number = self._child.next(_LOOK_S)
+            if kind != "error":
+                self._take(kind, value, number, began_s)
+            elif value is not None:
+                self.close()
+                raise ModelError(value)
+            elif not self._child.ended:  # one that ended has left a message why
+                self._supervise(self._clock())
+        if self._state in ("starting", "given up"):
+            self.close()
+            raise ModelError(f"the listener process was not loaded after {limit_s:g} s")
+        self._restarted_s.clear()  # times of another clock than those of `poll`
 
     def choose_hop_by(self, source_latency_s: Callable[[], float], lead_s: float, tick_s: float) -> None:
         """Choose the hop when it is known what a plan takes here, for a source that is so late, a loop of `tick_s` and
@@ -125,7 +158,7 @@ class ListenerProcess:
         self._waits_since_s = now_s if self._waits_since_s is None else self._waits_since_s
 
     def poll(self, now_s: float) -> Sequence[Plan]:
-        """Plans that came. Never blocks, never raises: a child that died or hangs is started anew."""
+        """Return plans that came. Never blocks, never raises: a child that died or hangs is restarted."""
         plans = []
         while (message := self._child.message()) is not None:
             plan = self._take(*message, now_s)
@@ -137,16 +170,16 @@ class ListenerProcess:
 
     @property
     def lost(self) -> bool:
-        """Hung, being started anew, given up, or always too late."""
-        away = self._state in ("hung", "given up") or (self._restarts > 0 and self._state != "listening")
-        return away or self._lateness.lasting
+        """Return whether it hangs, restarts, is given up, or always comes too late."""
+        away = self._state == "given up" or (self._restarts > 0 and self._state != "listening")
+        return self._hung or away or self._lateness.lasting
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` (starting, building, listening, late, hung, given up), `engine` in words, `restarts`,
+        """Return `state` (starting, building, listening, late, hung, given up), `engine` in words, `restarts`,
         `skipped_frames`, `step_ms`, `hop` and `budget_ms` (see `config.hop`), None as long as no hop was chosen.
         """
         return {
-            "state": self._lateness.named(self._state),
+            "state": "hung" if self._hung else self._lateness.named(self._state),
             "engine": self._engine,
             "restarts": self._restarts,
             "skipped_frames": self._skipped,
@@ -169,6 +202,7 @@ class ListenerProcess:
             self._answered(int(number), now_s)
         elif kind == "loaded":
             self._state, self._engine = "building", value
+            self._waits_since_s = self._phase_since_s = None
         elif kind == "probed":
             self._probe = value
             self._tell_hop()
@@ -179,9 +213,6 @@ class ListenerProcess:
             self._review_s = now_s + REVIEW_S
         else:
             self._answered(1, now_s)
-            if self._state == "hung":
-                log.warning("the listener goes on")
-                self._state = "listening"
             if kind == "plan":
                 self._step_ms.add(number)
                 self._lateness.came(value, now_s)
@@ -224,29 +255,47 @@ class ListenerProcess:
         self._waits_since_s = now_s if self._unanswered else None
 
     def _supervise(self, now_s: float) -> None:
+        """Name a child without a sign of life, and restart it after the limit of its phase."""
         if self._state == "given up":
             return
         if self._child.ended:
             self._restart("died", now_s)
-        elif self._state in ("listening", "hung") and self._waits_since_s is not None:
-            silent_s = now_s - self._waits_since_s
-            if silent_s > RESTART_S:
-                self._restart(f"has not answered for {silent_s:.1f} s", now_s)
-            elif silent_s > HUNG_S and self._state != "hung":
-                log.warning("the listener has not answered for %.1f s", silent_s)
-                self._state = "hung"
+            return
+        if self._state != "listening" and self._loads_too_long(now_s):
+            self._restart(f"is {self._state} for {PHASE_LIMIT_S:g} s", now_s)
+            return
+        silent_s = 0.0 if self._waits_since_s is None else now_s - self._waits_since_s
+        if silent_s > (LOAD_RESTART_S if self._state == "starting" else RESTART_S):
+            self._restart(f"has not answered for {silent_s:.1f} s", now_s)
+        elif (silent_s > HUNG_S) != self._hung:
+            self._hung = not self._hung
+            if self._hung:
+                log.warning("the listener (%s) has not answered for %.1f s", self._state, silent_s)
+            else:
+                log.info("the listener answers again")
+
+    def _loads_too_long(self, now_s: float) -> bool:
+        """Look for a sign of life of a child that starts or builds; whether that has lasted too long in all."""
+        worked_ns = self._child.worked_ns()
+        if self._waits_since_s is None or not worked_ns or worked_ns != self._worked_ns:
+            self._waits_since_s, self._worked_ns = now_s, worked_ns
+        if self._phase_since_s is None or self._probe is not None:  # a child with a probe waits for us
+            self._phase_since_s = now_s
+        return now_s - self._phase_since_s > PHASE_LIMIT_S
 
     def _restart(self, why: str, now_s: float) -> None:
         self._child.kill()
         self._restarted_s = [at_s for at_s in self._restarted_s if now_s - at_s < _MINUTE_S]
+        self._hung = False
         if len(self._restarted_s) >= RESTARTS:
-            log.error("the listener %s again, %d times in a minute: the head goes on without it", why, RESTARTS)
+            log.error("the listener %s again, %d times in a minute: the head continues without it", why, RESTARTS)
             self._state = "given up"
             return
-        log.warning("the listener %s: started anew", why)
+        log.warning("the listener %s: restarted", why)
         self._restarted_s.append(now_s)
         self._restarts += 1
-        self._state, self._waits_since_s, self._unanswered, self._probe = "starting", None, 0, None
+        self._state, self._waits_since_s, self._phase_since_s, self._unanswered = "starting", None, None, 0
+        self._probe = None
         self._lateness = Lateness()
         self._child = _Child(self._name, self._seed + self._restarts, self._calmness, self._wanted)
 
@@ -291,6 +340,13 @@ class _Child:
             return self._messages.get_nowait()
         except queue.Empty:
             return None
+
+    def worked_ns(self) -> int:
+        """Return the processor time of its main thread so far; 0 where the system (Linux) does not report it."""
+        try:
+            return int(Path(f"/proc/{self._process.pid}/schedstat").read_text().split()[0])
+        except (OSError, ValueError):
+            return 0
 
     def next(self, limit_s: float) -> tuple[str, Any, float]:
         """The next message; ("error", None, 0) when none comes in time."""

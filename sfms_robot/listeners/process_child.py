@@ -13,6 +13,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import IO, Any, Final
 
 import numpy as np
@@ -26,6 +27,7 @@ from sfms_robot.listeners.inbox import Inbox, calmed
 from sfms_robot.ports import Listener
 
 NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
+AWAKE_S: Final = 0.25
 PROBE_S: Final = 0.5
 PROBE_PLANS: Final = 12
 
@@ -55,7 +57,14 @@ def main() -> None:
     except RobotError as error:
         _say(plans, "error", str(error))
         return
-    listen(at_hop(listener, hops.get()), seed, inbox, plans, hops)
+    listen(at_hop(listener, _hop(hops)), seed, inbox, plans, hops)
+
+
+def _hop(hops: queue.SimpleQueue[int]) -> int:
+    """Wait for the hop, awake a few times a second: for the parent, a child that uses no processor time hangs."""
+    while True:
+        with suppress(queue.Empty):
+            return hops.get(timeout=AWAKE_S)
 
 
 def use_threads(listener: Listener, most: int) -> bool:

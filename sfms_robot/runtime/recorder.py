@@ -3,12 +3,12 @@
 The loop only drops a value into a bounded queue; a thread of its own encodes and writes. When the queue is full a
 value is dropped and counted, never waited for - except in virtual time, where waiting costs nothing and the file must
 be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
-goes on in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
+continues in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
-Topics: /speaker (25 Hz: sound, level, face, attention, place), /plan (per plan), /event (what was decided, and why; of
-a listener that decides nothing, nods, blinks and smiles found in its plans), /face (per tick: the 58 channels asked
-for), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: what else they tell), /state
-(when it changes).
+Topics: /speaker (25 Hz: sound, level, face, attention, place, and what the robot says next), /plan (per plan), /event
+(what was decided, and why; of a listener that decides nothing, nods, blinks and smiles found in its plans), /face (per
+tick: the 58 channels asked for), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: what
+else they tell), /state (when it changes).
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ _log = logging.getLogger(__name__)
 
 _NUMBER: Final = {"type": "number"}
 _NUMBER_OR_NULL: Final = {"type": ["number", "null"]}
+_PCM16: Final = {"type": "string", "contentEncoding": "base64"}
 _CHANNELS: Final[Mapping[str, Any]] = dict.fromkeys(CHANNELS, _NUMBER_OR_NULL)
 _JOINT: Final = {
     "type": "object",
@@ -65,10 +66,12 @@ _JOINT: Final = {
 _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
     "/speaker": {
         "time_s": _NUMBER,
-        "audio_pcm16": {"type": "string", "contentEncoding": "base64"},
+        "audio_pcm16": _PCM16,
+        "agent_audio_pcm16": {**_PCM16, "type": ["string", "null"]},
         "audio_hz": _NUMBER,
         "energy_db": _NUMBER,
         "face": {"type": ["object", "null"], "properties": _CHANNELS},
+        "jaw_rad": {"type": ["array", "null"], "items": _NUMBER},
         "attention": _NUMBER_OR_NULL,
         "place_m": {"type": ["array", "null"], "items": _NUMBER},
     },
@@ -76,6 +79,7 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "made_at_s": _NUMBER,
         "times_s": {"type": "array", "items": _NUMBER},
         "frames": {"type": "array", "items": {"type": "array", "items": _NUMBER}},
+        "jaw_rad": {"type": ["array", "null"], "items": {"type": "array", "items": _NUMBER}},
         "hazards_hz": {"type": "object", "additionalProperties": _NUMBER},
     },
     "/event": {
@@ -155,8 +159,9 @@ class Recorder:
             _log.warning("the recording lacks %d values: the disk was too slow", self._dropped)
 
     def statistics(self) -> dict[str, Any]:
-        """Messages written, values dropped, and what went wrong with the file, for the report."""
-        return {"messages": self._written, "dropped": self._dropped, "trouble": self._trouble}
+        """Return for the report: messages written, values dropped, bytes on disk, and what went wrong with the file."""
+        size = sum(part.stat().st_size for part in parts_of(self._folder))
+        return {"messages": self._written, "dropped": self._dropped, "bytes": size, "trouble": self._trouble}
 
     def _put(self, value: Tick | SpeakerFrame | Plan) -> None:
         if self._closed:
@@ -288,22 +293,31 @@ def _plan_body(plan: Plan) -> dict[str, Any]:
     return {
         "made_at_s": plan.made_at_s,
         "times_s": _numbers(plan.times_s),
-        "frames": [_numbers(frame) for frame in plan.frames],
+        "frames": _numbers(plan.frames),
+        "jaw_rad": None if plan.jaw_rad is None else _numbers(plan.jaw_rad),
         "hazards_hz": {kind: _number(hazard) for kind, hazard in plan.hazards_hz.items()},
     }
 
 
 def _speaker_body(frame: SpeakerFrame) -> dict[str, Any]:
-    pcm = np.round(np.clip(frame.audio, -1.0, 1.0) * 32767).astype("<i2")
+    jaw_rad = None if frame.face is None else frame.face.jaw_rad
     return {
         "time_s": frame.time_s,
-        "audio_pcm16": base64.b64encode(pcm.tobytes()).decode(),
+        "audio_pcm16": _pcm16(frame.audio),
+        "agent_audio_pcm16": None if frame.agent_audio is None else _pcm16(frame.agent_audio),
         "audio_hz": AUDIO_HZ,
         "energy_db": round(energy_db(frame.audio), 2),
         "face": None if frame.face is None else _by_channel(frame.face.motion),
+        "jaw_rad": None if jaw_rad is None else _numbers(jaw_rad),
         "attention": None if frame.attention is None else _number(frame.attention),
         "place_m": None if frame.place_m is None else _numbers(frame.place_m),
     }
+
+
+def _pcm16(audio: Floats) -> str:
+    """Return samples of -1..1 as 16-bit integers, little-endian, in base64."""
+    pcm = np.round(np.clip(audio, -1.0, 1.0) * 32767).astype("<i2")
+    return base64.b64encode(pcm.tobytes()).decode()
 
 
 def _joints_body(seen: Tick, joints: Sequence[str]) -> dict[str, Any]:
@@ -336,6 +350,6 @@ def _number(value: float) -> float:
     return round(float(value), _DIGITS)
 
 
-def _numbers(values: NDArray[np.floating]) -> list[float]:
-    rounded: list[float] = values.astype(np.float64).round(_DIGITS).tolist()
+def _numbers(values: NDArray[np.floating]) -> list[Any]:
+    rounded: list[Any] = values.astype(np.float64).round(_DIGITS).tolist()
     return rounded

@@ -9,6 +9,7 @@ import secrets
 import socket
 import ssl
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final
@@ -20,7 +21,7 @@ from sfms_robot.child_process import take_pipes
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.origin import is_loopback
-from sfms_robot.viewer.page_process import DOCUMENT, HEADER, PERSON, PICTURE, Address, packed_message
+from sfms_robot.viewer.page_process import BEAT_S, DOCUMENT, HEADER, PERSON, PICTURE, Address, packed_message
 from sfms_robot.viewer.page_server import PageServer
 from sfms_robot.viewer.visitor_commands import LONGEST_PERSON, Command
 
@@ -163,7 +164,10 @@ async def _serve(
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     page.prepare()
     run.send(0, bound=url(address, host, port, token), token=token, taken=_taken(address, port))
-    await over.wait()
+    while not over.is_set():
+        run.send(0, alive=True)
+        with suppress(TimeoutError):
+            await asyncio.wait_for(over.wait(), BEAT_S)
     server.should_exit = True
     await serving
 

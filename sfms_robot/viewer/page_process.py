@@ -1,4 +1,4 @@
-"""The page's server in a process of its own: whatever visitors do, it costs the servo loop no tick.
+"""The page's server in a process of its own: visitors cost the servo loop no tick.
 
 Both directions are messages behind a header, over the child's stdin and stdout:
 
@@ -7,7 +7,7 @@ Both directions are messages behind a header, over the child's stdin and stdout:
     uint32    number of a visitor, 0 for none
 
 The run's side hands over numbers and small documents (`pipe_writer`). The child makes JSON of pictures, talks to
-visitors, and sends back what they ask for. It ends with its pipe.
+visitors, and sends back what they ask for, and a sign of life every `BEAT_S`. It ends with its pipe.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ HEADER: Final = struct.Struct("<IBI")
 PICTURE, DOCUMENT, PERSON = b"PJV"
 START_LIMIT_S: Final = 30.0  # importing on a small board with a cold disk
 CLOSE_LIMIT_S: Final = 1.0
+BEAT_S: Final = 0.5
+HUNG_S: Final = 2.5  # without a sign of life
+_STEP_S: Final = 0.2  # a longer pause between two looks was the run's own
 CHILD: Final = "sfms_robot.viewer.page_child:main"
 PORT: Final = 8780
 
@@ -87,6 +90,7 @@ class PageProcess:
         url: where the page is, with its token where it needs one.
         visitors: how many look at it now.
         token: None on loopback.
+        hung: it has shown no sign of life for `HUNG_S`; see `watch`.
     """
 
     def __init__(self, address: Address, child: str = CHILD) -> None:
@@ -96,6 +100,8 @@ class PageProcess:
         self.token: str | None = None
         self.visitors = 0
         self.visited = threading.Event()
+        self.hung = self._alive = False  # `_alive`: set by the thread that reads
+        self._hangs, self._silent_s, self._looked_s = 0, 0.0, 0.0
         self._asked: Asked | None = None
         self._problem: RobotError | None = None
         self._bound = threading.Event()
@@ -129,6 +135,24 @@ class PageProcess:
         """Who does from now on what visitors ask for; None: nobody, they are told so."""
         self._asked = asked
 
+    def watch(self, now_s: float) -> None:
+        """Name a server that hangs, once, and once when it is back. The run's loop calls it a few times a second."""
+        step_s, self._looked_s = min(max(now_s - self._looked_s, 0.0), _STEP_S), now_s
+        silent_s = 0.0 if self._alive or not self._reading.is_alive() else self._silent_s + step_s
+        self._silent_s, self._alive = silent_s, False
+        if (silent_s > HUNG_S) == self.hung:
+            return
+        self.hung = not self.hung
+        if self.hung:
+            self._hangs += 1
+            log.warning("the page has not answered for %.1f s; the run continues", silent_s)
+        else:
+            log.info("the page answers again")
+
+    def statistics(self) -> dict[str, Any]:
+        """Return for status and report: whether it hangs now, and how often it has."""
+        return {"hung": self.hung, "hangs": self._hangs}
+
     def show(self, record: bytes) -> None:
         """A packed picture; an older one that has not left yet is left out."""
         self._writer.send_newest(packed_message(PICTURE, 0, record))
@@ -157,6 +181,7 @@ class PageProcess:
         with pipe:
             while (message := read_message(pipe)) is not None:
                 kind, visitor, data = message
+                self._alive = True
                 if kind == PERSON:
                     self._heed(visitor, partial(_person, visitor, data))
                 else:
@@ -177,6 +202,8 @@ class PageProcess:
         elif "watched" in told:
             self.visitors = told["watched"]
             self.visited.set()
+        elif "alive" in told:
+            pass  # counted already
         elif "left" in told:
             self._heed(visitor, lambda asked: asked.left(visitor))
         else:

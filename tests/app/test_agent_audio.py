@@ -1,6 +1,8 @@
 """`run --agent-audio` from end to end in virtual time: the robot's own voice, ARIG, emulated servos."""
 
 import dataclasses
+import json
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -9,14 +11,20 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.app.replay import read_recording
+from sfms_robot.app.replay.page_replay import pictures
+from sfms_robot.app.replay.run_file import _records
+from sfms_robot.app.replay.run_playback import PlaybackOptions, play_back
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.config.arig import STATES, paper_state
 from sfms_robot.data import data_dir
+from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.registry import load_listener
+from sfms_robot.runtime.recorder import RUN_FILE
 from sfms_robot.sources.registry import open_source
+from sfms_robot.viewer.frame_record import frame_json
 
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
 RAW = {"kind": "arig", "width": 16, "feedforward": 24, "heads": 2, "context_chunks": 4, "context_layers": 1}
@@ -72,6 +80,39 @@ def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_pat
     jaw, at_s = shown.motion[:, JAW], shown.times_s
     talking, after = jaw[(at_s > 0.5) & (at_s < 4.0)], jaw[at_s > 5.5]
     assert np.std(talking) > 2 * np.std(after) and np.mean(talking) > 2 * np.mean(after)
+
+
+def test_a_recording_of_a_head_that_speaks_moves_a_head_and_a_listener_as_the_run_did(seeded, tmp_path):
+    said = voice(tmp_path / "said.wav", 2.0)
+    done = listened(seeded, agent_audio=said, duration_s=3.0, record=tmp_path / "run")
+    played = play_back(tmp_path / "run", PlaybackOptions(fast=True))
+    assert played["motion"] == done["motion"]
+    for end in ("min_rad", "max_rad"):
+        assert played["joints"]["jaw"][end] == pytest.approx(done["joints"]["jaw"][end], abs=0.02)
+
+    recording = read_recording(tmp_path / "run")
+    assert recording.agent_audio.shape == recording.audio.shape
+    with closing(open_source(duration_s=3.0, agent_audio=said)) as source:
+        given = source.read(3.0)
+    heard = speaker_frames(recording.audio, recording.speaker, recording.agent_audio)
+    for one, other in zip(heard[:-1], given[:-1], strict=True):  # what is said after the last frame is not in its file
+        np.testing.assert_allclose(one.agent_audio, other.agent_audio, atol=2e-5)
+    planned = np.array([body["frames"][0] for kind, body in _records(tmp_path / "run" / RUN_FILE) if kind == "/plan"])
+    mute = speaker_frames(recording.audio, recording.speaker, None)
+    away = [np.abs(answers(seeded, frames[: len(planned)]) - planned).max() for frames in (heard, mute)]
+    assert away[0] < 1e-3 < 0.02 < away[1]
+    own_db = [json.loads(frame_json(record))["own"] for record in pictures(recording)]
+    assert max(own_db[5:45]) > -40 and own_db[-1] == -100
+
+
+def answers(folder, frames):
+    """What a listener of seed 3 plans for the next frame (N, 58), one frame after the other."""
+    listener = load_listener(folder)
+    memory, planned = listener.start(3), []
+    for frame in frames:
+        plan, memory = listener.step(frame, memory)
+        planned.append(plan.frames[0])
+    return np.array(planned)
 
 
 @trained

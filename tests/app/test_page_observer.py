@@ -21,6 +21,9 @@ class Sent:
         self.pictures = []
         self.said = []
 
+    def watch(self, now_s):
+        self.looked_s = now_s
+
     def show(self, record):
         self.pictures.append(json.loads(frame_json(record)))
 
@@ -48,7 +51,7 @@ def test_of_a_hundred_ticks_a_second_it_shows_twenty_five():
     page, watcher = watching()
     for index in range(200):
         watcher.tick(tick(index / 100))
-    assert len(page.pictures) == 50
+    assert len(page.pictures) == 50 and page.looked_s == 1.96  # whether the page still answers
 
 
 def test_joints_are_shown_as_they_are_asked_and_read_and_their_faults_by_name():

@@ -86,6 +86,7 @@ def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
         assert second["seed"] == 7 and pages.released and not pages.next(stay=True)  # nobody looks any more
         assert "halted" in [change["state"] for change in first["states"]["changes"]]
         assert first["observers_detached"] == second["observers_detached"] == {}
+        assert first["page"] == second["page"] == {"hung": False, "hangs": 0}
         assert (pages._folder / "recording-1" / "run.mcap").stat().st_size > 1000
         about = read_recording(pages._folder / "recording-1").about
         assert json.loads(about["options"])["calmness"]["smile"] == 0.5

@@ -1,16 +1,19 @@
 """The listener's own process: what it hears when it cannot keep up, what its parent does when it hangs or dies."""
 
 import io
+import logging
 import os
 import pickle
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from stranger_process import ends
+from virtual_time import Time
 
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
@@ -227,21 +230,141 @@ def test_a_child_that_dies_is_started_anew_and_listens_again(listener):
     assert answered(listener, 1.0) and listener.statistics()["state"] == "listening"
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP here")
-def test_a_child_that_hangs_is_named_then_replaced_and_its_frames_do_not_pile_up(listener):
+def until_named(listener, caplog, now_s=0.0, step_s=0.125, frame=True):
+    """Virtual time at which a child that has stopped is named; what is still on its way counts as a sign of life."""
+    while listener.statistics()["state"] != "hung":
+        now_s += step_s
+        if frame:
+            listener.push(frames(1)[0], now_s)
+        listener.poll(now_s)
+    assert [each.message for each in caplog.records if f"for {process.HUNG_S + step_s:.1f} s" in each.message]
+    return now_s
+
+
+def until_restarted(listener, now_s, step_s=0.125):
+    before = listener.statistics()["restarts"]
+    while listener.statistics()["restarts"] == before:
+        now_s += step_s
+        listener.poll(now_s)
+    return now_s
+
+
+PHASES = {"starting": "", "building": "loaded", "waiting for its hop": "probed", "listening": "ready"}
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_child_that_is_stopped_in_any_phase_is_named_within_a_second_and_restarted(phase, caplog):
+    with closing(ListenerProcess("sfms-small", 3)) as child:
+        if phase == "waiting for its hop":
+            child.choose_hop_by(lambda: 0.06, 0.047, 0.01)  # chosen after half a second of frames
+        kind = ""
+        while kind != PHASES[phase]:
+            kind, value, number = child._child.next(60.0)
+            child._take(kind, value, number, 0.0)
+        os.kill(before := pid_of(child), signal.SIGSTOP)
+        os.waitid(os.P_PID, before, os.WSTOPPED)
+        named_s = until_named(child, caplog, frame=phase == "listening")
+        assert child.lost
+        limit_s = process.LOAD_RESTART_S if phase == "starting" else process.RESTART_S
+        assert until_restarted(child, named_s) - named_s == pytest.approx(limit_s - process.HUNG_S, abs=0.13)
+        assert pid_of(child) != before and child.statistics()["state"] == "starting" and child.lost
+
+
+def test_a_child_that_is_stopped_while_the_run_waits_for_it_is_named_and_restarted(caplog):
+    def now_s():
+        time.t += 0.25 if child.statistics()["restarts"] == 0 else 0.0
+        return time.t
+
+    time = Time()
+    with closing(ListenerProcess("sfms-small", 3, clock=now_s)) as child:
+        os.kill(pid_of(child), signal.SIGSTOP)
+        child.wait_loaded()
+        assert child.statistics()["state"] == "building" and child.statistics()["restarts"] == 1
+    assert "(starting) has not answered for 1." in caplog.text and "restarted" in caplog.text
+
+
+STUCK = """
+import threading
+from pathlib import Path
+
+class Stuck:
+    hop = horizon = 1
+
+    def __init__(self, how):
+        self.where, self.how = how.split("-")
+        self.reaches("load")
+
+    def build_graphs(self):
+        self.reaches("build")
+
+    def start(self, seed):
+        return 0
+
+    def step(self, speaker, memory):
+        self.reaches("step")
+
+    def reaches(self, where):
+        while where == self.where:
+            Path(__file__).with_name("reached").touch()
+            if self.how == "waits":
+                threading.Event().wait()
+"""
+
+
+@pytest.fixture
+def stuck(tmp_path, monkeypatch):
+    """A listener of another package that hangs as its name says; what is there once it does."""
+    (tmp_path / "stuck_listener.py").write_text(STUCK)
+    info = tmp_path / "stuck_listener-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stuck-listener\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[sfms_robot.listeners]\nstuck = stuck_listener:Stuck\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path / "reached"
+
+
+@pytest.mark.parametrize("where", ["load", "build", "step"])
+@pytest.mark.parametrize("how", ["waits", "turns"])
+def test_a_child_that_hangs_while_it_loads_or_measures_is_restarted_also_where_other_threads_work(
+    where, how, stuck, caplog
+):
+    with closing(ListenerProcess(f"stuck:{where}-{how}", 0)) as child:
+        while where != "load" and child.statistics()["state"] == "starting":
+            child._take(*child._child.next(60.0), 0.0)
+        while not stuck.exists():
+            pass
+        if how == "waits":
+            named_s = until_named(child, caplog)
+            limit_s = process.LOAD_RESTART_S if where == "load" else process.RESTART_S
+            assert until_restarted(child, named_s) - named_s == pytest.approx(limit_s - process.HUNG_S, abs=0.13)
+        else:
+            now_s = 0.0
+            while child.statistics()["restarts"] == 0:
+                worked_ns = child._child.worked_ns()
+                while child._child.worked_ns() == worked_ns:
+                    pass
+                child.poll(now_s := now_s + 0.9)
+            assert now_s == pytest.approx(process.PHASE_LIMIT_S, abs=1.9) and "answered" not in caplog.text
+    assert "restarted" in caplog.text
+
+
+def test_frames_of_a_child_that_hangs_do_not_pile_up_and_it_goes_on_where_it_was(listener, caplog):
+    caplog.set_level(logging.INFO)
     answered(listener, 0.0)
     while listener._unanswered:  # the rest of the hop
         listener._take(*listener._child.next(60.0), 0.0)
-    before = pid_of(listener)
-    os.kill(before, signal.SIGSTOP)
+    os.kill(pid_of(listener), signal.SIGSTOP)
+    os.waitid(os.P_PID, pid_of(listener), os.WSTOPPED)
     for frame in frames(2000):
         listener.push(frame, 10.0)
     listener.poll(10.0)
     assert len(listener._child._frames) <= MOST_WAITING
     listener.poll(10.0 + process.HUNG_S + 0.1)
-    assert listener.statistics()["state"] == "hung"
-    listener.poll(10.0 + process.RESTART_S + 0.1)
-    assert listener.statistics()["restarts"] == 1 and pid_of(listener) != before
+    assert listener.statistics()["state"] == "hung" and listener.lost
+    os.kill(pid_of(listener), signal.SIGCONT)
+    while listener.statistics()["state"] == "hung":
+        listener.poll(10.0 + process.HUNG_S + 0.1)
+    assert not listener.lost and listener.statistics()["restarts"] == 0 and "answers again" in caplog.text
 
 
 def test_a_child_that_dies_with_a_full_pipe_leaves_no_file_open(listener):

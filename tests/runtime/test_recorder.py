@@ -45,15 +45,20 @@ def test_a_tick_becomes_a_face_and_joints_with_nulls_for_what_is_not_known(tmp_p
 
 def test_sound_and_plans_are_kept(tmp_path):
     audio = np.linspace(-1, 1, 640, dtype=np.float32)
-    face = FaceFrame.of(0.04, np.full(58, 0.5))
+    jaw_rad = np.array([[0.0, 0.25, 0.0], [0.0, 0.125, 0.0]], dtype=np.float32)
+    face = replace(FaceFrame.of(0.04, np.full(58, 0.5)), jaw_rad=jaw_rad[0])
     recorder = Recorder(tmp_path, JOINTS)
-    recorder.heard(SpeakerFrame(0.04, audio, face, attention=0.75, place_m=np.array([1.0, 0.5, 0.0])))
+    recorder.heard(SpeakerFrame(0.04, audio, face, -audio, attention=0.75, place_m=np.array([1.0, 0.5, 0.0])))
     recorder.heard(SpeakerFrame(0.08, np.zeros(0, dtype=np.float32)))
-    recorder.planned(Plan(0.08, np.array([0.12, 0.16]), np.ones((2, 58), dtype=np.float32)))
+    recorder.planned(Plan(0.08, np.array([0.12, 0.16]), np.ones((2, 58), dtype=np.float32), jaw_rad))
     recorder.close()
     (_, _, first, _), (_, _, second, _), (topic, _, plan, _) = messages(tmp_path)
     pcm = np.frombuffer(base64.b64decode(first["audio_pcm16"]), dtype="<i2") / 32767
     np.testing.assert_allclose(pcm, audio, atol=2e-5)
+    said = np.frombuffer(base64.b64decode(first["agent_audio_pcm16"]), dtype="<i2") / 32767
+    np.testing.assert_allclose(said, -audio, atol=2e-5)
+    assert second["agent_audio_pcm16"] is None and second["jaw_rad"] is None
+    assert first["jaw_rad"] == [0.0, 0.25, 0.0] and plan["jaw_rad"] == jaw_rad.tolist()
     assert (first["attention"], first["place_m"]) == (0.75, [1.0, 0.5, 0.0]) and second["attention"] is None
     assert first["face"]["jawOpen"] == 0.5 and second["face"] is None and second["energy_db"] == -100
     assert topic == "/plan" and np.shape(plan["frames"]) == (2, 58) and plan["times_s"] == [0.12, 0.16]
@@ -88,7 +93,9 @@ def test_a_full_queue_drops_and_counts_and_does_not_block(tmp_path):
         recorder.tick(tick(n / 100))
     gate.opened.set()
     recorder.close()
-    assert recorder.statistics() == {"messages": 13, "dropped": 3, "trouble": None}
+    told = recorder.statistics()
+    assert told.pop("bytes") == sum(part.stat().st_size for part in parts_of(tmp_path)) > 0
+    assert told == {"messages": 13, "dropped": 3, "trouble": None}
 
 
 def test_states_are_kept_when_they_change_and_servos_once_a_second(tmp_path):

@@ -2,7 +2,10 @@
 
 import gzip
 import json
+import logging
+import os
 import queue
+import signal
 import socket
 import struct
 import subprocess
@@ -329,6 +332,31 @@ def test_a_page_whose_process_dies_takes_no_run_with_it(caplog):
             page.say("status", status={})
         page._reading.join(WAIT_S)
         assert page.visitors == 0 and "the page is away" in caplog.text
+
+
+def test_a_page_whose_process_hangs_is_named_once_and_once_when_it_is_back(caplog):
+    caplog.set_level(logging.INFO)
+    with closing(PageProcess(Address(port=0))) as page:
+        page.wait()
+        page.watch(now_s := 3600.0)  # the run itself stood still: that is no silence of the page
+        assert page.statistics() == {"hung": False, "hangs": 0}
+        os.kill(page.process_id, signal.SIGSTOP)
+        os.waitid(os.P_PID, page.process_id, os.WSTOPPED)
+        while not page.hung:
+            page.watch(now_s := now_s + 0.125)
+        for _ in range(100):
+            page.watch(now_s := now_s + 0.125)
+        assert page.statistics() == {"hung": True, "hangs": 1}
+        os.kill(page.process_id, signal.SIGCONT)
+        while page.hung:
+            page.watch(now_s := now_s + 1e-6)
+        page.watch(0.0)  # another run begins
+        assert page.statistics() == {"hung": False, "hangs": 1}
+    told = [(each.levelname, each.message) for each in caplog.records if each.name.endswith("page_process")]
+    assert told == [
+        ("WARNING", "the page has not answered for 2.6 s; the run continues"),
+        ("INFO", "the page answers again"),
+    ]
 
 
 def test_it_ends_with_who_began_it():

@@ -57,6 +57,7 @@ class PageObserver:
         if index == self._index:
             return
         self._index = index
+        self._page.watch(seen.time_s)
         self._page.show(self._packed(seen))
         if seen.time_s - self._told_s >= TOLD_S:
             self._told_s = seen.time_s

@@ -101,6 +101,7 @@ class PageSession:
                 options, _told_to(watcher, panel), source=self._source(stack), feed=feed,
                 observers=[watcher, recorder, *lonely, *observers], knobs=knobs,
                 overlay=puppet.overlay, interrupt=interrupt, halt=halt,
+                more=lambda: {"page": self.page.statistics()},
             )  # fmt: skip
         if report["exit"] == "interrupted" and any(each.ended for each in lonely):  # its proper end
             report |= {"exit": "done", "exit_code": 0}

@@ -14,7 +14,8 @@ from sfms_robot.app.listen.page_facts import page_facts
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ
+from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
+from sfms_robot.signals.audio import energy_db
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 from sfms_robot.viewer.frame_record import NOTHING, Picture, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
@@ -53,6 +54,7 @@ def pictures(recording: RunRecording) -> Iterator[bytes]:
     rows = np.minimum(np.searchsorted(recording.times_s, times_s - 1e-9), len(recording.times_s) - 1)
     talks = recording.talks_at(times_s)
     heard = np.searchsorted(recording.heard_s, times_s, side="right") - 1
+    said = recording.agent_audio
     states = [(-np.inf, "starting", ()), *recording.states]
     for time_s, row, talking, frame in zip(times_s.tolist(), rows.tolist(), talks, heard.tolist(), strict=True):
         while len(states) > 1 and states[1][0] <= time_s:
@@ -63,6 +65,7 @@ def pictures(recording: RunRecording) -> Iterator[bytes]:
                 time_s, recording.motion[row], recording.goals_rad[row].astype(np.float64), recording.present_rad[row],
                 rare_json(states[0][1], states[0][2], faults, None),
                 voice_db=float(recording.energy_db[frame]) if 0 <= frame < len(recording.heard_s) else NOTHING,
+                own_voice_db=NOTHING if said is None else energy_db(said[frame * FRAME_SAMPLES :][:FRAME_SAMPLES]),
                 talking=bool(talking),
             )
         )  # fmt: skip

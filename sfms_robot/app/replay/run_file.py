@@ -29,7 +29,7 @@ _PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
 _FLOOR_DB, _BELOW_LOUD_DB = -50.0, 27.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunRecording:
     """A run as arrays: N ticks, J joints, M speaker frames.
 
@@ -40,7 +40,9 @@ class RunRecording:
         goals_rad, present_rad: (N, J) float32; present is NaN where nothing was read within `AWAY_S`.
         faults: (N, J) a named fault is there.
         heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
-        energy_db: (M,). speaker: (M, 58) NaN where no face was seen.
+        agent_audio: (M * 640,) voice of the head itself, sample by sample beside `audio`; None where the recording has
+            none, as those of version 0.1.
+        energy_db: (M,). speaker: (M, 58) NaN where no face was seen. speaker_jaw_rad: (M, 3) NaN where no jaw was.
         plans: how many the listener made.
         states: (time_s, name, why) of every change, in order; none in a file of version 0.1.
         events: (start_s, kind) of the nods, blinks and smiles that plans held.
@@ -58,8 +60,10 @@ class RunRecording:
     faults: NDArray[np.bool_]
     heard_s: Doubles
     audio: Floats
+    agent_audio: Floats | None
     energy_db: Doubles
     speaker: Floats
+    speaker_jaw_rad: Floats
     plans: int
     states: Sequence[tuple[float, str, tuple[str, ...]]]
     events: Sequence[tuple[float, str]]
@@ -192,8 +196,9 @@ class _Found:
         self._joints: tuple[str, ...] = ()
         self._plans = 0
         self._times_s, self._heard_s, self._energy_db = (array("d") for _ in range(3))
-        self._motion, self._goals_rad, self._present_rad, self._speaker = (array("f") for _ in range(4))
-        self._faults, self._pcm16 = bytearray(), bytearray()
+        self._motion, self._goals_rad, self._present_rad, self._speaker, self._jaw_rad = (array("f") for _ in range(5))
+        self._faults, self._pcm16, self._agent_pcm16 = bytearray(), bytearray(), bytearray(2 * FRAME_SAMPLES)
+        self._speaks = False
         self._states: list[tuple[float, str, tuple[str, ...]]] = []
         self._events: list[tuple[float, str]] = []
         self._servos_s = array("d")
@@ -221,7 +226,10 @@ class _Found:
             self._heard_s.append(value["time_s"])
             self._energy_db.append(value["energy_db"])
             self._speaker.extend(_by_channel(value["face"]))
-            self._pcm16 += _samples(value)
+            self._jaw_rad.extend(value.get("jaw_rad") or [math.nan] * 3)  # no key in a recording of version 0.1
+            self._pcm16 += _samples(value["audio_pcm16"])
+            self._speaks |= (said := value.get("agent_audio_pcm16")) is not None
+            self._agent_pcm16 += _samples(said or "")
         elif kind == "/state":
             self._states.append((value["time_s"], value["state"], tuple(value["why"])))
         elif kind == "/event":
@@ -249,23 +257,26 @@ class _Found:
         by_joint = [np.array(values, dtype=np.float32) for values in (self._goals_rad, self._present_rad)]
         goals_rad, present_rad = (values.reshape(-1, count)[:ticks] for values in by_joint)
         return RunRecording(
-            self.about,
-            self._joints,
-            np.array(self._times_s)[:ticks],
-            np.array(self._motion, dtype=np.float32).reshape(-1, MOTION_DIM)[:ticks],
-            goals_rad,
-            present_rad,
-            np.frombuffer(self._faults, dtype=np.bool_).reshape(-1, count)[:ticks],
-            np.array(self._heard_s),
-            np.frombuffer(self._pcm16, dtype="<i2").astype(np.float32) / np.float32(32767),
-            np.array(self._energy_db),
-            np.array(self._speaker, dtype=np.float32).reshape(-1, MOTION_DIM),
-            self._plans,
-            self._states,
-            self._events,
-            np.array(self._servos_s),
-            {name: np.array(values, np.float32).reshape(-1, count) for name, values in self._servos.items()},
-            self.whole,
+            about=self.about,
+            joints=self._joints,
+            times_s=np.array(self._times_s)[:ticks],
+            motion=np.array(self._motion, dtype=np.float32).reshape(-1, MOTION_DIM)[:ticks],
+            goals_rad=goals_rad,
+            present_rad=present_rad,
+            faults=np.frombuffer(self._faults, dtype=np.bool_).reshape(-1, count)[:ticks],
+            heard_s=np.array(self._heard_s),
+            audio=_sound(self._pcm16),
+            # A frame holds what the robot says after it: the sound of the frame itself stands in the one before.
+            agent_audio=_sound(self._agent_pcm16)[: len(self._heard_s) * FRAME_SAMPLES] if self._speaks else None,
+            energy_db=np.array(self._energy_db),
+            speaker=np.array(self._speaker, dtype=np.float32).reshape(-1, MOTION_DIM),
+            speaker_jaw_rad=np.array(self._jaw_rad, dtype=np.float32).reshape(-1, 3),
+            plans=self._plans,
+            states=self._states,
+            events=self._events,
+            servos_s=np.array(self._servos_s),
+            servos={name: np.array(values, np.float32).reshape(-1, count) for name, values in self._servos.items()},
+            whole=self.whole,
         )
 
 
@@ -282,7 +293,11 @@ def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _samples(body: Mapping[str, Any]) -> bytes:
-    """The samples of one frame, always 640 of them, so that they stay in step with the clock."""
+def _samples(pcm16: str) -> bytes:
+    """Return the samples of one frame, always 640 of them, so that they stay in step with the clock."""
     size = 2 * FRAME_SAMPLES
-    return base64.b64decode(body["audio_pcm16"])[:size].ljust(size, b"\0")
+    return base64.b64decode(pcm16)[:size].ljust(size, b"\0")
+
+
+def _sound(pcm16: bytearray) -> Floats:
+    return np.frombuffer(pcm16, dtype="<i2").astype(np.float32) / np.float32(32767)
