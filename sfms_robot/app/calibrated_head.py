@@ -36,7 +36,7 @@ def calibrated_head(name: str, port: str) -> Head:
     head = load_head(name)
     overlay, sha256 = load_overlay(head), head_hash(name)
     if port == SIM:
-        layers = layered(head, overlay.model_copy(update={"calibrate": None}), sha256)
+        layers = layered(head, overlay.model_copy(update={"calibrate": None, "stored": None}), sha256)
         _tell(head.name, layers.refused, layers.notes)
         return layers.head
     where = devices(head, port)

@@ -355,7 +355,7 @@ class Member:
             self._return(now_s + RETRY_S)
         except ServoError as error:
             self.job = None
-            log.warning("%s", error)
+            self._reporter.say(self.servo, str(error))
             self._try_again(now_s + REFUSED_S, now_s)
 
     def accepts(self, goal_ticks: int) -> bool:
