@@ -220,10 +220,10 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
         problem = OLD_FILE if overlay.calibrate is None or overlay.calibrate.head_sha256 != sha256 else None
         problem = problem or _another(found, joint, servos, name)
         if problem is None:
-            joints[name] = calibrated(joint, found)
+            joints[name] = calibrated(joint, found, head.safety)
         else:
             refused[name] = problem
-    joints |= {name: declared(joints[name], stored) for name, stored in overlay.confirmed(sha256).items()}
+    joints |= {name: declared(joints[name], each, head.safety) for name, each in overlay.confirmed(sha256).items()}
     fit, fitted = overlay.fit, frozenset[str]()
     if fit is not None and fit.head_sha256 != sha256:
         notes.append(f"the fit of {fit.date} is not used: {OLD_FILE}")
@@ -245,20 +245,23 @@ def _another(found: Measured, joint: Joint, servos: Mapping[str, Identity | None
     return "its servo does not answer" if now is None else found.identity.difference(now)
 
 
-def calibrated(joint: Joint, found: Measured) -> Joint:
-    """Return the joint with measured zero, direction and ends; its rest keeps its angle, and is where the centre is."""
+def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Joint:
+    """Return the joint with measured zero, direction and ends; its rest keeps its angle, and is where the centre is.
+
+    `usual`: that of the head, under the joint's own.
+    """
     ticks_per_deg = found.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
     zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
     low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
     ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
-    return declared(joint, found.stored).model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, **ends})
+    joint = declared(joint, found.stored, usual or Safety())
+    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, **ends})
 
 
-def declared(joint: Joint, stored: Mapping[str, int]) -> Joint:
+def declared(joint: Joint, stored: Mapping[str, int], usual: Safety) -> Joint:
     """Return the joint with zero and direction that count as made for these registers of its servo."""
-    safety = joint.safety or Safety()
-    safety = safety.model_copy(update={"stored": {**safety.stored, **stored}})
-    return joint.model_copy(update={"safety": safety})
+    update = {"stored": {**usual.merged(joint.safety).stored, **stored}}
+    return joint.model_copy(update={"safety": (joint.safety or Safety()).model_copy(update=update)})
 
 
 def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bool = False) -> Path:
