@@ -422,8 +422,8 @@ def test_a_board_stores_nothing_that_a_start_could_compare(name):
     )
 
 
-@pytest.mark.parametrize(("name", "register", "value"), [(n, r, v) for n, r, v, how in STORED if how is REFUSED])
-def test_a_servo_that_comes_back_with_what_would_be_refused_stays_off_and_is_named(name, register, value):
+def gone_and_back(name, register, value):
+    """A rig in whose run servo 2 went away, got a value stored, and came back."""
     rig = stored_rig(name, {})
     held = rig.hold()
 
@@ -436,15 +436,27 @@ def test_a_servo_that_comes_back_with_what_would_be_refused_stays_off_and_is_nam
     ticks(3)
     rig.kill(2)
     ticks(30)
-    servo = rig.servo(2)
     rig.set(2, "torque_enable", 0)
-    if "lock" in servo.table.fields:
+    if "lock" in rig.servo(2).table.fields:
         rig.set(2, "lock", 0)
     rig.set(2, register, value)
     rig.revive(2)
     ticks(600)
-    assert rig.torques() == [1, 0, 1, 1] and rig.register(2, register) == value
-    assert any(
-        f"joint2: wire: servo 2 (joint2): {register} is {value}" in each for each in rig.bus.statistics()["faults"]
-    )
-    assert "left alone" in rig.bus.poll(rig.clock.t)["joint2"].fault
+    assert rig.register(2, register) == value
+    return rig
+
+
+@pytest.mark.parametrize(("name", "register", "value"), [row[:3] for row in STORED if row[3] is REFUSED])
+def test_a_servo_that_comes_back_with_what_would_be_refused_stays_off_and_is_named(name, register, value):
+    rig = gone_and_back(name, register, value)
+    assert rig.torques() == [1, 0, 1, 1] and "left alone" in rig.bus.poll(rig.clock.t)["joint2"].fault
+    (named,) = (each for each in rig.bus.statistics()["faults"] if f"{register} is {value}" in each)
+    assert named.startswith("joint2: wire: servo 2 (joint2): ")
+
+
+@pytest.mark.parametrize(("name", "register", "value"), [row[:3] for row in STORED if row[3] is WARNED])
+def test_a_servo_that_comes_back_with_less_protection_is_one_more_warning(name, register, value, caplog):
+    rig = gone_and_back(name, register, value)
+    (warned,) = rig.bus.statistics()["stored_warnings"]
+    assert rig.torques() == [1] * 4 and warned.startswith(f"joint2: {register} is {value}")
+    assert sum(f"comes back, and {register} is {value}" in each.getMessage() for each in caplog.records) == 1
