@@ -27,7 +27,7 @@ _REVERSED: Final = 1  # bit of the drive mode: which way ticks run
 
 
 def calibrated_head(name: str, port: str) -> Head:
-    """The head as it may move on this port.
+    """Return the head as it may move on this port.
 
     On emulated servos every head counts as calibrated. On real ones each measured servo is asked who it is first; a
     joint whose measurement does not hold, and an unmeasured one of a head to be calibrated first, holds back. Raises

@@ -184,7 +184,7 @@ def load_overlay(head: Head, file: Path | None = None) -> Overlay:
 
 
 def save_overlay(overlay: Overlay, file: Path) -> None:
-    """Whole or not at all: an interrupted write leaves what was there. Raises ConfigError."""
+    """Write an overlay whole or not at all. Raises ConfigError."""
     plain = overlay.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
     text = "# Of one built head: written by `sfms-robot head calibrate`, `head fit` and `doctor --fix`.\n"
     _replace(file, text + yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120))
@@ -205,11 +205,11 @@ def _replace(file: Path, text: str) -> None:
 
 
 def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Identity | None] | None = None) -> Layered:
-    """Both layers over a head.
+    """Lay all layers over a head.
 
     Args:
         sha256: of the head's file now.
-        servos: who answers at each joint, None for nobody; without it only the file is compared.
+        servos: the servo that answers at each joint, or None; without it only the file is compared.
 
     Raises ConfigError for a layer that makes no sound head.
     """
@@ -268,12 +268,13 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
     """Declare in the file of head `name` all that the servo of a joint stores; return the file that was written.
 
     The head.yaml of the user is edited. The overlay is written instead for a shipped head, for one that has an overlay
-    (an edit would end its measurements), and where the form of the file does not let one joint change alone.
+    (an edit would end its measurements), for a file that cannot be written, and for one whose form (an alias, a twin)
+    does not let one joint change alone.
     `practice`: found on emulated servos. Raises ConfigError for a file that cannot be written.
     """
     head = load_head(name)
     own, file = find("heads", name, "head.yaml") / "head.yaml", overlay_file(head.name, practice)
-    if not file.exists() and data_dir("configs").resolve() not in own.resolve().parents:
+    if not overlay_file(head.name).exists() and data_dir("configs").resolve() not in own.resolve().parents:
         text = own.read_bytes().decode()
         for register, value in stored.items():
             text = with_number(text, ("joints", joint, "safety", "stored", register), value)

@@ -1,7 +1,7 @@
-"""What a servo has stored, held against what the head's file says of its joint: values in, contradictions out, no I/O.
+"""Compare what a servo stores with what the head's file says of its joint: values in, contradictions out, no I/O.
 
-Startup asks before torque comes on, `sfms-robot doctor` whenever it is run; both see the same. Registers that a model
-does not have, or that were not read, are not judged.
+Startup compares before torque comes on, `sfms-robot doctor` whenever it is run; both see the same. Registers that a
+model does not have, or that were not read, are not judged.
 
 Sources: ROBOTIS e-manual, control tables of the X and MX series (operating mode 11, homing offset 20, position limits
 48 and 52, startup configuration 60, shutdown 63) and of Protocol 1.0 (angle limits 6 and 8, shutdown 18); Feetech STS
@@ -196,7 +196,7 @@ def offset_ticks(table: Table, stored: int) -> int:
 
 
 def _named_in_the_file(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
-    """Whatever else the head's file says is stored."""
+    """Yield each other register that does not hold what the head's file declares."""
     for name, wanted in needs.stored.items():
         if name not in (*_OFFSETS, *_DIRECTION) and values.get(name, wanted) != wanted:
             yield Contradiction(name, values[name], wanted, "the head's file reckons with it", "refused", in_file=True)
@@ -239,7 +239,7 @@ def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Ite
 
 
 def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Where it stands: within the one turn of position mode, or at one turn of several and no other."""
+    """Yield a position beyond the one turn of position mode, or one that several turns of the joint have in common."""
     present, turn = table.role("present_position"), table.ticks_per_revolution
     if present is None or present.name not in values:
         return
@@ -247,7 +247,7 @@ def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterat
     torque = table.role("torque_enable")
     if multi_turn(table, needs):
         if torque is not None and values.get(torque.name):
-            return  # it has had power since somebody knew where it was
+            return  # it has had power since its place was known
         if not unique_turn(now, turn, needs):
             low, high = home_ticks(turn, needs)
             why = (

@@ -195,7 +195,7 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
 def _look(
     line: Line, port: Port, clock: Clock, adapter: SerialDevice, progress: Progress | None, fix: Confirm | None
 ) -> tuple[list[Finding], dict[str, Any]]:
-    """Everything that needs the open port."""
+    """Return findings and facts that need the open port."""
     command = Command(line.shown, line.family, line.head, line.ports)
     wire = Wire(port, line.family, clock, _first_baud(line))
     here, elsewhere = (

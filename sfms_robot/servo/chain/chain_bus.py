@@ -154,10 +154,10 @@ class ChainBus(WireBus[L], Generic[L]):
     # --- start and stop -----------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open, identify every servo that answers, make it listen to us. Torque is left as it is found.
+        """Open the port, identify and prepare every servo that answers; torque stays on or off.
 
         Blocks a few exchanges per servo, and for one that does not answer a few times 50 ms. Raises PortError;
-        BusError when nobody answers; ServoError for a servo that contradicts the head's file.
+        BusError when no servo answers; ServoError for a servo that contradicts the head's file.
         """
         link = self._open()
         try:

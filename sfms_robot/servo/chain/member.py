@@ -340,7 +340,7 @@ class Member:
         return self.job is not None or self._back_s < math.inf
 
     def step(self, now_s: float) -> None:
-        """One exchange of its job. Raises BusError when the port fails."""
+        """Take one exchange of its job. Raises BusError when the port fails."""
         if self.job is None:
             return
         if self.stands_s is None:

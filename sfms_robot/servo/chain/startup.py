@@ -1,15 +1,15 @@
 """Startup of the servos of a chain: identify, verify, prepare, enable.
 
-    identify   who answers, is it the model that the head's file names, of a firmware whose registers are known
+    identify   which servos answer, each of the model that the head's file names and of a firmware that is known
     verify     what the unit has stored against what the head's file reckons with (`stored_settings`): refused by name,
                or a warning where it only weakens protection
     prepare    mode, profile, torque limit and the registers of the head's file, each written and read back
     enable     goal := present, then torque: no jump. A servo that stands outside its own limits, as of a sagged head,
-               cannot be told to hold there: its own profile moves it inside, slowly (`slow_profile`)
+               cannot hold there: its own profile moves it inside, slowly (`slow_profile`)
 
 The same steps bring a servo back that was away. They are generators (`Steps`): between two exchanges on the wire they
 yield how long they would like to wait. At startup they are run through; while the bus is running, a tick takes a few
-and goes on with its own work.
+of them beside its own work.
 """
 
 from __future__ import annotations
