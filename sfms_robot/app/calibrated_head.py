@@ -27,7 +27,7 @@ _REVERSED: Final = 1  # bit of the drive mode: which way ticks run
 
 
 def calibrated_head(name: str, port: str) -> Head:
-    """The head as it may move on this port.
+    """Return the head as it may move on this port.
 
     On emulated servos every head counts as calibrated. On real ones each measured servo is asked who it is first; a
     joint whose measurement does not hold, and an unmeasured one of a head to be calibrated first, holds back. Raises
@@ -36,7 +36,7 @@ def calibrated_head(name: str, port: str) -> Head:
     head = load_head(name)
     overlay, sha256 = load_overlay(head), head_hash(name)
     if port == SIM:
-        layers = layered(head, overlay.model_copy(update={"calibrate": None}), sha256)
+        layers = layered(head, overlay.model_copy(update={"calibrate": None, "stored": None}), sha256)
         _tell(head.name, layers.refused, layers.notes)
         return layers.head
     where = devices(head, port)

@@ -10,9 +10,11 @@ What is played on it, and by whom, is `app.session`'s.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -37,6 +39,8 @@ from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -133,9 +137,12 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     clock: Clock = VirtualClock() if options.fast else RealClock()
     with ExitStack() as stack:
         opened = stack.enter_context(open_wires(head, options))
-        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without)
+        doctor = f"sfms-robot doctor --port {options.port} --head {quote(options.head)} --fix"
+        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without, doctor=doctor)
         stack.callback(bus.close)
         bus.connect()
+        if weak := bus.statistics().get("stored_warnings"):
+            log.warning("servos protect themselves less than usual: %s; mend it: %s", "; ".join(weak), doctor)
         yield OpenHead(options, head, motion, bus, clock, rate_hz, opened)
 
 
@@ -166,35 +173,47 @@ def on_boards(head: Head) -> list[str]:
     return [name for name, joint in head.joints.items() if family_named(head.buses[joint.bus].family).board]
 
 
-def build_bus(head: Head, opened: Opened, clock: Clock, *, confirmed: bool = False, without: Sequence[str] = ()) -> Bus:
-    """The head's bus, not yet connected.
+def build_bus(
+    head: Head,
+    opened: Opened,
+    clock: Clock,
+    *,
+    confirmed: bool = False,
+    without: Sequence[str] = (),
+    doctor: str = BusServo.doctor,
+) -> Bus:
+    """Return the head's bus, not yet connected.
 
     `confirmed`: hobby servos may jump when their pulses come on. `without`: joints whose servos are left alone.
+    `doctor`: see `BusServo`.
     """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name and key not in without}
         if joints:
-            buses[name] = _build_one(head, name, joints, where, clock, confirmed)
+            buses[name] = _build_one(head, name, joints, where, clock, confirmed, doctor)
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
     if without:
-        buses[LEFT_OUT] = AbsentBus(_bus_servos(head, {joint: head.joints[joint] for joint in without}))
+        buses[LEFT_OUT] = AbsentBus(_bus_servos(head, {joint: head.joints[joint] for joint in without}, doctor))
         rates = rates and {**rates, LEFT_OUT: max(rates.values())}
     return CompositeBus(buses, list(head.joints), rates)
 
 
-def _bus_servos(head: Head, joints: Mapping[str, Joint]) -> list[BusServo]:
+def _bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str) -> list[BusServo]:
     maps = firmware_maps(dict(joints))
-    return [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()]
+    return [
+        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key), doctor)
+        for key, j in joints.items()
+    ]
 
 
 def _build_one(
-    head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool
+    head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool, doctor: str
 ) -> Bus:
     config = head.buses[name]
     check_safety(head, joints, firmware_maps(joints))
-    servos = _bus_servos(head, joints)
+    servos = _bus_servos(head, joints, doctor)
     family = family_named(config.family)
     if family.board:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])

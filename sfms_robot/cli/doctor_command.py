@@ -17,7 +17,9 @@ def doctor(
     head: str | None = typer.Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
     baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: at all."),
     family: Family | None = typer.Option(None, help="Without a head: how the servos speak. Default: dynamixel2."),
-    fix: bool = typer.Option(False, "--fix", help="Mend what servos have stored where that is safe; asks before each."),
+    fix: bool = typer.Option(
+        False, "--fix", help="Mend what servos store, or record it in the head's file; asks before each."
+    ),
     yes: bool = typer.Option(False, "--yes", "-y", help="With --fix: do not ask."),
     json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
 ) -> None:

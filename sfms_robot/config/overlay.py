@@ -3,7 +3,8 @@
 Two builds of a head differ in their zeros, ranges and directions, and in how their skin answers. Nobody edits the
 shipped file for that; each layer of the overlay replaces what it is about, always in this order:
 
-    head file -> calibrate (zero, ends and direction of each joint) -> fit (drives learnt from sight)
+    head file -> calibrate (zero, ends and direction of each joint) -> stored (what a servo stores, as confirmed)
+              -> fit (drives learnt from sight)
 
 A measurement holds for the servo and the head file that it was made with. Where one of them is another by now, the
 joint counts as not calibrated.
@@ -14,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -22,19 +24,20 @@ from typing import Annotated, Final, Literal
 import yaml
 from pydantic import Field, model_validator
 
-from sfms_robot.config.base import Model, Name, load
+from sfms_robot.config.base import Model, Name, load, parse
 from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Head
+from sfms_robot.config.head import Head, load_head
 from sfms_robot.config.joint import Joint
 from sfms_robot.config.mapping import Expression
 from sfms_robot.config.safety_rules import Safety
-from sfms_robot.data import find
+from sfms_robot.config.yaml_file import with_number
+from sfms_robot.data import data_dir, find
 from sfms_robot.errors import ConfigError
 
 CALIBRATE: Final = "calibrate"
 FIT: Final = "fit"
-LAYERS: Final = (CALIBRATE, FIT)
+LAYERS: Final = (CALIBRATE, "stored", FIT)
 OLD_FILE: Final = "the head's file has changed since"
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -48,6 +51,12 @@ class Identity(Model):
     firmware: int | None = None
     homing_offset: int | None = None
     drive_mode: int | None = None
+
+    @property
+    def stored(self) -> dict[str, int]:
+        """What a measurement of zero and direction declares to be stored in the servo."""
+        known = {"homing_offset": self.homing_offset, "drive_mode": self.drive_mode}
+        return {name: value for name, value in known.items() if value is not None}
 
     def difference(self, now: Identity) -> str | None:
         """What is another now, or None."""
@@ -88,6 +97,13 @@ class CalibrateLayer(Model):
     joints: dict[Name, Measured] = Field(default_factory=dict)
 
 
+class StoredLayer(Model):
+    """Registers that the servos of joints store, confirmed by the user, and the head file they were confirmed for."""
+
+    head_sha256: Sha256
+    joints: dict[Name, dict[Name, int]] = Field(default_factory=dict)
+
+
 class Fitted(Model):
     """The drive that takes the place of a joint's own."""
 
@@ -108,7 +124,18 @@ class Overlay(Model):
 
     head: Name
     calibrate: CalibrateLayer | None = None
+    stored: StoredLayer | None = None
     fit: FitLayer | None = None
+
+    def confirmed(self, sha256: str) -> dict[str, dict[str, int]]:
+        """Return what is recorded as stored in servos, by joint, for a head file of this hash."""
+        return self.stored.joints if self.stored is not None and self.stored.head_sha256 == sha256 else {}
+
+    def recorded(self, sha256: str, joint: str, stored: Mapping[str, int]) -> Overlay:
+        """Return the overlay with more registers of one joint recorded."""
+        before = self.confirmed(sha256)
+        joints = {**before, joint: {**before.get(joint, {}), **stored}}
+        return self.model_copy(update={"stored": StoredLayer(head_sha256=sha256, joints=joints)})
 
 
 @dataclass(frozen=True)
@@ -157,15 +184,18 @@ def load_overlay(head: Head, file: Path | None = None) -> Overlay:
 
 
 def save_overlay(overlay: Overlay, file: Path) -> None:
-    """Whole or not at all: an interrupted write leaves what was there. Raises ConfigError."""
+    """Write an overlay whole or not at all. Raises ConfigError."""
     plain = overlay.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
-    text = "# Of one built head: written by `sfms-robot head calibrate` and `head fit`.\n" + yaml.safe_dump(
-        plain, sort_keys=False, default_flow_style=None, width=120
-    )
+    text = "# Of one built head: written by `sfms-robot head calibrate`, `head fit` and `doctor --fix`.\n"
+    _replace(file, text + yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120))
+
+
+def _replace(file: Path, text: str) -> None:
+    """Write a file whole or not at all. Raises ConfigError."""
     new = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with new.open("w", encoding="utf-8") as out:
+        with new.open("w", encoding="utf-8", newline="") as out:
             out.write(text)
             out.flush()
             os.fsync(out.fileno())
@@ -175,11 +205,11 @@ def save_overlay(overlay: Overlay, file: Path) -> None:
 
 
 def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Identity | None] | None = None) -> Layered:
-    """Both layers over a head.
+    """Lay all layers over a head.
 
     Args:
         sha256: of the head's file now.
-        servos: who answers at each joint, None for nobody; without it only the file is compared.
+        servos: the servo that answers at each joint, or None; without it only the file is compared.
 
     Raises ConfigError for a layer that makes no sound head.
     """
@@ -190,9 +220,10 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
         problem = OLD_FILE if overlay.calibrate is None or overlay.calibrate.head_sha256 != sha256 else None
         problem = problem or _another(found, joint, servos, name)
         if problem is None:
-            joints[name] = calibrated(joint, found)
+            joints[name] = calibrated(joint, found, head.safety)
         else:
             refused[name] = problem
+    joints |= {name: declared(joints[name], each, head.safety) for name, each in overlay.confirmed(sha256).items()}
     fit, fitted = overlay.fit, frozenset[str]()
     if fit is not None and fit.head_sha256 != sha256:
         notes.append(f"the fit of {fit.date} is not used: {OLD_FILE}")
@@ -214,14 +245,45 @@ def _another(found: Measured, joint: Joint, servos: Mapping[str, Identity | None
     return "its servo does not answer" if now is None else found.identity.difference(now)
 
 
-def calibrated(joint: Joint, found: Measured) -> Joint:
-    """The joint with measured zero, direction and ends; its rest keeps its angle, and stands where the centre is."""
+def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Joint:
+    """Return the joint with measured zero, direction and ends; its rest keeps its angle, and is where the centre is.
+
+    `usual`: that of the head, under the joint's own.
+    """
     ticks_per_deg = found.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
     zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
     low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
     ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
-    known = {"homing_offset": found.homing_offset, "drive_mode": found.drive_mode}
-    safety = joint.safety or Safety()
-    stored = {**safety.stored, **{name: value for name, value in known.items() if value is not None}}
-    safety = safety.model_copy(update={"stored": stored})
-    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, "safety": safety, **ends})
+    joint = declared(joint, found.stored, usual or Safety())
+    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, **ends})
+
+
+def declared(joint: Joint, stored: Mapping[str, int], usual: Safety) -> Joint:
+    """Return the joint with zero and direction that count as made for these registers of its servo."""
+    update = {"stored": {**usual.merged(joint.safety).stored, **stored}}
+    return joint.model_copy(update={"safety": (joint.safety or Safety()).model_copy(update=update)})
+
+
+def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bool = False) -> Path:
+    """Declare in the file of head `name` all that the servo of a joint stores; return the file that was written.
+
+    The head.yaml of the user is edited. The overlay is written instead for a shipped head, for one that has an overlay
+    (an edit would end its measurements), for a file that cannot be written, and for one whose form (an alias, a twin)
+    does not let one joint change alone.
+    `practice`: found on emulated servos. Raises ConfigError for a file that cannot be written.
+    """
+    head = load_head(name)
+    own, file = find("heads", name, "head.yaml") / "head.yaml", overlay_file(head.name, practice)
+    if not overlay_file(head.name).exists() and data_dir("configs").resolve() not in own.resolve().parents:
+        text = own.read_bytes().decode()
+        for register, value in stored.items():
+            text = with_number(text, ("joints", joint, "safety", "stored", register), value)
+        with suppress(ConfigError, yaml.YAMLError):
+            edited = parse(Head, yaml.safe_load(text), own)
+            wanted = {key: head.safety_of(key) for key in head.joints}
+            wanted[joint] = wanted[joint].model_copy(update={"stored": stored})
+            if {key: edited.safety_of(key) for key in edited.joints} == wanted:
+                _replace(own.resolve(), text)
+                return own
+    save_overlay(load_overlay(head, file).recorded(head_hash(name), joint, stored), file)
+    return file

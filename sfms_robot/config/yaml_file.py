@@ -7,7 +7,7 @@ only `true` and `false` are booleans, and a number with a leading zero is refuse
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -73,6 +73,25 @@ def read(file: Path) -> Any:
         where = f":{mark.line + 1}" if mark else ""
         problem = " ".join(str(getattr(error, "problem", None) or error).split())
         raise ConfigError(f"{file}{where}: {problem}") from error
+
+
+def with_number(text: str, keys: Sequence[str], value: int) -> str:
+    """Return `text` with `value` under a path of mapping keys; comments, order and all other values stay.
+
+    Only what is written there is edited: aliases and merge keys are not followed, so look at what the result means.
+    """
+    node: Any = yaml.compose(text, Loader=yaml.SafeLoader)
+    missing, new = list(keys), f"{value}"
+    while isinstance(node, yaml.MappingNode) and (found := [v for k, v in node.value if [k.value] == missing[:1]]):
+        node = found[0]
+        del missing[0]
+    for key in reversed(missing):
+        new = f"{{{key}: {new}}}"
+    start, end = node.start_mark.index, node.end_mark.index
+    if isinstance(node, yaml.MappingNode):  # as its first entry
+        start = end = start + node.flow_style
+        new = new[1:-1] + (", " if node.flow_style else f"\n{' ' * node.start_mark.column}")
+    return text[:start] + new + text[end:]
 
 
 def _check_depth(text: str) -> None:

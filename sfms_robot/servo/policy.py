@@ -19,7 +19,11 @@ PINCH_S: Final = 0.5
 
 @dataclass(frozen=True)
 class BusServo:
-    """One servo of a bus and the joint it moves; the limits are those of the joint."""
+    """One servo of a bus and the joint it moves; the limits are those of the joint.
+
+    Attributes:
+        doctor: command that mends what the servo stores against the head's file.
+    """
 
     joint: str
     id: int
@@ -27,6 +31,7 @@ class BusServo:
     min_rad: float
     max_rad: float
     safety: Safety = field(default_factory=Safety)
+    doctor: str = "sfms-robot doctor --port PORT --head HEAD --fix"
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
-"""What a servo has stored, held against what the head's file says of its joint: values in, contradictions out, no I/O.
+"""Compare what a servo stores with what the head's file says of its joint: values in, contradictions out, no I/O.
 
-Startup asks before torque comes on, `sfms-robot doctor` whenever it is run; both see the same. Registers that a model
-does not have, or that were not read, are not judged.
+Startup compares before torque comes on, `sfms-robot doctor` whenever it is run; both see the same. Registers that a
+model does not have, or that were not read, are not judged.
 
 Sources: ROBOTIS e-manual, control tables of the X and MX series (operating mode 11, homing offset 20, position limits
 48 and 52, startup configuration 60, shutdown 63) and of Protocol 1.0 (angle limits 6 and 8, shutdown 18); Feetech STS
-memory table V3.6 (angle limits 9 and 11, unloading condition 19, offset 31).
+memory table V3.6 (angle limits 9 and 11, phase 18, unloading condition 19, offset 31).
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _CURRENT_POSITION_MODE: Final = 5  # Protocol 2.0: position with bounded current
 _PROTECTIONS: Final = ("overheating", "overload", "electrical shock")
 _LIMITS: Final = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _OFFSETS: Final = ("homing_offset", "multi_turn_offset")
+_DIRECTION: Final = {"drive_mode": REVERSE | _SLAVE, "phase": 0x81}  # Feetech: of the motor (bit 0), of the encoder (7)
 _SCALES: Final = ("angular_resolution", "resolution_divider")  # other than 1: a tick is more than a tick
 
 
@@ -56,8 +57,9 @@ class Contradiction:
 
     Attributes:
         wanted: the value that would do, as close to the stored one as can be.
-        then: `refused` at startup, `set` by startup itself, or only `told`.
-        fixable: whether writing `wanted` mends it without harm; else it is for a person to look at.
+        then: `refused` at startup, `set` by startup itself, or `told`: a warning, since it only weakens protection.
+        fixable: whether it can be mended without harm; else it is for a person to look at.
+        in_file: the head's file is what has to change: zero and direction belong together with it. Else the servo.
     """
 
     register: str
@@ -66,6 +68,7 @@ class Contradiction:
     why: str
     then: Then
     fixable: bool = True
+    in_file: bool = False
 
     def __str__(self) -> str:
         return f"{self.register} is {self.value}, wanted {self.wanted}: {self.why}"
@@ -163,42 +166,40 @@ def _unlimited(names: tuple[str, str], low: int, high: int, table: Table) -> Ite
 
 
 def _zero_and_direction(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Homing offset, reverse bit and the like move or turn round every angle of the joint."""
+    """Yield each offset, reverse bit and scale that would move the joint by a wrong angle or the wrong way."""
     for name in _OFFSETS:
-        if name in values and (values[name] or name in needs.stored):
-            yield from _shifted(name, values[name], table, needs)
-    if "drive_mode" in values:
-        now = values["drive_mode"]
-        wanted = now & ~(REVERSE | _SLAVE) | needs.stored.get("drive_mode", 0) & (REVERSE | _SLAVE)
-        if (now ^ wanted) & _SLAVE:
-            yield Contradiction("drive_mode", now, wanted, "it follows another motor, not its goals", "refused")
-        elif now != wanted and "drive_mode" in needs.stored:
-            yield Contradiction("drive_mode", now, wanted, "the joint would move the other way", "refused")
-        elif now != wanted:
-            why = "its ticks run the other way; the head's file says nothing of it"
-            yield Contradiction("drive_mode", now, wanted, why, "told", fixable=False)
+        now, wanted = values.get(name, 0), needs.stored.get(name, 0)
+        if name in values and now != wanted:
+            degrees = offset_ticks(table, now - wanted) * 360.0 / table.ticks_per_revolution
+            yield Contradiction(
+                name, now, wanted, f"every angle would be {degrees:+.1f} deg off", "refused", in_file=True
+            )
+    for name, bits in _DIRECTION.items():
+        now, declared = values.get(name, 0), needs.stored.get(name, 0)
+        wanted = now & ~bits | declared & bits
+        if name not in values or now == wanted:
+            continue
+        slave = name == "drive_mode" and (now ^ wanted) & _SLAVE
+        why = "it follows another motor, not its goals" if slave else "the joint would move the other way"
+        yield Contradiction(name, now, wanted, why, "refused", in_file=not slave)
     for name in _SCALES:
         if values.get(name, 1) > 1:
             yield Contradiction(name, values[name], 1, "one of its ticks is several", "refused")
 
 
-def _shifted(name: str, now: int, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    wanted = needs.stored.get(name)
-    if now == wanted:
-        return
-    degrees = (now - (wanted or 0)) * 360.0 / table.ticks_per_revolution
-    if wanted is not None:
-        yield Contradiction(name, now, wanted, f"every angle would be {degrees:+.1f} deg off", "refused")
-    else:
-        why = f"it shifts every angle by {degrees:+.1f} deg; the head's file says nothing of it"
-        yield Contradiction(name, now, 0, why, "told", fixable=False)
+def offset_ticks(table: Table, stored: int) -> int:
+    """Return the ticks that a stored offset adds to each position the servo reports.
+
+    Dynamixel: present position = shaft + offset. Feetech STS: present position = shaft - offset.
+    """
+    return -stored if table.family == "feetech" else stored
 
 
 def _named_in_the_file(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
-    """Whatever else the head's file says is stored."""
+    """Yield each other register that does not hold what the head's file declares."""
     for name, wanted in needs.stored.items():
-        if name not in (*_OFFSETS, "drive_mode") and values.get(name, wanted) != wanted:
-            yield Contradiction(name, values[name], wanted, "the head's file reckons with it", "refused")
+        if name not in (*_OFFSETS, *_DIRECTION) and values.get(name, wanted) != wanted:
+            yield Contradiction(name, values[name], wanted, "the head's file reckons with it", "refused", in_file=True)
 
 
 def _secondary_id(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
@@ -238,15 +239,15 @@ def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Ite
 
 
 def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Where it stands: within the one turn of position mode, or at one turn of several and no other."""
+    """Yield a position beyond the one turn of position mode, or one that several turns of the joint have in common."""
     present, turn = table.role("present_position"), table.ticks_per_revolution
     if present is None or present.name not in values:
         return
-    now, offset = values[present.name], values.get("homing_offset", 0)
+    now, offset = values[present.name], offset_ticks(table, values.get("homing_offset", 0))
     torque = table.role("torque_enable")
     if multi_turn(table, needs):
         if torque is not None and values.get(torque.name):
-            return  # it has had power since somebody knew where it was
+            return  # it has had power since its place was known
         if not unique_turn(now, turn, needs):
             low, high = home_ticks(turn, needs)
             why = (

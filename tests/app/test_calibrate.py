@@ -1,7 +1,11 @@
 """Leading through a head's joints: somebody who answers lines and turns emulated servos by hand, in virtual time."""
 
+import re
+import shlex
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -13,10 +17,19 @@ from sfms_robot.app.head.calibrate import Outcome, calibrate, calibrate_on
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.config.calibrate_first import held_back
-from sfms_robot.config.overlay import calibrated, head_hash, load_overlay, overlay_file
+from sfms_robot.config.overlay import (
+    Overlay,
+    calibrated,
+    head_hash,
+    layered,
+    load_overlay,
+    overlay_file,
+    save_overlay,
+)
+from sfms_robot.data import find
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
-from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.runtime.clock import RealClock, VirtualClock
 
 DAY = date(2026, 5, 17)
 LIMIT = {"speed_deg_s": 90, "acceleration_deg_s2": 900, "jerk_deg_s3": 9000}
@@ -254,3 +267,74 @@ def test_a_run_holds_a_joint_back_whose_servo_is_another(name, caplog):
     assert ready.joints["jaw"] == held_back(head).joints["jaw"]
     assert ready.joints["brow"].limits == "slow"
     assert "the calibration of jaw does not hold: homing_offset was 0 and is 100" in caplog.text
+
+
+# --- what a start refuses, and `doctor --fix` records -----------------------------------------------------------
+
+
+@pytest.fixture
+def turret(tmp_path, monkeypatch) -> Path:
+    """A copy of a shipped head, and a folder for what belongs to this build."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    folder = tmp_path / "my turret"
+    shutil.copytree(find("heads", "interbotix_wxxms", "head.yaml"), folder)
+    return folder
+
+
+def reversed_turret(**registers) -> list[EmulatedServo]:
+    """Servos of the turret, of which the second runs the other way than its head's file says."""
+    pan, tilt = emulated(load_head("interbotix_wxxms"))["main"]
+    return [pan, replace(tilt, registers={"drive_mode": 0, **registers})]
+
+
+@pytest.mark.parametrize("shipped", [False, True])
+def test_the_command_that_a_refusal_names_records_the_value_and_the_head_starts(turret, shipped, command_line):
+    head = "interbotix_wxxms" if shipped else str(turret)
+    own = find("heads", head, "head.yaml") / "head.yaml"
+    before = own.read_bytes()
+    with launch(reversed_turret(homing_offset=-100, shutdown=0)) as chain:
+        start = ("run", "--head", head, "--port", chain.device, "--dry-run", "--yes", "--json")
+        stored = identify(load_head(head), ["pan", "tilt"], {"main": chain.device}, RealClock())
+        refused = command_line(*start)
+        assert refused.code == 4 and "servo 2 (tilt): homing_offset is -100, wanted 0" in refused.err
+        cure = shlex.split(refused.err.strip().partition("fits it: sfms-robot ")[2])
+        looked = command_line(*cure[:-1], "--json")
+        errors = [each for each in looked.told["findings"] if each["severity"] == "error"]
+        assert looked.code == 4 and {each["fix"] for each in errors} == {f"sfms-robot {shlex.join(cure)}"}
+        assert command_line(*cure, "--yes", "--json").code == 0
+        assert command_line(*start).code == 0
+        assert identify(load_head(head), ["pan", "tilt"], {"main": chain.device}, RealClock()) == stored
+    written = overlay_file("interbotix_wxxms") if shipped else own
+    assert {"homing_offset: -100", "drive_mode: 0"} <= set(re.findall(r"\w+: -?\d+", written.read_text()))
+    assert (own.read_bytes() == before) == shipped == overlay_file("interbotix_wxxms").exists()
+
+
+def test_a_head_on_emulated_servos_is_refused_and_mended_by_the_same_commands(turret, command_line):
+    (turret / "emulate.yaml").write_text("joints: {tilt: {drive_mode: 0}}\n")
+    start = ("run", "--head", turret, "--port", "sim", "--duration", 0.2, "--fast", "--yes", "--json")
+    assert command_line(*start).code == 4
+    assert command_line("doctor", "--head", turret, "--port", "sim", "--fix", "--yes").code == 0
+    assert command_line(*start).code == 0
+
+
+def test_less_protection_is_one_warning_and_a_line_in_the_report(turret, command_line, caplog):
+    (turret / "emulate.yaml").write_text("joints: {tilt: {shutdown: 0}, pan: {shutdown: 0}}\n")
+    ended = command_line("run", "--head", turret, "--duration", 0.2, "--fast", "--json")
+    (line,) = ended.told["bus"]["stored_warnings"]
+    assert ended.code == 0 and line.startswith("pan, tilt: shutdown is 0, wanted 52: it goes on under")
+    assert [record for record in caplog.records if "shutdown" in record.getMessage()] == [
+        record for record in caplog.records if f"doctor --port sim --head '{turret}' --fix" in record.getMessage()
+    ]
+
+
+def test_a_joint_is_measured_whatever_its_servo_has_stored_and_starts_with_it(name, command_line):
+    servos = [EmulatedServo(1, registers={"homing_offset": 300, "drive_mode": 1}), EmulatedServo(2)]
+    save_overlay(Overlay(head="two").recorded(head_hash(name), "jaw", {"homing_offset": 1}), overlay_file("two"))
+    with launch(servos, virtual=True) as chain:
+        outcome = led(name, chain, Person(*by_hand(chain)[:5]), joints=["jaw"])
+    assert outcome.measured == ["jaw"]
+    head = load_head(name)
+    now = layered(head, load_overlay(head), head_hash(name)).head
+    assert now.safety_of("jaw").stored == {"homing_offset": 300, "drive_mode": 1}
+    with launch(servos) as chain:
+        assert command_line("run", "--head", name, "--port", chain.device, "--dry-run").code == 0

@@ -46,6 +46,8 @@ def test_what_is_to_be_typed_reaches_the_servos_it_is_about():
     assert Command("/dev/ttyUSB0", "feetech", "face").servo(words).endswith("--port /dev/ttyUSB0 --family feetech")
     assert Command("sim", "feetech", "face").servo(words, BAUD).endswith("--port sim --head face")
     assert Command("sim", "feetech").servo(words, BAUD).endswith("--port sim --baud 1000000 --family feetech")
+    two = Command("/dev/a", "feetech", "my face", "face=/dev/a,neck=/dev/b")
+    assert two.fix == "sfms-robot doctor --port face=/dev/a,neck=/dev/b --head 'my face' --fix"
 
 
 class Patient:
@@ -409,6 +411,12 @@ def test_what_acts_by_itself_or_shifts_angles_is_told():
         report = sick.examined()
     said = " ".join(told(report, "error") + told(report, "warning"))
     assert all(f"{name} is {value}" in said for name, value in stored.items())
+
+
+def test_without_a_head_an_offset_contradicts_nothing_and_is_left_alone():
+    with patient(EmulatedServo(1, registers={"homing_offset": 100, "drive_mode": 1}), count=1) as sick:
+        report = sick.examined(wanted={}, fix=lambda question: True)
+    assert len(told(report, "warning")) == 2 and report["fixed"] == [] and report["exit_code"] == 0
 
 
 # --- the budget and the wording ---------------------------------------------------------------------------------

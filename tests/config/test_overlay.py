@@ -22,9 +22,11 @@ from sfms_robot.config.overlay import (
     layered,
     load_overlay,
     overlay_file,
+    record_stored,
     save_overlay,
 )
 from sfms_robot.config.provenance import provenance, refusals
+from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 
@@ -171,3 +173,69 @@ def test_an_unknown_joint_is_named_with_those_there_are():
     save_overlay(overlay(chin=measured()), overlay_file("face28"))
     with pytest.raises(ConfigError, match="calibrate.joints = 'chin' is not a joint of this head .*jaw"):
         load_overlay(FACE)
+
+
+# --- what servos have stored ------------------------------------------------------------------------------------
+
+
+def copied(folder, *changes):
+    """A head of the user's own: a shipped one, some words of its file changed."""
+    text = (find("heads", "interbotix_wxxms", "head.yaml") / "head.yaml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    folder.mkdir()
+    (folder / "head.yaml").write_text(text)
+    return str(folder)
+
+
+def test_a_stored_value_goes_into_the_user_s_own_file_and_all_else_in_it_stays(tmp_path):
+    name = copied(tmp_path / "turret")
+    before = (tmp_path / "turret" / "head.yaml").read_text()
+    assert record_stored(name, "tilt", {"drive_mode": 0, "homing_offset": -100}) == tmp_path / "turret" / "head.yaml"
+    after = (tmp_path / "turret" / "head.yaml").read_text()
+    assert after == before.replace("{stored: {drive_mode: 1}}", "{stored: {homing_offset: -100, drive_mode: 0}}")
+    head = load_head(name)
+    assert head.safety_of("tilt").stored == {"drive_mode": 0, "homing_offset": -100}
+    assert head.safety_of("pan").stored == {"drive_mode": 0}
+    assert not overlay_file(head.name).exists()
+
+
+SHARED = {
+    "alias": (
+        ("safety: {stored: {drive_mode: 0}}", "safety: &same {stored: {drive_mode: 1}}"),
+        ("safety: {stored: {drive_mode: 1}}", "safety: *same"),
+    ),
+    "mirror": (("    safety: {stored: {drive_mode: 1}}\n", "    mirror_of: pan\n"),),
+}
+
+
+@pytest.mark.parametrize("form", SHARED)
+def test_a_file_in_which_one_joint_cannot_change_alone_gets_an_overlay(tmp_path, form):
+    name = copied(tmp_path / "turret", *SHARED[form])
+    before = (tmp_path / "turret" / "head.yaml").read_text()
+    head = load_head(name)
+    assert record_stored(name, "pan", {"drive_mode": 4}) == overlay_file(head.name)
+    assert (tmp_path / "turret" / "head.yaml").read_text() == before
+    now = layered(head, load_overlay(head), head_hash(name)).head
+    assert now.safety_of("pan").stored == {"drive_mode": 4} and now.joints["tilt"] == head.joints["tilt"]
+
+
+def test_a_shipped_head_and_one_that_was_calibrated_are_not_edited(tmp_path):
+    shipped = find("heads", "interbotix_wxxms", "head.yaml") / "head.yaml"
+    before = shipped.read_bytes()
+    for name in ("interbotix_wxxms", str(shipped.parent), copied(tmp_path / "turret")):
+        assert record_stored(name, "tilt", {"drive_mode": 0}) == overlay_file("interbotix_wxxms")
+    assert shipped.read_bytes() == before == (tmp_path / "turret" / "head.yaml").read_bytes()
+    record_stored("interbotix_wxxms", "pan", {"drive_mode": 1}, practice=True)
+    head, sha256 = load_head("interbotix_wxxms"), head_hash("interbotix_wxxms")
+    now = layered(head, load_overlay(head), sha256).head
+    assert [now.safety_of(joint).stored["drive_mode"] for joint in ("pan", "tilt")] == [0, 0]
+    assert layered(head, load_overlay(head), "0" * 64).head == head  # recorded for another file
+
+
+def test_what_was_measured_keeps_what_the_head_declares_for_all_joints():
+    usual = FACE.safety.model_copy(update={"stored": {"operating_mode": 3}})
+    head = FACE.model_copy(update={"safety": usual})
+    now = layered(head, overlay(jaw=measured()), SHA).head
+    assert now.safety_of("jaw").stored == {"operating_mode": 3, "homing_offset": 0, "drive_mode": 0}

@@ -5,7 +5,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config.yaml_file import DEEPEST, read
+from sfms_robot.config.yaml_file import DEEPEST, read, with_number
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 
@@ -56,3 +56,21 @@ NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]*", fullmatch=True)  # what keys and
 def test_what_we_write_is_what_we_read(tmp_path_factory, value):
     text = yaml.safe_dump(value, allow_unicode=False)
     assert repr(of(tmp_path_factory.mktemp("yaml"), text)) == repr(yaml.safe_load(text))
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("a: {b: {c: 1, d: 2}}  # why\n", "a: {b: {c: 7, d: 2}}  # why\n"),
+        ("a: {b: {d: 2}}\n", "a: {b: {c: 7, d: 2}}\n"),
+        ("a: {b: {}}\n", "a: {b: {c: 7, }}\n"),
+        ("a: {x: 1}\n", "a: {b: {c: 7}, x: 1}\n"),
+        ("# head\r\na:\r\n  x: \u00e9  # kept\r\n", "# head\r\na:\r\n  b: {c: 7}\n  x: \u00e9  # kept\r\n"),
+        ("a:\n  b:\n    d: 2\n", "a:\n  b:\n    c: 7\n    d: 2\n"),
+        ("a: {b: null}\n", "a: {b: {c: 7}}\n"),
+        ("x: 1\n", "a: {b: {c: 7}}\nx: 1\n"),
+    ],
+)
+def test_a_number_is_set_in_a_text_of_which_the_rest_stays(before, after):
+    assert with_number(before, ("a", "b", "c"), 7) == after
+    assert yaml.safe_load(after)["a"]["b"]["c"] == 7

@@ -366,22 +366,6 @@ def test_reading_one_by_one_keeps_to_its_budget_and_reaches_everybody():
     assert ages[-1] == pytest.approx(0.03)  # and all of them within four ticks
 
 
-def test_sts_is_calibrated_where_it_stands_and_others_are_not():
-    rig = rig_of("sts3215", [3000])
-    rig.bus.connect()
-    rig.bus.calibrate_here("joint1")
-    assert rig.register(1, "present_position") == 2048
-    rig.servo(1).power_cycle(1.0)
-    assert rig.register(1, "present_position") == 2048
-    rig.hold()
-    with pytest.raises(ServoError, match="has torque on"):
-        rig.bus.calibrate_here("joint1")
-    other = rig_of("scs0009", [600])
-    other.bus.connect()
-    with pytest.raises(ServoError, match="scs0009, which cannot be calibrated"):
-        other.bus.calibrate_here("joint1")
-
-
 @pytest.mark.parametrize("model", OLDER)
 def test_one_sync_request_goes_out_per_tick_for_all_goals(rig):
     held = rig.hold()

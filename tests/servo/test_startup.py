@@ -16,7 +16,7 @@ from sfms_robot.servo.chain.startup import PATIENCE_S, needs_of
 from sfms_robot.servo.chain.verified_write import Silent, finish
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
-from sfms_robot.servo.stored_settings import contradictions
+from sfms_robot.servo.stored_settings import JointNeeds, contradictions, offset_ticks
 
 LIMIT_RAD = 0.9
 MODELS = ("xl330-m288", "mx-28-2.0", "xl-320", "ax-12a", "mx-28-1.0", "sts3215", "scs0009")
@@ -113,8 +113,8 @@ def test_limits_narrower_than_the_joint_are_refused_with_what_to_type(model):
     rig = Rig(model, {"registers": stored})
     with pytest.raises(
         ServoError,
-        match=rf"joint1 \(id 1\).*{low} is {stored[low]}, wanted {rig.needs[0].low_ticks}"
-        r".*sfms-robot doctor --port lossy .*--fix, or sfms-robot servo write 1 ",
+        match=rf"^lossy: servo 1 \(joint1\): {low} is {stored[low]}, wanted {rig.needs[0].low_ticks}"
+        r".*; sfms-robot doctor --port PORT --head HEAD --fix$",
     ):
         rig.startup.run()
     assert {low, high} <= rig.found().keys()
@@ -149,28 +149,53 @@ def test_wheel_mode_is_ended(model):
 # --- zero and direction -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("model", ["xl330-m288", "sts3215"])
-def test_another_homing_offset_than_the_head_s_file_reckons_with_is_refused(model):
-    rig = Rig(model, {"registers": {"homing_offset": 100}}, stored={"homing_offset": 612})
-    with pytest.raises(ServoError, match="homing_offset is 100, wanted 612: every angle would be -45.0 deg off"):
+MOVES_WRONGLY = [  # model, register, stored, declared (None: nothing), what is wrong
+    ("xl330-m288", "homing_offset", 100, 612, "every angle would be -45.0 deg off"),
+    ("xl330-m288", "homing_offset", 512, None, "every angle would be +45.0 deg off"),
+    ("sts3215", "homing_offset", 100, 612, "every angle would be +45.0 deg off"),
+    ("sts3215", "homing_offset", -512, None, "every angle would be +45.0 deg off"),
+    ("mx-28-1.0", "multi_turn_offset", 512, None, "every angle would be +45.0 deg off"),
+    ("xl330-m288", "drive_mode", 1, 0, "the joint would move the other way"),
+    ("xl330-m288", "drive_mode", 5, None, "the joint would move the other way"),
+    ("mx-28-2.0", "drive_mode", 0, 1, "the joint would move the other way"),
+    ("sts3215", "phase", 13, None, "the joint would move the other way"),
+    ("scs0009", "phase", 128, None, "the joint would move the other way"),
+]
+
+
+@pytest.mark.parametrize(("model", "name", "now", "said", "why"), MOVES_WRONGLY)
+def test_what_would_move_a_joint_wrongly_is_refused_until_the_file_declares_it(model, name, now, said, why):
+    declared = {} if said is None else {name: said}
+    rig = Rig(model, {"registers": {name: now}}, stored=declared)
+    with pytest.raises(ServoError, match=rf"servo 1 \(joint1\): {name} is {now}, wanted .* doctor --port") as refused:
         rig.startup.run()
-    Rig(model, {"registers": {"homing_offset": 612}}, stored={"homing_offset": 612}).startup.run()
+    assert why in str(refused.value)
+    assert rig.found()[name].in_file and rig.held("torque_enable") == 0 and rig.held(name) == now
+    Rig(model, {"registers": {name: now}}, stored={name: now}).startup.run()
 
 
-@pytest.mark.parametrize("model", ["xl330-m288", "sts3215"])
-def test_an_offset_of_which_the_head_s_file_says_nothing_is_told(model):
-    rig = Rig(model, {"registers": {"homing_offset": 100}})
-    rig.startup.run()
-    assert rig.found()["homing_offset"].then == "told"
+def test_an_sts_offset_counts_with_its_own_sign():
+    """Sign and magnitude, and subtracted from what the encoder reads: every second raw value, against the emulator."""
+    rig = Rig("sts3215", {"registers": {"lock": 0}})
+    field, turn = rig.table["homing_offset"], rig.table.ticks_per_revolution
+    assert rig.held("present_position") == 2048
+    for raw in range(0, 4096, 2):
+        rig.servo(1).write(field.address, raw.to_bytes(2, "little"), 0.0)
+        stored = rig.held("homing_offset")
+        assert stored == (2048 - raw if raw > 2048 else raw % 2048)
+        shown = rig.held("present_position") - 2048
+        assert (shown - offset_ticks(rig.table, stored)) % turn == 0
+        if stored:
+            degrees = offset_ticks(rig.table, stored) * 360 / turn
+            assert f"every angle would be {degrees:+.1f} deg off" in rig.found()["homing_offset"].why
 
 
-def test_a_servo_that_runs_the_other_way_is_refused_where_the_file_says_which():
-    rig = Rig("xl330-m288", {"registers": {"drive_mode": 1}}, stored={"drive_mode": 0})
-    with pytest.raises(ServoError, match="drive_mode is 1, wanted 0: the joint would move the other way"):
-        rig.startup.run()
-    rig = Rig("xl330-m288", {"registers": {"drive_mode": 1}})
-    rig.startup.run()
-    assert rig.found()["drive_mode"].then == "told"
+@pytest.mark.parametrize(("shaft", "offset"), [(500, 1000), (3900, -1000)])
+def test_the_one_turn_of_an_sts_that_counts_turns_is_shifted_by_its_offset_with_its_own_sign(shaft, offset):
+    table = Table.of(load_firmware_map("sts3215"))
+    values = {"present_position": shaft - offset, "homing_offset": offset, "phase": 28}
+    needs = JointNeeds(1462, 2634, {"homing_offset": offset})
+    assert contradictions(values, table, needs) == []
 
 
 # --- what acts by itself ----------------------------------------------------------------------------------------
@@ -196,6 +221,7 @@ def test_a_shutdown_mask_without_its_protections_is_told(model):
     name = "unloading_condition" if model == "sts3215" else "shutdown"
     rig = Rig(model, {"registers": {name: 0}})
     rig.startup.run()
+    assert rig.held(name) == 0
     told = rig.found()[name]
     assert told.then == "told" and "overload" in told.why and "overheating" in told.why
     assert told.wanted and Rig(model, {"registers": {name: told.wanted}}).found().get(name) is None

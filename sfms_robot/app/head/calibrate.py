@@ -148,7 +148,7 @@ def _one(
         if identity is None:
             raise BusError(f"no answer from id {config.id} on bus {config.bus!r}")
         by_hand = _ask_how(talk, jumps(head, joint))
-        with probe(head, joint, where[config.bus], clock) as at:
+        with probe(head, joint, where[config.bus], clock, identity.stored) as at:
             while True:
                 try:
                     return _measure(config, identity, at, by_hand, talk, today)
@@ -260,7 +260,8 @@ def _of_this_file(overlay: Overlay, sha256: str, talk: Talk) -> Overlay:
 def _with(overlay: Overlay, sha256: str, joint: str, found: Measured) -> Overlay:
     joints = overlay.calibrate.joints if overlay.calibrate is not None else {}
     layer = CalibrateLayer(head_sha256=sha256, joints={**joints, joint: found})
-    return overlay.model_copy(update={"calibrate": layer})
+    overlay = overlay.model_copy(update={"calibrate": layer})
+    return overlay.recorded(sha256, joint, found.stored) if overlay.stored is not None else overlay
 
 
 def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: Outcome) -> None:

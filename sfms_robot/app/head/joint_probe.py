@@ -7,7 +7,7 @@ range is has yet to be found. It moves only while somebody asks it to, at a slow
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Final
 
@@ -90,12 +90,14 @@ class Probe:
 
 
 @contextmanager
-def probe(head: Head, name: str, where: Chain | str, clock: Clock) -> Iterator[Probe]:
-    """The joint's bus, open; limp again at the end. Raises RobotError for a servo that is not what the head says."""
-    joint = head.joints[name]
-    if joint.safety is not None or head.safety.stop != "release":
-        joint = joint.model_copy(update={"safety": head.safety_of(name).model_copy(update={"stop": "release"})})
-    joint = joint.model_copy(update=_whole_travel(joint))
+def probe(head: Head, name: str, where: Chain | str, clock: Clock, stored: Mapping[str, int]) -> Iterator[Probe]:
+    """Open the joint's bus; limp again at the end. Raises RobotError for a servo that is not what the head says.
+
+    `stored`: what its servo stores of zero and direction; a measurement may begin from any.
+    """
+    joint, safety = head.joints[name], head.safety_of(name)
+    safety = safety.model_copy(update={"stop": "release", "stored": {**safety.stored, **stored}})
+    joint = joint.model_copy(update={"safety": safety, **_whole_travel(joint)})
     # A person thinks longer than a watchdog waits.
     config = head.buses[joint.bus].model_copy(update={"watchdog_ms": 0})
     alone = head.model_copy(update={"joints": {name: joint}, "buses": {joint.bus: config}})

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from shlex import quote
 from typing import Any, Final, Literal
 
 from sfms_robot.app.servo.budget import Budget
@@ -84,15 +85,17 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Command:
-    """Writes commands that can be pasted."""
+    """Commands that can be pasted. `port`: of one bus; `ports`: of the whole head, where it has several."""
 
     port: str
     family: str
     head: str | None = None
+    ports: str | None = None
 
     @property
     def fix(self) -> str:
-        return f"sfms-robot doctor --port {self.port}{self._of_head or self._of_family} --fix"
+        """Return the command that mends what servos store against the head's file."""
+        return f"sfms-robot doctor --port {self.ports or self.port}{self._of_head or self._of_family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
         rate = f" --baud {baud}" if baud is not None else ""
@@ -102,7 +105,7 @@ class Command:
 
     @property
     def _of_head(self) -> str:
-        return f" --head {self.head}" if self.head else ""
+        return f" --head {quote(self.head)}" if self.head else ""
 
     @property
     def _of_family(self) -> str:
@@ -319,13 +322,15 @@ def _judge_settings(state: State, about: str, command: Command) -> Iterator[Find
 
 
 def judge_stored(state: State, want: Wanted | None, command: Command) -> Iterator[Finding]:
-    """What the unit has stored against what its joint needs; without a head, against itself."""
+    """Yield a finding for each stored value that is not what its joint needs; without a head, against itself."""
     seen = state.seen
     about, torque = _name(seen.id, want), state.value("torque_enable")
     for each in stored_contradictions(state, want):
         severity: Severity = "error" if each.then == "refused" else "note" if each.then == "set" else "warning"
         fix = ""
-        if each.fixable and each.register in _own_registers(seen):
+        if each.in_file and want is None:  # no head's file that it could contradict
+            severity = "warning"
+        elif each.fixable and not each.in_file and seen.registers()[each.register].writable:
             fix = command.servo(f"write {{id}} {each.register} {each.wanted}", seen.baud)
             if torque:
                 severity = "error" if each.then == "set" else severity
@@ -351,10 +356,6 @@ def _as_it_is(values: Mapping[str, int], table: Table) -> JointNeeds:
     """What a servo that is no joint of a head needs: to stay within its own limits."""
     low, high = (values.get(name, table.center_ticks) for name in limit_names(table) or ("", ""))
     return JointNeeds(low, high) if low < high else JointNeeds(table.center_ticks, table.center_ticks)
-
-
-def _own_registers(seen: FoundServo) -> list[str]:
-    return [name for name, field in seen.table.fields.items() if field.writable] if seen.table is not None else []
 
 
 # --- the bus ----------------------------------------------------------------------------------------------------

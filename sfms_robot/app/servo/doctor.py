@@ -35,7 +35,7 @@ from sfms_robot.app.servo.register_view import State, read_all
 from sfms_robot.app.servo.serial_line import SIM, FoundServo, Wire, check_baud, only_port, table_of
 from sfms_robot.app.servo.single_servo import Confirm, Progress, field_named, guard, has_duplicate, put, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
-from sfms_robot.config.overlay import head_hash, layered, load_overlay
+from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
@@ -63,7 +63,7 @@ OpenPort = Callable[[str, int], Port]
 
 @dataclass(frozen=True)
 class Line:
-    """One port to look at, and what is expected on it."""
+    """One port to look at, and what is expected on it. `ports`: as `--port` named those of the whole head."""
 
     bus: str | None
     device: str
@@ -73,6 +73,7 @@ class Line:
     rate_hz: float
     wanted: dict[int, Wanted]
     head: str | None = None
+    ports: str | None = None
 
 
 def examine(
@@ -170,7 +171,7 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
     for name, device in where.items():
         bus = described.buses[name]
         shown = SIM if port == SIM else device
-        yield Line(name, device, shown, bus.family, bus.baud, bus.rate_hz, _wanted(described, name), head)
+        yield Line(name, device, shown, bus.family, bus.baud, bus.rate_hz, _wanted(described, name), head, port)
 
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
@@ -194,8 +195,8 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
 def _look(
     line: Line, port: Port, clock: Clock, adapter: SerialDevice, progress: Progress | None, fix: Confirm | None
 ) -> tuple[list[Finding], dict[str, Any]]:
-    """Everything that needs the open port."""
-    command = Command(line.shown, line.family, line.head)
+    """Return findings and facts that need the open port."""
+    command = Command(line.shown, line.family, line.head, line.ports)
     wire = Wire(port, line.family, clock, _first_baud(line))
     here, elsewhere = (
         {servo: _as_wanted(seen, line) for servo, seen in found.items()} for found in _who(wire, line, progress)
@@ -213,7 +214,7 @@ def _look(
         double += [seen.id] if has_duplicate(wire, seen.id) else []
         try:
             state = read_all(wire, seen)
-            if fix is not None and (done_here := _fix(wire, state, line.wanted.get(seen.id), fix)):
+            if fix is not None and (done_here := _fix(wire, state, line, fix)):
                 fixed += done_here
                 state = read_all(wire, seen)
             states.append(state)
@@ -239,15 +240,24 @@ def _look(
     return findings, facts
 
 
-def _fix(wire: Wire, state: State, want: Wanted | None, confirm: Confirm) -> list[str]:
-    """Write what can be mended without harm, each asked about and verified; what was done.
+def _fix(wire: Wire, state: State, line: Line, confirm: Confirm) -> list[str]:
+    """Write what can be mended without harm, each confirmed and verified; return what was done.
 
-    Raises ServoError for a servo that has torque on, or does not take it.
+    What zero and direction depend on goes into the head's file, never into the servo. Raises ConfigError for a file
+    that cannot be written, ServoError for a servo that has torque on, or does not take a value.
     """
-    seen, done = state.seen, []
+    seen, want, done = state.seen, line.wanted.get(state.seen.id), []
     for each in stored_contradictions(state, want):
-        change = f"{each.register} {each.value} -> {each.wanted}"
-        if not each.fixable or not confirm(f"id {seen.id} ({seen.model}): {change} ({each.why})"):
+        about, change = f"id {seen.id} ({seen.model})", f"{each.register} {each.value} -> {each.wanted}"
+        if each.in_file:
+            change = f"in the head's file: {each.register} {each.wanted} -> {each.value}"
+            if want and want.needs and line.head and confirm(f"{about}: {change} ({each.why})"):
+                stored = {**want.needs.stored, each.register: each.value}
+                file = record_stored(line.head, want.joint, stored, line.shown == SIM)
+                line.wanted[seen.id] = want = replace(want, needs=replace(want.needs, stored=stored))
+                done.append(f"{file}: {want.joint}: {each.register} {each.value}")
+            continue
+        if not each.fixable or not confirm(f"{about}: {change} ({each.why})"):
             continue
         guard(wire, seen, change, lambda question: True)
         field = field_named(seen.registers(), each.register)

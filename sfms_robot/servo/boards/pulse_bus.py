@@ -363,6 +363,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             **self._counts,
             "silent": sorted(self._channels) if self._silent else [],
             "faults": list(self._fault_log),
+            "stored_warnings": [],
         }
 
     # --- goals --------------------------------------------------------------------------------------------------

@@ -107,6 +107,7 @@ class ChainBus(WireBus[L], Generic[L]):
         self._peak_mA = 0.0
         self._release_packet = b""
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
+        self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
         self._letting_go: frozenset[int] = frozenset()  # asked for by `release`, not yet told to their members
         self._sending = RLock()
         self._set_up()
@@ -153,13 +154,14 @@ class ChainBus(WireBus[L], Generic[L]):
     # --- start and stop -----------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open, identify every servo that answers, make it listen to us. Torque is left as it is found.
+        """Open the port, identify and prepare every servo that answers; torque stays on or off.
 
         Blocks a few exchanges per servo, and for one that does not answer a few times 50 ms. Raises PortError;
-        BusError when nobody answers; ServoError for a servo that contradicts the head's file.
+        BusError when no servo answers; ServoError for a servo that contradicts the head's file.
         """
         link = self._open()
         try:
+            self._warnings.clear()
             bits = self._begin(link).run()
             present = [self._servos[index] for index in bits]
             self._read_deadline_s = link.adapt(present[0].id, *self._telemetry.position)
@@ -413,6 +415,7 @@ class ChainBus(WireBus[L], Generic[L]):
             **self._counts,
             "silent": [member.id for member in self._members if not member.liveness.listed],
             "faults": list(self._reporter.said),
+            "stored_warnings": [f"{', '.join(joints)}: {problem}" for problem, joints in self._warnings.items()],
             "supply_mA": round(self._telemetry.supply_mA(), 1),
             "supply_peak_mA": round(self._peak_mA, 1),
         }

@@ -6,8 +6,6 @@ are never asked to: there servos are read one by one, in rotation.
 
 from __future__ import annotations
 
-from sfms_robot.errors import ServoError
-from sfms_robot.servo.chain.member import State
 from sfms_robot.servo.chain.protocol1_bus import Protocol1Bus
 from sfms_robot.servo.chain.protocol1_link import Protocol1Link
 from sfms_robot.servo.chain.status_poll import GroupRead
@@ -20,13 +18,3 @@ class FeetechBus(Protocol1Bus):
 
     def _group_reader(self, link: Protocol1Link) -> GroupRead | None:
         return link.sync_read if self._tables[0].byte_order == "little" else None
-
-    def calibrate_here(self, joint: str) -> None:
-        """Make the present position the middle of the servo's range, for good. STS only.
-
-        Raises ServoError for a joint that has torque, or a model that cannot.
-        """
-        index = self.joints.index(joint)
-        if self._members[index].state is not State.OFF:
-            raise ServoError(f"{joint} (id {self._servos[index].id}) has torque on: stop it before it is calibrated")
-        self._begin(self._connected()).calibrate_here(index)

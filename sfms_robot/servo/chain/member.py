@@ -340,7 +340,7 @@ class Member:
         return self.job is not None or self._back_s < math.inf
 
     def step(self, now_s: float) -> None:
-        """One exchange of its job. Raises BusError when the port fails."""
+        """Take one exchange of its job. Raises BusError when the port fails."""
         if self.job is None:
             return
         if self.stands_s is None:
@@ -355,7 +355,7 @@ class Member:
             self._return(now_s + RETRY_S)
         except ServoError as error:
             self.job = None
-            log.warning("%s", error)
+            self._reporter.say(self.servo, str(error))
             self._try_again(now_s + REFUSED_S, now_s)
 
     def accepts(self, goal_ticks: int) -> bool:

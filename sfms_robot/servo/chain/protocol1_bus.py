@@ -45,7 +45,16 @@ class Protocol1Bus(ChainBus[Protocol1Link]):
         return Protocol1Link(self._open_port(), self._baud, self._read_deadline_s, self.family)
 
     def _begin(self, link: Protocol1Link, tries: int = 3) -> Protocol1Startup:
-        return Protocol1Startup(self.name, link, self._servos, self._tables, self._conversion, self._baud, tries)
+        return Protocol1Startup(
+            self.name,
+            link,
+            self._servos,
+            self._tables,
+            self._conversion,
+            self._baud,
+            tries=tries,
+            warnings=self._warnings,
+        )
 
     def _found(self, link: Protocol1Link) -> None:
         group, present = self._group_reader(link), self._present()

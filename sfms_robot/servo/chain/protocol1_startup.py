@@ -11,9 +11,7 @@ from collections.abc import Mapping
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain.link import Found
 from sfms_robot.servo.chain.protocol1_link import Protocol1Link
-from sfms_robot.servo.chain.startup import PATIENCE_S, Silent, Startup, Steps
-from sfms_robot.servo.chain.verified_write import finish
-from sfms_robot.servo.codecs import feetech
+from sfms_robot.servo.chain.startup import Silent, Startup, Steps
 from sfms_robot.servo.policy import torque_limit
 from sfms_robot.servo.registers import Field
 
@@ -88,28 +86,6 @@ class Protocol1Startup(Startup[Protocol1Link]):
             full = {limit.name: self.value(index, table["max_torque"])}
         for name, value in full.items():
             yield from self._write(index, table[name], value)
-
-    def calibrate_here(self, index: int) -> None:
-        """Make the present position the middle of the servo (STS: written 128, torque enable does that).
-
-        Raises ServoError for a model that cannot.
-        """
-        table, servo = self.tables[index], self._servos[index]
-        torque, lock = self._field(index, "torque_enable"), table.role("lock")
-        if "homing_offset" not in table.fields or torque.high < feetech.CALIBRATE_HERE:
-            raise self._error(index, f"is a {table.model}, which cannot be calibrated where it stands")
-        with self._link.patient(PATIENCE_S):
-            finish(self._write(index, torque, 0))
-            if lock is not None:
-                finish(self._write(index, lock, 0))
-            data = bytes([feetech.CALIBRATE_HERE])
-            if all(self._link.write(servo.id, torque.address, data) is None for _ in range(self._tries)):
-                raise Silent(self._about(index, "does not answer to its calibration"))
-            if lock is not None:
-                finish(self._write(index, lock, 1))
-            now = self.value(index, self._field(index, "present_position"))
-            if abs(now - table.center_ticks) > 2:  # the gear may settle a little
-                raise self._error(index, f"was calibrated and stands at {now}, not at {table.center_ticks}")
 
     def _write(self, index: int, field: Field, value: int) -> Steps[None]:
         """A value that was not taken is told with what the servo reports beside."""

@@ -1,14 +1,15 @@
 """Startup of the servos of a chain: identify, verify, prepare, enable.
 
-    identify   who answers, is it the model that the head's file names, of a firmware whose registers are known
-    verify     what the unit has stored against what the head's file reckons with (`stored_settings`); refused by name
+    identify   which servos answer, each of the model that the head's file names and of a firmware that is known
+    verify     what the unit has stored against what the head's file reckons with (`stored_settings`): refused by name,
+               or a warning where it only weakens protection
     prepare    mode, profile, torque limit and the registers of the head's file, each written and read back
     enable     goal := present, then torque: no jump. A servo that stands outside its own limits, as of a sagged head,
-               cannot be told to hold there: its own profile moves it inside, slowly (`slow_profile`)
+               cannot hold there: its own profile moves it inside, slowly (`slow_profile`)
 
 The same steps bring a servo back that was away. They are generators (`Steps`): between two exchanges on the wire they
 yield how long they would like to wait. At startup they are run through; while the bus is running, a tick takes a few
-and goes on with its own work.
+of them beside its own work.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ class Startup(ABC, Generic[L]):
         conversion: joint angles (J,) <-> ticks (J,), which says how far the goals of each joint go.
         baud: for messages.
         tries: before a servo counts as silent; 1 beside a running bus.
+        warnings: joints by what their servos have stored that only weakens protection; filled here.
 
     Attributes:
         can_reboot: whether the protocol has an instruction for it.
@@ -78,6 +80,7 @@ class Startup(ABC, Generic[L]):
         conversion: TickConversion,
         baud: int,
         tries: int = TRIES,
+        warnings: dict[str, list[str]] | None = None,
     ) -> None:
         self._bus = bus
         self._link = link
@@ -86,6 +89,7 @@ class Startup(ABC, Generic[L]):
         self._needs = needs_of(servos, conversion)
         self._baud = baud
         self._tries = tries
+        self._warnings = {} if warnings is None else warnings
 
     @property
     @abstractmethod
@@ -276,23 +280,18 @@ class Startup(ABC, Generic[L]):
         return (low, high) if low < high else None
 
     def _verify(self, index: int, values: Mapping[str, int]) -> list[Contradiction]:
-        """Contradictions that startup itself sets right or that do no harm. Raises ServoError for the others."""
-        found = contradictions(values, self.tables[index], self._needs[index])
+        """Return the contradictions that startup sets right or warns of. Raises ServoError for the others."""
+        found, servo = contradictions(values, self.tables[index], self._needs[index]), self._servos[index]
         for each in found:
             if each.then == "refused":
-                raise self._error(
-                    index, f"has stored what contradicts the head's file: {each}{self._cure(index, each)}"
-                )
+                kept = "measure the joint (sfms-robot head calibrate), or record the value if the head's file fits it: "
+                cure = f"; {kept * each.in_file}{servo.doctor}" if each.fixable else ""
+                raise ServoError(f"{self._link.port.name}: servo {servo.id} ({servo.joint}): {each}{cure}")
+            if each.then == "told" and servo.joint not in (joints := self._warnings.setdefault(str(each), [])):
+                joints.append(servo.joint)
+                if self._tries == 1:
+                    log.warning("%s", self._about(index, f"comes back, and {each}"))
         return found
-
-    def _cure(self, index: int, problem: Contradiction) -> str:
-        """What to type."""
-        port, servo = self._link.port.name, self._servos[index].id
-        if problem.register == self._name(index, "present_position"):
-            return "" if not problem.fixable else f" (sfms-robot doctor --port {port} --head HEAD --fix)"
-        family = "" if self.family == "dynamixel2" else f" --family {self.family}"
-        write = f"sfms-robot servo write {servo} {problem.register} {problem.wanted} --port {port}{family}"
-        return f" (sfms-robot doctor --port {port} --head HEAD --fix, or {write})"
 
     # --- exchanges ----------------------------------------------------------------------------------------------
 

@@ -5,9 +5,13 @@ On emulated servos in virtual time; with `--port FAMILY=DEVICE` those that need 
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from chain_rig import BusRig
+from emulated_devices import device_of
+from emulated_port import EmulatedPort
 from families import FAMILIES, LIMIT_RAD
 from rig import emulated
 
@@ -353,3 +357,104 @@ def test_same_goals_make_the_same_bytes(family):
             return rig.sent
 
     assert sent() == sent()
+
+
+# --- what servos have stored ------------------------------------------------------------------------------------
+
+REFUSED, WARNED, SET = "refused", "warned", "set"
+STORED = [  # family, register, value, what a start makes of it
+    ("dynamixel2", "drive_mode", 1, REFUSED),
+    ("dynamixel2", "homing_offset", 100, REFUSED),
+    ("dynamixel2", "min_position_limit", 2000, REFUSED),
+    ("dynamixel2", "operating_mode", 1, SET),
+    ("dynamixel2", "shutdown", 0, WARNED),
+    ("dynamixel1", "cw_angle_limit", 500, REFUSED),
+    ("dynamixel1", "ccw_angle_limit", 0, SET),  # wheel mode
+    ("dynamixel1", "shutdown", 0, WARNED),
+    ("dynamixel1-mx", "multi_turn_offset", -100, REFUSED),
+    ("dynamixel1-mx", "cw_angle_limit", 2000, REFUSED),
+    ("dynamixel1-mx", "ccw_angle_limit", 0, SET),
+    ("dynamixel1-mx", "shutdown", 0, WARNED),
+    ("sts", "phase", 13, REFUSED),
+    ("sts", "homing_offset", -100, REFUSED),
+    ("sts", "max_position_limit", 2100, REFUSED),
+    ("sts", "operating_mode", 1, SET),
+    ("sts", "unloading_condition", 0, WARNED),
+    ("scs", "phase", 1, REFUSED),
+    ("scs", "max_position_limit", 520, REFUSED),
+    ("scs", "unloading_condition", 0, WARNED),
+]
+
+
+def stored_rig(name, stored, joints=None):
+    """The family's bus, with `stored` in the servos of all joints, or of those at `joints`."""
+    family = FAMILIES[name]
+    there = [
+        replace(servo, start_ticks=family.table.center_ticks, registers=stored if joints is None or i in joints else {})
+        for i, servo in enumerate(family.plugged())
+    ]
+    port = EmulatedPort(device_of(*there), family.baud, name="wire")
+    return BusRig(port, family.build(lambda: port, 0.003))
+
+
+@pytest.mark.parametrize(("name", "register", "value", "outcome"), STORED)
+def test_what_servos_have_stored_is_refused_set_or_one_warning(name, register, value, outcome):
+    rig = stored_rig(name, {register: value})
+    if outcome is REFUSED:
+        refusal = rf"^wire: servo 1 \(joint1\): {register} is {value}, wanted .* doctor --port"
+        with pytest.raises(ServoError, match=refusal):
+            rig.bus.connect()
+        assert ServoError.exit_code == 4 and rig.torques() == [0] * 4
+    else:
+        rig.hold()
+        (*warned,) = rig.bus.statistics()["stored_warnings"]
+        assert [each.partition(" is ")[0] for each in warned] == (
+            [f"joint1, joint2, joint3, joint4: {register}"] if outcome is WARNED else []
+        )
+    assert (rig.register(1, register) != value) == (outcome is SET)
+
+
+@pytest.mark.parametrize("name", ["maestro", "ssc32"])
+def test_a_board_stores_nothing_that_a_start_could_compare(name):
+    assert not FAMILIES[name].table.fields
+    assert FAMILIES[name].build(lambda: None, 0.003).statistics()["stored_warnings"] == []
+
+
+def gone_and_back(name, register, value):
+    """A rig in whose run servo 2 went away, got a value stored, and came back."""
+    rig = stored_rig(name, {})
+    held = rig.hold()
+
+    def ticks(n):
+        for _ in range(n):
+            rig.clock.t += 0.02
+            rig.bus.write(held, rig.clock.t)
+            rig.bus.poll(rig.clock.t)
+
+    ticks(3)
+    rig.kill(2)
+    ticks(30)
+    rig.set(2, "torque_enable", 0)
+    if "lock" in rig.servo(2).table.fields:
+        rig.set(2, "lock", 0)
+    rig.set(2, register, value)
+    rig.revive(2)
+    ticks(600)
+    assert rig.register(2, register) == value
+    return rig
+
+
+@pytest.mark.parametrize(("name", "register", "value"), [row[:3] for row in STORED if row[3] is REFUSED])
+def test_a_servo_that_comes_back_with_what_would_be_refused_stays_off_and_is_named(name, register, value):
+    rig = gone_and_back(name, register, value)
+    assert rig.torques() == [1, 0, 1, 1] and "left alone" in rig.bus.poll(rig.clock.t)["joint2"].fault
+    (named,) = (each for each in rig.bus.statistics()["faults"] if f"{register} is {value}" in each)
+    assert named.startswith("joint2: wire: servo 2 (joint2): ")
+
+
+@pytest.mark.parametrize(("name", "register", "value"), [row[:3] for row in STORED if row[3] is WARNED])
+def test_a_servo_that_comes_back_with_less_protection_is_one_more_warning(name, register, value, caplog):
+    rig = gone_and_back(name, register, value)
+    (warned,) = rig.bus.statistics()["stored_warnings"]
+    assert rig.torques() == [1] * 4 and warned.startswith(f"joint2: {register} is {value}")
+    assert sum(f"comes back, and {register} is {value}" in each.getMessage() for each in caplog.records) == 1
