@@ -5,7 +5,7 @@
     listening       somebody is there
     speaking        the robot's own voice is being played
     degraded        it goes on without something: `why` says what
-    halted          emergency stop, latched: `why` says who asked; ends when a person releases it
+    halted          emergency stop, latched: `why` names every cause; ends when none is left
     stopping        it comes to rest
     stopped, fault  torque is off: as asked, or by an error that `why` names
 
@@ -40,7 +40,7 @@ class RunState:
     """A state and since when [s, loop time].
 
     Attributes:
-        why: what is lost, who halted, or the error; empty where nothing is to be said.
+        why: what is lost, what halts it, or the error; empty where nothing is to be said.
         doing: what it would be doing if nothing were lost.
     """
 
@@ -63,7 +63,7 @@ class Situation:
         person: somebody is there.
         speaking: the robot's own voice is being played.
         lost: sources, "listener" and joints that the run goes on without.
-        halted: who asked for an emergency stop, while it is latched.
+        halted: causes of an emergency stop, while it is latched.
         ending: the run is on its way to rest.
     """
 
@@ -71,7 +71,7 @@ class Situation:
     person: bool = False
     speaking: bool = False
     lost: tuple[str, ...] = ()
-    halted: str | None = None
+    halted: tuple[str, ...] = ()
     ending: bool = False
 
 
@@ -89,8 +89,8 @@ def following(state: RunState, now: Situation, now_s: float) -> RunState:
 def _name(state: RunState, now: Situation, doing: Activity) -> tuple[StateName, tuple[str, ...]]:
     if now.ending or state.name == "stopping":
         return "stopping", ()
-    if now.halted is not None:
-        return "halted", (now.halted,)
+    if now.halted:
+        return "halted", now.halted
     if state.name == "halted" or (state.name == "starting" and not now.eased_in):
         return "starting", ()
     return ("degraded", now.lost) if now.lost else (doing, ())

@@ -148,7 +148,7 @@ def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_i
     def does(latch: HaltLatch) -> dict[int, Callable[[], None]]:
         def look() -> None:
             seen.update({joint: torque(chain, joint) for joint in JOINTS})
-            latch.open()
+            latch.resume("device")
 
         return {halted: lambda: latch.close("key"), late: look}
 
@@ -173,13 +173,13 @@ def test_a_head_that_is_halted_at_the_end_moves_no_more(chain):
 
 
 def test_a_halt_that_is_released_at_once_is_ended_when_the_head_stands(chain):
-    ran = run(chain, lambda latch: {150: lambda: latch.close("key"), 151: latch.open}, seconds=4.0)
+    ran = run(chain, lambda latch: {150: lambda: latch.close("key"), 151: lambda: latch.resume("device")}, seconds=4.0)
     assert ran.states == ["starting", "listening", "halted", "starting", "listening", "stopping"]
     assert ran.log.audited.violations == 0
 
 
 def test_a_halt_while_joints_ease_in_and_one_before_the_first_tick(chain):
-    ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: latch.open}, seconds=4.0)
+    ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: lambda: latch.resume("device")}, seconds=4.0)
     assert ran.states == ["starting", "halted", "starting", "listening", "stopping"]
     assert ran.log.audited.violations == 0
 
