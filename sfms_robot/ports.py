@@ -290,8 +290,8 @@ class Tick:
         motion: (58,) the face asked for at this instant, without lead.
         goals_rad: (J,) what was written.
         readings: freshest reading per joint.
-        state, why: of the run, see docs/safety.md; `why` names what is lost, or who halted.
-        written_s: loop time at which the goals were on the wire; None where nobody looked.
+        state, why: of the run, see docs/safety.md; `why` names what is lost, or what halts it.
+        written_s: loop time at which the goals were on the wire; None where it was not measured.
     """
 
     time_s: float

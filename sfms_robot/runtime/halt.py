@@ -1,4 +1,4 @@
-"""Emergency stop: one latch that holds a set of causes and opens when none is left.
+"""Emergency stop: one latch that holds a set of causes and opens when all are cleared.
 
     close      from its next tick on the loop brakes every joint as fast as its limits allow, then holds or releases it
     resume     clears the causes that its door may clear; refused while a switch is still on
@@ -63,7 +63,7 @@ class HaltLatch:
             self._note()
 
     def resume(self, door: Door) -> None:
-        """Clear the causes that `door` may clear (the device: all); the head goes on when none is left.
+        """Clear the causes that `door` may clear (the device: all); the halt ends when no cause is left.
 
         Raises HaltedError, in one line that names the causes: with nothing cleared while a switch is still on or torque
         is being taken off; else for those that are left.

@@ -1,4 +1,4 @@
-"""What closes the halt latch from outside the program: a signal, a file that appears, or a line of a GPIO chip.
+"""Switches outside the program that close the halt latch: a signal, a file that appears, a line of a GPIO chip.
 
 A button of a GPIO line is wired to ground: the line's own pull-up holds it high, and pressing it closes the latch. With
 `active-high` a line that rises does. Linux only: the chip is `/dev/gpiochipN`, by its character device (kernel 5.10 and
@@ -87,7 +87,7 @@ def _on_signal(number: int, act: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
-    """`--halt-on FILE` or `--halt-on /dev/gpiochipN:LINE[,active-high]`: closes the latch while inside.
+    """Close the latch by `--halt-on FILE` or `--halt-on /dev/gpiochipN:LINE[,active-high]`, while inside.
 
     A thread waits for it. Raises ConfigError for what cannot be watched, and for a switch that is on already.
     """
@@ -108,7 +108,7 @@ def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
 
 
 def _is_there(path: Path) -> bool:
-    """Whether there is such a file; one in a folder that cannot be looked into counts."""
+    """Return whether the file exists; a folder that cannot be read counts."""
     try:
         path.stat()
     except FileNotFoundError:
@@ -132,9 +132,9 @@ def watching_line(line: Line, name: str, latch: HaltLatch) -> Iterator[None]:
 def _watching(
     name: str, latch: HaltLatch, active: Callable[[], bool], pressed: Callable[[], bool], fd: int | None = None
 ) -> Iterator[None]:
-    """Close the latch each time `pressed` says so, in a thread: asked when `fd` has something, or periodically.
+    """Close the latch from a thread each time `pressed` says so: read when `fd` has an event, or periodically.
 
-    `active` is asked before every resume. A switch that cannot be read closes the latch, and nothing opens it again.
+    `active` is read before every resume. A switch that cannot be read closes the latch, and nothing opens it again.
     """
     ours, theirs = os.pipe()  # readable once it is over
     watched, period_s = ([ours], FILE_PERIOD_S) if fd is None else ([ours, fd], None)
@@ -199,7 +199,7 @@ def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None
     try:
         with open(chip, "rb", buffering=0) as file:
             if not stat.S_ISCHR(os.fstat(file.fileno()).st_mode):
-                raise ConfigError(f"{name}: {chip} is no character device (/dev/gpiochipN)")
+                raise ConfigError(f"{name}: {chip} expected a character device (/dev/gpiochipN), got another file")
             ioctl(file.fileno(), _GET_LINE, request)
     except OSError as error:
         raise ConfigError(f"{name}: {error.strerror or error}") from error

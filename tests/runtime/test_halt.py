@@ -398,5 +398,5 @@ def test_a_button_that_is_pressed_already_or_cannot_be_read_is_refused(broken: b
 
 def test_a_file_that_is_no_chip_is_refused(tmp_path: Path) -> None:
     (tmp_path / "chip").touch()
-    with pytest.raises(ConfigError, match="no character device"):
+    with pytest.raises(ConfigError, match="expected a character device"):
         open_line(str(tmp_path / "chip"), 17, ioctl=Chip().ioctl)

@@ -1,4 +1,4 @@
-"""One servo of a chain: what state it is in, why, and what is asked of it next. Opens no port.
+"""One servo of a chain: its state, the reason for it, and its next request. Opens no port.
 
     off        no torque is wanted: before `enable`, after `stop`
     online     has torque and gets goals
@@ -6,14 +6,14 @@
     faulty     keeps its torque where it stands and gets no goals: policy "hold"
     limp       torque off is wanted; written in every poll until the servo says that it is off
     silent     does not answer; gets no goals
-    returning  is started up anew: identity, settings, goal := present, torque
+    returning  is started up again: identity, settings, goal := present, torque
     rebooting  the same after a reboot
     rejoining  holds where it stands, and waits for goals that begin there
     given up   failed too often: as limp, until it is enabled or called back
     released   the same because it was asked for: no fault
 
 The diagram and a table of all arrows are in docs/safety.md. A goal is sent to members that are online or reduced and
-have been seen with torque, and to nobody else. So a servo that was away moves only from where it stands.
+have been seen with torque, and to no others. So a servo that was away moves only from where it stands.
 Times are those of the port's clock, in seconds.
 """
 
@@ -96,7 +96,7 @@ class Member:
         state: see the module.
         liveness: whether it answers.
         identified: it has been checked against the head's file.
-        torque_seen: what it last said; None where nobody knows.
+        torque_seen: what it last said; None where it is not known.
         job: its way back, in steps of one exchange, and when the next is due.
         rejoined: it came to hold a position in this poll.
         recalled: it was called back and had not been away.
@@ -205,7 +205,7 @@ class Member:
             self.state = State.RELEASED
 
     def called_back(self, now_s: float) -> None:
-        """Bring it back as if it had been away, unless it goes on or comes already; faults it has count as known."""
+        """Bring it back as if it had been away, unless it is driven or on its way; its faults count as known."""
         if self.state in _DRIVEN | _COMING | {State.REJOINING, State.SILENT}:
             return
         self._attempts_s.clear()
