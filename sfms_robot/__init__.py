@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sfms_robot.errors import (
         BusError,
         ConfigError,
+        HaltedError,
         InputError,
         MissingExtra,
         ModelError,
@@ -42,6 +43,7 @@ __all__ = [
     "BusError",
     "ConfigError",
     "FaceFrame",
+    "HaltedError",
     "Head",
     "InputError",
     "Listener",
@@ -73,8 +75,8 @@ _NAMES: Final = {
     "app.api.servos": ("Servos", "open_bus"),
     "config": ("Head", "load_head"),
     "errors": (
-        "BusError", "ConfigError", "InputError", "MissingExtra", "ModelError", "PacketError", "PortError",
-        "RobotError", "ServoError",
+        "BusError", "ConfigError", "HaltedError", "InputError", "MissingExtra", "ModelError", "PacketError",
+        "PortError", "RobotError", "ServoError",
     ),
     "frames": ("BLENDSHAPES", "CHANNELS", "FaceFrame", "ListenerEvent", "Plan", "Reading", "SpeakerFrame"),
     "ports": ("Listener", "Source"),

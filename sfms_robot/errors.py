@@ -4,11 +4,12 @@ RobotError                      base; `exit_code` is what the command line retur
 +-- ConfigError          (2)    a file, a flag or a value in it is wrong; names file, key, value, choices
 |   +-- MissingExtra     (2)    a feature needs a package that is not installed; names the pip install
 |   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
-+-- PortError            (3)    a port cannot be opened, or is held by somebody else
++-- PortError            (3)    a port cannot be opened, or another program holds it
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
 +-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
-+-- PacketError          (4)    bytes that are no packet (codecs raise it, buses count it)
++-- PacketError          (4)    bytes that are not a packet (codecs raise it, buses count it)
 +-- ModelError           (5)    weights or model files are missing, corrupt or of another shape
++-- HaltedError          (1)    an emergency stop cannot be ended now, or not from here; names what keeps it
 +-- GroupError           (1)    a process that trains with this one is gone
 """
 
@@ -87,6 +88,10 @@ class ModelError(RobotError):
     """Weights or a model's files are missing, corrupt, or belong to another configuration."""
 
     exit_code = 5
+
+
+class HaltedError(RobotError):
+    """An emergency stop that cannot be ended: a cause is still active, or is to be cleared elsewhere."""
 
 
 class GroupError(RobotError):

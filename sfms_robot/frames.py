@@ -253,8 +253,8 @@ class Reading:
         age_s: age of the position; inf when there is none.
         fault: named fault or None.
         extra: what else the family tells, unit in the key (`current_mA`, `velocity_rad_s`, `voltage_V`).
-        rejoined: true once, when the servo was away and holds this position now; its goals are left out until they
-            begin there, so ease in from it.
+        rejoined: true once, when the servo was away and holds this position now, or the newest goal where it has no
+            position to tell; its goals are left out until they begin there, so ease in from it.
     """
 
     position_rad: float | None

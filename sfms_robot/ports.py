@@ -234,15 +234,22 @@ class Bus(Protocol):
         """Send torque-off now, unconfirmed: one packet per wire, to this head's ids alone; pulses off on boards.
 
         May be called from any thread at any time after `connect`, also while another one is inside `poll`. Never
-        raises, never waits for an answer. No goal is sent from then on, until `enable`. With the policy "hold" nothing
-        happens.
+        raises, never waits for an answer. No goal is sent from then on, until `enable` or `resume`. With the policy
+        "hold" nothing happens.
         """
 
     def release(self, joints: Sequence[str]) -> None:
-        """Torque off for `joints` alone: their goals are withheld, until `enable`; the others go on.
+        """Torque off for `joints` alone: their goals are withheld, until `resume` or `enable`; the others go on.
 
         Written at once in one packet per wire, and again in every poll until each servo says that it is off. Never
         waits for an answer; raises nothing. Called by who calls `write`.
+        """
+
+    def resume(self, joints: Sequence[str]) -> None:
+        """Bring back those of `joints` that have no torque, after `release`, `torque_off` or a fault; the others go on.
+
+        Only asked for here: the polls do it, a few joints in each, as with a servo that was away; its reading says
+        `rejoined`. Never waits; raises nothing. Called by the caller of `write`.
         """
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
@@ -283,8 +290,8 @@ class Tick:
         motion: (58,) the face asked for at this instant, without lead.
         goals_rad: (J,) what was written.
         readings: freshest reading per joint.
-        state, why: of the run, see docs/safety.md; `why` names what is lost, or who halted.
-        written_s: loop time at which the goals were on the wire; None where nobody looked.
+        state, why: of the run, see docs/safety.md; `why` names what is lost, or what halts it.
+        written_s: loop time at which the goals were on the wire; None where it was not measured.
     """
 
     time_s: float

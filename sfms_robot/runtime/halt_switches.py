@@ -1,12 +1,15 @@
-"""What closes the halt latch from outside the program: a signal, a file that appears, or a line of a GPIO chip.
+"""Switches outside the program that close the halt latch: a signal, a file that appears, a line of a GPIO chip.
 
 A button of a GPIO line is wired to ground: the line's own pull-up holds it high, and pressing it closes the latch. With
 `active-high` a line that rises does. Linux only: the chip is `/dev/gpiochipN`, by its character device (kernel 5.10 and
 later; structures of <linux/gpio.h>, version 2).
+
+A file or line that is on keeps the latch closed. One that cannot be looked at counts as on.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import select
@@ -18,48 +21,73 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, Final
 
-from sfms_robot.errors import ConfigError
-from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.errors import ConfigError, HaltedError
+from sfms_robot.runtime.halt import JOIN_S, HaltLatch
 
 FILE_PERIOD_S: Final = 0.05
 
 _GET_LINE: Final = 0xC250B407  # _IOWR(0xB4, 0x07, struct gpio_v2_line_request)
 _GET_VALUES: Final = 0xC010B40E  # _IOWR(0xB4, 0x0E, struct gpio_v2_line_values)
-_ACTIVE_LOW, _INPUT, _RISING, _PULL_UP = 1 << 1, 1 << 2, 1 << 4, 1 << 8
+_ACTIVE_LOW, _INPUT, _EDGES, _PULL_UP = 1 << 1, 1 << 2, 3 << 4, 1 << 8  # edges: rising and falling
 # offsets[64], consumer[32], config {flags, num_attrs, padding[5], attrs[10]}, num_lines, buffer size, padding[5], fd
 _REQUEST: Final = struct.Struct("=I252x 32s Q260x4x I4x20x i")
 _VALUES: Final = struct.Struct("=QQ")  # bits, mask
-_EVENT_BYTES: Final = 48  # struct gpio_v2_line_event
+_EVENT: Final = struct.Struct("=QI36x")  # time stamp, 1: became active, 2: became inactive
 _LINE: Final = re.compile(r"(?P<chip>/dev/gpiochip\d+):(?P<line>\d+)(?P<high>,active-high)?")
 
 Ioctl = Callable[[int, int, bytearray], Any]
 
+log = logging.getLogger(__name__)
+
 
 @contextmanager
 def halt_signals(latch: HaltLatch) -> Iterator[None]:
-    """SIGUSR1 closes the latch while inside, SIGUSR2 opens it. Main thread only; nothing where there are no such."""
+    """Close the latch on SIGUSR1 and resume on SIGUSR2, while inside. Main thread only; nothing where there are none.
+
+    The handlers only wake a thread each, so that neither a lock nor a log that is held up stops the main thread.
+    """
     if not hasattr(signal, "SIGUSR1"):
         yield
         return
-    before = [
-        (number, signal.signal(number, handler))
-        for number, handler in (
-            (signal.SIGUSR1, lambda *_: latch.close("signal")),
-            (signal.SIGUSR2, lambda *_: latch.open()),
-        )
-    ]
+    with (
+        _on_signal(signal.SIGUSR1, lambda: latch.close("signal")),
+        _on_signal(signal.SIGUSR2, partial(resume_here, latch)),
+    ):
+        yield
+
+
+def resume_here(latch: HaltLatch) -> None:
+    """Resume at the device; log a refusal."""
+    try:
+        latch.resume("device")
+    except HaltedError as refusal:
+        log.warning("%s", refusal)
+
+
+@contextmanager
+def _on_signal(number: int, act: Callable[[], None]) -> Iterator[None]:
+    """Call `act` in a thread for every signal, while inside."""
+    came: SimpleQueue[bool] = SimpleQueue()  # a handler may put into it whatever it interrupts
+
+    def work() -> None:
+        while came.get():
+            act()
+
+    threading.Thread(target=work, name="halt signal", daemon=True).start()
+    before = signal.signal(number, lambda *_: came.put(True))
     try:
         yield
     finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+        signal.signal(number, before)
+        came.put(False)
 
 
 @contextmanager
 def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
-    """`--halt-on FILE` or `--halt-on /dev/gpiochipN:LINE[,active-high]`: closes the latch while inside.
+    """Close the latch by `--halt-on FILE` or `--halt-on /dev/gpiochipN:LINE[,active-high]`, while inside.
 
     A thread waits for it. Raises ConfigError for what cannot be watched, and for a switch that is on already.
     """
@@ -70,57 +98,94 @@ def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
         path = Path(where)
         if not path.parent.is_dir():
             raise ConfigError(f"--halt-on {where}: no such folder (FILE, or /dev/gpiochipN:LINE[,active-high])")
-        if path.exists():
-            raise ConfigError(f"--halt-on {where}: is there already: the head would be halted at once (remove it)")
-        with _watching(partial(_wait_for_file, path), where, latch):
+        is_there = partial(_is_there, path)
+        if is_there():
+            raise ConfigError(
+                f"--halt-on {where}: is there already, or its folder cannot be read: the head would be halted"
+            )
+        with _watching(where, latch, is_there, is_there):
             yield
 
 
-@contextmanager
-def watching_line(line: int, name: str, latch: HaltLatch) -> Iterator[None]:
-    """A line that `open_line` gave closes the latch while inside, and is closed itself at the end."""
+def _is_there(path: Path) -> bool:
+    """Return whether the file exists; a folder that cannot be read counts."""
     try:
-        with _watching(partial(_wait_for_line, line), name, latch):
+        path.stat()
+    except FileNotFoundError:
+        return not path.parent.is_dir()
+    except OSError:
+        pass
+    return True
+
+
+@contextmanager
+def watching_line(line: Line, name: str, latch: HaltLatch) -> Iterator[None]:
+    """Close the latch when `line` becomes active, while inside; give the line back at the end."""
+    try:
+        with _watching(name, latch, line.active, line.pressed, line.fd):
             yield
     finally:
-        os.close(line)
+        os.close(line.fd)
 
 
 @contextmanager
-def _watching(wait: Callable[[int], bool], name: str, latch: HaltLatch) -> Iterator[None]:
-    """`wait(over)` in a thread, again and again; each time it says True the latch closes."""
+def _watching(
+    name: str, latch: HaltLatch, active: Callable[[], bool], pressed: Callable[[], bool], fd: int | None = None
+) -> Iterator[None]:
+    """Close the latch from a thread each time `pressed` says so: read when `fd` has an event, or periodically.
+
+    `active` is read before every resume. A switch that cannot be read closes the latch, and nothing opens it again.
+    """
     ours, theirs = os.pipe()  # readable once it is over
+    watched, period_s = ([ours], FILE_PERIOD_S) if fd is None else ([ours, fd], None)
 
     def work() -> None:
-        while wait(ours):
+        try:
+            while ours not in select.select(watched, [], [], period_s)[0]:
+                if pressed():
+                    latch.close(name)
+        except OSError as error:
+            latch.switches[name] = lambda: True
             latch.close(name)
+            log.error("--halt-on %s: cannot be read: %s; end the run and look at the switch", name, error)
 
+    latch.switches[name] = active
     thread = threading.Thread(target=work, name="halt switch", daemon=True)
     thread.start()
     try:
         yield
     finally:
         os.close(theirs)
-        thread.join()
+        thread.join(JOIN_S)
         os.close(ours)
+        del latch.switches[name]
 
 
-def _wait_for_file(path: Path, over: int) -> bool:
-    """Until the file appears (True), or it is over. One that stays counts again and again, which a latch ignores."""
-    while not select.select([over], [], [], FILE_PERIOD_S)[0]:
-        if path.exists():
+class Line:
+    """A line of a GPIO chip as input, by its file descriptor, which has an event to read at each edge."""
+
+    def __init__(self, fd: int, ioctl: Ioctl) -> None:
+        self.fd, self._ioctl = fd, ioctl
+
+    def active(self) -> bool:
+        """Read its level; a line that cannot be read counts as active."""
+        values = bytearray(_VALUES.pack(0, 1))
+        try:
+            self._ioctl(self.fd, _GET_VALUES, values)
+        except OSError:
             return True
-    return False
+        return bool(_VALUES.unpack(values)[0] & 1)
+
+    def pressed(self) -> bool:
+        """Read one edge and the level: whether it became active, however shortly, or is. Raises OSError."""
+        event = os.read(self.fd, _EVENT.size)
+        if len(event) != _EVENT.size:
+            raise OSError("the line has no events any more")
+        return _EVENT.unpack(event)[1] == 1 or self.active()
 
 
-def _wait_for_line(line: int, over: int) -> bool:
-    """Until the line becomes active (True), or it is over."""
-    ready, _, _ = select.select([line, over], [], [])
-    return over not in ready and len(os.read(line, _EVENT_BYTES)) == _EVENT_BYTES
-
-
-def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None = None) -> int:
-    """A line of a chip as input with its pull-up, whose file descriptor tells each time it becomes active.
+def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None = None) -> Line:
+    """Return a line of a chip as input with its pull-up.
 
     Raises ConfigError for a chip or line that cannot be used, and for a line that is active already.
     """
@@ -129,19 +194,17 @@ def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None
 
         ioctl = fcntl.ioctl
     name = f"--halt-on {chip}:{line}"
-    flags = _INPUT | _RISING | (_ACTIVE_LOW | _PULL_UP if active_low else 0)
+    flags = _INPUT | _EDGES | (_ACTIVE_LOW | _PULL_UP if active_low else 0)
     request = bytearray(_REQUEST.pack(line, b"sfms-robot halt", flags, 1, 0))
-    values = bytearray(_VALUES.pack(0, 1))
     try:
         with open(chip, "rb", buffering=0) as file:
             if not stat.S_ISCHR(os.fstat(file.fileno()).st_mode):
-                raise ConfigError(f"{name}: {chip} is no character device (/dev/gpiochipN)")
+                raise ConfigError(f"{name}: {chip} expected a character device (/dev/gpiochipN), got another file")
             ioctl(file.fileno(), _GET_LINE, request)
-        fd = int(_REQUEST.unpack(request)[-1])
-        ioctl(fd, _GET_VALUES, values)
     except OSError as error:
         raise ConfigError(f"{name}: {error.strerror or error}") from error
-    if _VALUES.unpack(values)[0] & 1:
-        os.close(fd)
-        raise ConfigError(f"{name}: is active already: the head would be halted at once")
-    return fd
+    opened = Line(int(_REQUEST.unpack(request)[-1]), ioctl)
+    if opened.active():
+        os.close(opened.fd)
+        raise ConfigError(f"{name}: is active already, or cannot be read: the head would be halted at once")
+    return opened

@@ -155,10 +155,12 @@ class RunLog:
             self._speech_s.append(frame.time_s)
 
     def entered(self, state: RunState, now_s: float) -> None:
-        """The run's state, or what is said of it, is this one from `now_s` on."""
+        """Note the run's state, or what is said of it, from `now_s` on."""
         if self.states:
             since_s, before = self.states[-1]
             self.state_s[before.name] = self.state_s.get(before.name, 0.0) + now_s - since_s
+            if before.name == "halted" and state.name == "starting":
+                logger.warning("halt released")
         self.states.append((now_s, state))
         level = logging.WARNING if state.why else logging.INFO
         logger.log(level, "%s%s", state.name, f": {', '.join(state.why)}" if state.why else "")

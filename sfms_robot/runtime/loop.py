@@ -95,7 +95,8 @@ class State:
         goals_rad: (J,) the last command; `motion` (58,) the face behind it.
         run: the state of the run; `presence` and `lost_joints` are what it is judged by.
         answer: how much of the listener's answer shows.
-        released: the halt has let go of the joints that it does not hold.
+        released: (J,) joints that a halt has let go of and that have not come back; their goals stand still.
+        stands: it is halted, and has let go of all that it does not hold.
     """
 
     timeline: Any
@@ -108,11 +109,12 @@ class State:
     life: Any
     retargeter: Any
     heat: Heat
+    released: NDArray[np.bool_]
     presence: Presence = field(default_factory=Presence.start)
     run: RunState = RunState()
     lost_joints: tuple[str, ...] = ()
     answer: Fade = Fade()
-    released: bool = False
+    stands: bool = False
     motion: Floats = field(default_factory=lambda: np.zeros(MOTION_DIM, np.float32))
 
 
@@ -147,10 +149,10 @@ def drive(
                 state = _heard(parts, observers, log, tick.time_s, state)
                 state = _judged(parts, log, tick.time_s, state)
                 if state.run.name == "halted":
-                    state, command = _halted(parts, state)
+                    state, command = _halted(parts, tick.time_s, state)
                 else:
-                    if state.released:
-                        state = _resumed(parts, log, clock.now_s() - start_s, state)
+                    if state.stands:
+                        state = _resumed(parts, log, tick.time_s, state)
                     state, command = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
                 log.commanded(tick, command.goals_rad, command.asked_rad, command.motion)
                 parts.bus.write(command.goals_rad, tick.time_s)
@@ -168,7 +170,7 @@ def drive(
                 )  # fmt: skip
         finally:
             state = _ending(log, clock.now_s() - start_s, state)
-            if parts.halt.by is None:  # a head that was halted moves no more
+            if not parts.halt.causes:  # a head that was halted moves no more
                 way = tick_times(clock, rate_hz, start_s)
                 seen = partial(_seen_on_the_way, observers, state)
                 come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log, seen)
@@ -189,6 +191,7 @@ def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> Stat
     return State(
         parts.timeline.start(), parts.limiter.start(held_rad), held_rad, 0 * held_rad, held_rad, held_rad, held_rad,
         parts.life.start() if parts.life else None, parts.retargeter.start(), Heat.cool(len(held_rad)),
+        np.zeros(len(held_rad), np.bool_),
     )  # fmt: skip
 
 
@@ -212,21 +215,21 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
 
 
 def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
-    """What the run is doing, from here on."""
+    """Return the state with what the run is doing from here on."""
     presence = state.presence
     lost = (*parts.source.missing, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
     eased_in = bool(now_s - state.since_s.max() >= EASE_S)
-    halted = parts.halt.by
-    if halted is None and state.run.name == "halted" and not state.released:
-        (halted,) = state.run.why  # it is released when it stands, not before
+    halted, released = parts.halt.causes, state.released
+    if not halted and state.run.name == "halted" and not state.stands:
+        halted = state.run.why  # it ends when the head stands, not before
     run = following(
         state.run, Situation(eased_in, presence.person(now_s), presence.speaking(now_s), lost, halted), now_s
     )
-    if run.name == "halted":
-        parts.halt.answer()
+    if run.name == "halted" and parts.halt.answer():  # torque went off meanwhile
+        released = np.ones_like(released)
     if (run.name, run.why) != (state.run.name, state.run.why) or not log.states:
         log.entered(run, now_s)
-    return replace(state, run=run)
+    return replace(state, run=run, released=released)
 
 
 def _ending(log: RunLog, now_s: float, state: State) -> State:
@@ -282,6 +285,8 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     if not state.heat.none:
         angles_rad = parts.rest_rad + state.heat.share * (angles_rad - parts.rest_rad)
     eased = ease((now_s + period_s - state.since_s) / EASE_S)
+    if state.released.any():
+        eased = np.where(state.released, 0.0, eased)
     ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)
@@ -292,36 +297,42 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
     return state, Command(goals_rad, reference[0], motion[0], float(times_s.max()))
 
 
-def _halted(parts: Parts, state: State) -> tuple[State, Command]:
+def _halted(parts: Parts, now_s: float, state: State) -> tuple[State, Command]:
     """Brake; once all joints stand, let go of those that need not hold themselves."""
     goals_rad, limiter = parts.limiter.brake(state.limiter)
-    released = state.released
-    if not released and np.array_equal(goals_rad, state.goals_rad):
-        held = np.zeros(len(goals_rad), np.bool_) if parts.holds is None else parts.holds
-        parts.bus.release([joint for joint, holds in zip(parts.retargeter.joints, held, strict=True) if not holds])
-        released = True
+    released, stands = state.released, state.stands
+    if state.run.since_s == now_s and released.any():  # on their way back from a halt before: not now
+        _let_go(parts, released)
+    if not stands and np.array_equal(goals_rad, state.goals_rad):
+        stands, released = True, np.ones_like(released) if parts.holds is None else released | ~parts.holds
+        _let_go(parts, released)
     command = Command(goals_rad, goals_rad, np.zeros(MOTION_DIM, np.float32), -math.inf)
-    return replace(state, limiter=limiter, goals_rad=goals_rad, released=released), command
+    return replace(state, limiter=limiter, goals_rad=goals_rad, released=released, stands=stands), command
+
+
+def _let_go(parts: Parts, which: NDArray[np.bool_]) -> None:
+    parts.bus.release([joint for joint, each in zip(parts.retargeter.joints, which, strict=True) if each])
 
 
 def _resumed(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
-    """A person has released the halt: torque comes on again, and every joint eases in from where it stands."""
-    stands_rad = parts.bus.enable(parts.retargeter.joints)
-    return replace(
-        _eased_in_from(parts, log, stands_rad, np.ones(len(stands_rad), np.bool_), state, now_s), released=False
-    )
+    """End a halt: held joints ease in from where they stand now, the others from where they come back."""
+    parts.bus.resume(parts.retargeter.joints)
+    every = np.ones_like(state.released)
+    back = state.released & [joint not in parts.ignored for joint in parts.retargeter.joints]
+    return replace(_eased_in_from(parts, log, state.goals_rad, every, state, now_s), released=back, stands=False)
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: State, now_s: float) -> State:
-    """Joints that were away ease in again from where they stand, as all did when torque came on."""
+    """Ease joints that were away in again from where they stand, as all did when torque came on."""
     joints = parts.retargeter.joints
     back = np.array([joint in readings and readings[joint].rejoined for joint in joints])
     if not back.any():
         return state
-    stands_rad = np.array(
-        [readings[joint].position_rad if there else 0.0 for joint, there in zip(joints, back, strict=True)]
-    )
-    return _eased_in_from(parts, log, stands_rad, back, state, now_s)
+    stands_rad = state.goals_rad.copy()  # of a servo that cannot tell its position, too
+    for index in np.flatnonzero(back).tolist():
+        position_rad = readings[joints[index]].position_rad
+        stands_rad[index] = stands_rad[index] if position_rad is None else position_rad
+    return replace(_eased_in_from(parts, log, stands_rad, back, state, now_s), released=state.released & ~back)
 
 
 def _eased_in_from(
@@ -341,7 +352,7 @@ def _eased_in_from(
 
 
 def _noticed(parts: Parts, readings: Mapping[str, Reading], state: State, now_s: float, period_s: float) -> State:
-    """What the servos tell: who is away or faulty, who is warm; and a pinch while halted lets go at once."""
+    """Take what the servos say: which are away, faulty or warm; a pinch while halted lets go of all at once."""
     heat = state.heat
     if parts.heat:
         if _due(now_s, period_s, WARMTH_S):
@@ -351,8 +362,9 @@ def _noticed(parts: Parts, readings: Mapping[str, Reading], state: State, now_s:
         return replace(state, heat=heat) if heat is not state.heat else state
     lost = tuple(joint for joint, reading in readings.items() if joint not in parts.ignored and _is_lost(reading))
     if state.run.name == "halted" and any((readings[joint].fault or "").startswith(PINCH) for joint in lost):
-        parts.bus.release(parts.retargeter.joints)
-        state = replace(state, released=True)
+        every = np.ones_like(state.released)
+        _let_go(parts, every)
+        state = replace(state, released=every, stands=True)
     return replace(state, heat=heat, lost_joints=lost)
 
 

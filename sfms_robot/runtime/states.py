@@ -1,15 +1,15 @@
-"""What a run is doing, in one word that is true: the states of a run and the arrows between them.
+"""The states of a run and the arrows between them.
 
     starting        torque comes on, joints ease in
-    idle            nobody is there: the head lives, and answers nothing
-    listening       somebody is there
+    idle            no person is there: the head moves a little, and answers nothing
+    listening       a person is there
     speaking        the robot's own voice is being played
-    degraded        it goes on without something: `why` says what
-    halted          emergency stop, latched: `why` says who asked; ends when a person releases it
+    degraded        it continues without something: `why` names it
+    halted          emergency stop, latched: `why` names every cause; ends when none is left
     stopping        it comes to rest
     stopped, fault  torque is off: as asked, or by an error that `why` names
 
-One state after the other is a value (`RunState`); what there is to know about an instant is another (`Situation`).
+One state after the other is a value (`RunState`); the facts of an instant are another (`Situation`).
 The table of every arrow, its cause and its longest time is in docs/safety.md; `ARROWS` is the same table, and no other
 arrow is ever taken.
 """
@@ -40,7 +40,7 @@ class RunState:
     """A state and since when [s, loop time].
 
     Attributes:
-        why: what is lost, who halted, or the error; empty where nothing is to be said.
+        why: what is lost, what halts it, or the error; empty where nothing is to be said.
         doing: what it would be doing if nothing were lost.
     """
 
@@ -56,14 +56,14 @@ class RunState:
 
 @dataclass(frozen=True)
 class Situation:
-    """What is known at an instant.
+    """The facts of an instant.
 
     Attributes:
         eased_in: every joint has been led from where it was found into the face.
-        person: somebody is there.
+        person: a person is there.
         speaking: the robot's own voice is being played.
-        lost: sources, "listener" and joints that the run goes on without.
-        halted: who asked for an emergency stop, while it is latched.
+        lost: sources, "listener" and joints that the run continues without.
+        halted: causes of an emergency stop, while it is latched.
         ending: the run is on its way to rest.
     """
 
@@ -71,7 +71,7 @@ class Situation:
     person: bool = False
     speaking: bool = False
     lost: tuple[str, ...] = ()
-    halted: str | None = None
+    halted: tuple[str, ...] = ()
     ending: bool = False
 
 
@@ -89,8 +89,8 @@ def following(state: RunState, now: Situation, now_s: float) -> RunState:
 def _name(state: RunState, now: Situation, doing: Activity) -> tuple[StateName, tuple[str, ...]]:
     if now.ending or state.name == "stopping":
         return "stopping", ()
-    if now.halted is not None:
-        return "halted", (now.halted,)
+    if now.halted:
+        return "halted", now.halted
     if state.name == "halted" or (state.name == "starting" and not now.eased_in):
         return "starting", ()
     return ("degraded", now.lost) if now.lost else (doing, ())

@@ -18,7 +18,7 @@ _DIGITS: Final = 4
 _SAID: Final[Mapping[str, str]] = {
     "starting": "joints are led into the face",
     "idle": "nobody is seen or heard: the listener's answers are not shown",
-    "halted": "halted: nothing is followed until somebody releases it",
+    "halted": "halted: nothing is followed until every cause is cleared",
     "stopping": "the head comes to rest",
 }
 

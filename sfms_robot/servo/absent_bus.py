@@ -48,6 +48,9 @@ class AbsentBus:
     def release(self, joints: Sequence[str]) -> None:
         """There is no torque."""
 
+    def resume(self, joints: Sequence[str]) -> None:
+        """There is no torque."""
+
     def torque_off(self, policy: StopPolicy) -> None:
         """There is no torque."""
 

@@ -125,6 +125,11 @@ class CompositeBus:
         for _, bus in self._working():
             bus.release([joint for joint in joints if joint in bus.joints])
 
+    def resume(self, joints: Sequence[str]) -> None:
+        """As `ports.Bus`, on every bus that works."""
+        for _, bus in self._working():
+            bus.resume([joint for joint in joints if joint in bus.joints])
+
     def torque_off(self, policy: StopPolicy) -> None:
         """As `ports.Bus`, on every bus, from the caller's thread."""
         for bus in self._buses.values():

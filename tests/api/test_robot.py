@@ -262,6 +262,10 @@ def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
         robot.halt()
         robot.wait(0.3)
         assert robot.state == "halted"
+        robot._run.halt.switches["button"] = lambda: True
+        with pytest.raises(sr.HaltedError, match="button: still on"):
+            robot.resume()
+        robot._run.halt.switches.clear()
         robot.resume()
         robot.wait(0.3)
         assert robot.state == "starting"

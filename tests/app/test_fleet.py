@@ -34,6 +34,14 @@ def test_halt_names_who_asked_and_resume_lets_go(run):
     assert run.halt.by is None
 
 
+def test_the_fleet_does_not_end_a_halt_of_the_device_and_its_client_is_answered(run):
+    run.obey(command="halt", by="key")  # whatever name it gives itself
+    run.halt.close("key")
+    assert run.obey(command="resume") == {"error": "still halted: key (cleared at the device)"}
+    assert run.halt.by == "key"
+    run.halt.resume("device")
+
+
 def test_end_asks_the_run_to_end(run):
     run.obey(command="end")
     assert run.interrupt()

@@ -48,6 +48,15 @@ def test_a_halt_is_the_pages_until_it_is_ended():
     assert run.reach.halt.by is None
 
 
+def test_the_page_does_not_end_a_halt_of_the_device_and_its_visitor_is_answered():
+    run = Run()
+    run.does("halt")
+    run.reach.halt.close("key")
+    with pytest.raises(RobotError, match=r"^still halted: key \(cleared at the device\)$"):
+        run.does("resume")
+    assert run.reach.halt.by == "key"
+
+
 def test_channels_expressions_and_neutral_are_laid_over_the_face():
     run = Run()
     run.face(0.0)

@@ -58,6 +58,9 @@ def test_a_file_halts_a_run_until_a_signal_lets_it_go_on(log, tmp_path):
         switch.touch()
         running.until_state("halted")
         assert running.document()["why"] == [str(switch)]
+        running.signal(signal.SIGUSR2)
+        running.until(lambda: f"still halted: {switch}" in log.read_text())
+        assert running.document()["state"] == "halted"
         switch.unlink()
         running.signal(signal.SIGUSR2)
         running.until_state("listening")

@@ -13,7 +13,7 @@ from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, FaceFrame, Plan, SpeakerFrame
-from sfms_robot.ports import Source, Tick
+from sfms_robot.ports import Bus, Source, Tick
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.feed import InlineFeed
 from sfms_robot.runtime.halt import HaltLatch
@@ -108,15 +108,20 @@ def run(
     does: Callable[[HaltLatch], dict[int, Callable[[], None]]] = lambda latch: {},
     seconds: float = 4.0,
     source: Source | None = None,
+    without: tuple[str, ...] = (),
+    latch: HaltLatch | None = None,
+    opened: Callable[[Bus], object] = lambda bus: None,
 ) -> Ran:
-    clock, latch, motion = VirtualClock(), HaltLatch(), build_motion(HEAD, RATE_HZ)
+    clock, latch, motion = VirtualClock(), latch or HaltLatch(), build_motion(HEAD, RATE_HZ)
     clock.wait_until(chain_time(chain))
     watcher = Watcher(does(latch))
-    bus = build_bus(HEAD, {"main": chain}, clock)
+    bus = build_bus(HEAD, {"main": chain}, clock, without=without)
+    opened(bus)
     log = RunLog(JOINTS, 1 / RATE_HZ, motion.audit)
     parts = Parts(
         source or Somebody(), InlineFeed(Nodder(), 0, 0.01), motion.timeline, motion.retargeter, motion.limiter, bus,
         [watcher], motion.leads_s, motion.rest_rad, answers=True, halt=latch, holds=motion.holds, heat=motion.heat,
+        ignored=frozenset(without),
     )  # fmt: skip
     bus.connect()
     try:
@@ -148,7 +153,7 @@ def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_i
     def does(latch: HaltLatch) -> dict[int, Callable[[], None]]:
         def look() -> None:
             seen.update({joint: torque(chain, joint) for joint in JOINTS})
-            latch.open()
+            latch.resume("device")
 
         return {halted: lambda: latch.close("key"), late: look}
 
@@ -173,15 +178,100 @@ def test_a_head_that_is_halted_at_the_end_moves_no_more(chain):
 
 
 def test_a_halt_that_is_released_at_once_is_ended_when_the_head_stands(chain):
-    ran = run(chain, lambda latch: {150: lambda: latch.close("key"), 151: latch.open}, seconds=4.0)
+    ran = run(chain, lambda latch: {150: lambda: latch.close("key"), 151: lambda: latch.resume("device")}, seconds=4.0)
     assert ran.states == ["starting", "listening", "halted", "starting", "listening", "stopping"]
     assert ran.log.audited.violations == 0
 
 
 def test_a_halt_while_joints_ease_in_and_one_before_the_first_tick(chain):
-    ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: latch.open}, seconds=4.0)
+    ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: lambda: latch.resume("device")}, seconds=4.0)
     assert ran.states == ["starting", "halted", "starting", "listening", "stopping"]
     assert ran.log.audited.violations == 0
+
+
+def came_back(ran: Ran) -> dict[str, int]:
+    """The tick in which each joint held its place again, by joint."""
+    return {joint: k for k, tick in enumerate(ran.ticks) for joint, each in tick.readings.items() if each.rejoined}
+
+
+def test_joints_come_back_a_few_per_tick_while_those_that_hold_go_on(chain):
+    resumed = 250
+    ran = run(
+        chain, lambda latch: {150: lambda: latch.close("key"), resumed: lambda: latch.resume("device")},
+        seconds=6.0, without=("jaw",),
+    )  # fmt: skip
+    back = came_back(ran)
+    assert set(back) == set(JOINTS) - set(NECK) - {"jaw"}
+    per_tick = [list(back.values()).count(k) for k in range(resumed, max(back.values()) + 1)]
+    assert max(per_tick) <= 3 and sum(map(bool, per_tick)) > 5 and len(per_tick) < RATE_HZ
+    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    for joint, k in back.items():  # no goal moves before its joint is back
+        assert np.ptp(goals[resumed : k + 1, JOINTS.index(joint)]) == 0.0
+        assert goals[k + 1, JOINTS.index(joint)] == pytest.approx(ran.ticks[k].readings[joint].position_rad, abs=2e-3)
+    neck = goals[resumed : max(back.values()), JOINTS.index(NECK[1])]
+    assert np.ptp(neck) > 1e-3  # which is on its way already
+    assert np.ptp(goals[-150:, JOINTS.index("jaw")]) > 0.05  # one that was left out is drawn as before
+    assert ran.states == ["starting", "listening", "halted", "starting", "listening", "stopping"]
+    assert ran.log.audited.violations == 0
+
+
+@pytest.mark.parametrize("after", [1, 10, 40])
+def test_a_second_halt_while_joints_come_back_halts_again(chain, after):
+    torques: list[list[str]] = []
+
+    def does(latch: HaltLatch) -> dict[int, Callable[[], None]]:
+        again = 250 + after
+        return {
+            150: lambda: latch.close("key"), 250: lambda: latch.resume("device"),
+            again: lambda: latch.close("page", "page"), again + 40: look, again + 60: lambda: latch.resume("page"),
+        }  # fmt: skip
+
+    def look() -> None:
+        torques.append([joint for joint in JOINTS if torque(chain, joint)])
+
+    ran = run(chain, does, seconds=6.0)
+    assert ran.outcome == "done" and ran.log.audited.violations == 0
+    assert ran.states == [
+        "starting", "listening", "halted", "starting", "halted", "starting", "listening", "stopping",
+    ]  # fmt: skip
+    assert ran.ticks[250 + after + 1].why == ("page",)
+    assert torques == [NECK]
+    assert set(came_back(ran)) == set(JOINTS) - set(NECK)
+
+
+def test_all_causes_are_named_and_a_halt_that_ends_before_the_head_stands_ends_nothing(chain):
+    def does(latch: HaltLatch) -> dict[int, Callable[[], None]]:
+        return {
+            150: lambda: latch.close("key"), 151: lambda: latch.close("page", "page"),
+            153: lambda: latch.resume("device"),
+        }  # fmt: skip
+
+    ran = run(chain, does, seconds=5.0)
+    assert ran.ticks[151].why == ("key",) and ran.ticks[152].why == ran.ticks[155].why == ("key", "page")
+    assert ran.outcome == "done" and ran.states[2:] == ["halted", "starting", "listening", "stopping"]
+
+
+def test_a_head_that_lost_its_torque_because_the_loop_stood_still_comes_back_whole(chain):
+    class Late(HaltLatch):
+        """As one whose watching thread has taken torque off."""
+
+        def answer(self) -> bool:
+            return not super().answer()
+
+    buses: list[Bus] = []
+
+    def does(latch: HaltLatch) -> dict[int, Callable[[], None]]:
+        def dead() -> None:
+            latch.close("key")
+            buses[0].torque_off("release")
+
+        return {150: dead, 250: lambda: latch.resume("device")}
+
+    ran = run(chain, does, seconds=6.0, latch=Late(), opened=buses.append)
+    assert ran.outcome == "done" and ran.log.audited.violations == 0
+    assert set(came_back(ran)) == set(JOINTS) and ran.states[-2:] == ["listening", "stopping"]
+    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    assert np.ptp(goals[-100:, JOINTS.index(NECK[1])]) > 0.05
 
 
 def test_who_is_gone_is_not_answered_and_who_comes_is_answered_within_half_a_second(chain):

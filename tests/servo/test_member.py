@@ -157,6 +157,33 @@ def test_every_state_but_off_to_released_and_back_by_enable(member, before):
     assert member.state is State.ONLINE
 
 
+@pytest.mark.parametrize("before", list(State))
+def test_called_back_it_returns_from_every_state_in_which_it_neither_goes_on_nor_comes(member, way, before):
+    fails(member)  # a fault that is there before and after: it is not acted upon again
+    member.state, mine = before, member._named
+    member.called_back(1.0)
+    if before in (State.OFF, State.FAULTY, State.LIMP, State.GIVEN_UP, State.RELEASED):
+        assert member.state is State.RETURNING and member.recalled
+        run(member, 1.0)
+        assert member.state is State.REJOINING and member.recalled and member.fault == "overload" and mine
+        assert member.accepts(STANDS)
+        fails(member, 1.1)
+        assert member.state is State.ONLINE
+    else:
+        assert member.state is before and way.asked == []
+
+
+def test_called_back_while_it_is_silent_it_comes_when_it_answers(member):
+    silent(member)
+    member.released()
+    member.called_back(1.0)
+    assert member.state is State.SILENT and member.fault == "no answer"
+    member.answered()
+    member.back(2.0)
+    run(member, 2.0)
+    assert member.state is State.REJOINING and not member.recalled
+
+
 def test_off_stays_off_when_it_is_released(member):
     member.stopped()
     member.released()

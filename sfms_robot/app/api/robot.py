@@ -196,9 +196,12 @@ class Robot:
             self._run.halt.close("Robot.halt()")
 
     def resume(self) -> None:
-        """End a halt, whoever began it: torque comes on again, joints ease in from where they stand. Does not wait."""
+        """End a halt, whatever caused it: torque comes on again, joints ease in from where they stand.
+
+        Does not wait. Raises HaltedError while a switch is still on.
+        """
         if self._run is not None:
-            self._run.halt.open()
+            self._run.halt.resume("device")
 
     # --- what the robot hears and sees ---
 

@@ -63,8 +63,8 @@ class FleetControls:
         self._halt, self._interrupt, self._knobs, self._calm = halt, interrupt, knobs, calm
 
     def halt(self, by: str) -> None:
-        """`by` as who asked calls themselves."""
-        self._halt.close(_plain(by) or "the fleet")
+        """Halt; `by` is the name that the client gives itself."""
+        self._halt.close(_plain(by) or "the fleet", "fleet")
 
     def obey(self, message: bytes) -> dict[str, str]:
         """The effect of a command, or why it has none. Never raises."""
@@ -81,7 +81,7 @@ class FleetControls:
         if command == "halt":
             self.halt(str(asked.get("by", "")))
         elif command == "resume":
-            self._halt.open()
+            self._halt.resume("fleet")
         elif command == "end":
             self._interrupt.ask()
         elif command == "calm":

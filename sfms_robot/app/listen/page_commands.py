@@ -21,7 +21,7 @@ from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.sources.browser import Visitor
 from sfms_robot.viewer.visitor_commands import Command
 
-BY_PAGE = "page"  # who halted
+BY_PAGE: Final = "page"  # a cause, and its door
 
 
 @dataclass
@@ -99,8 +99,8 @@ def _calm(reach: Reach, rates: Mapping[str, float | None]) -> None:
 
 
 _DO: Final[Mapping[str, Callable[[Reach, Mapping[str, Any]], None]]] = {
-    "halt": lambda reach, values: reach.halt.close(BY_PAGE),
-    "resume": lambda reach, values: reach.halt.open(),
+    "halt": lambda reach, values: reach.halt.close(BY_PAGE, BY_PAGE),
+    "resume": lambda reach, values: reach.halt.resume(BY_PAGE),
     "release": lambda reach, values: reach.release(),
     "neutral": lambda reach, values: reach.puppet.show(np.zeros(MOTION_DIM, np.float32), values["seconds"]),
     "show": lambda reach, values: reach.puppet.show(values["channels"], values["seconds"]),

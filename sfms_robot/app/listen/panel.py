@@ -24,6 +24,7 @@ from rich.text import Text
 from sfms_robot.app.listen.keys import ESCAPE, Keyboard, in_background, keyboard, reading_keys
 from sfms_robot.app.listen.knobs import STEP
 from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.halt_switches import resume_here
 from sfms_robot.runtime.safety import Interrupt
 
 PERIOD_S: Final = 0.25
@@ -69,7 +70,7 @@ def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch, t
     if key in (" ", "h", ESCAPE):
         halt.close("key")
     elif key == "r":
-        halt.open()
+        resume_here(halt)
     elif key == "q" and not interrupt():  # a key that is held down asks once, and releases nothing
         interrupt.ask()
     elif key in "+=-":  # "=": the key of "+", without shift

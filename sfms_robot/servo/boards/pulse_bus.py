@@ -122,6 +122,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._faults: dict[int, str] = {}
         self._resting: frozenset[int] = frozenset()  # channels that `release` has switched off
         self._rest_due = False  # and that are to be told so again
+        self._arrived: list[int] = []  # whose pulses came on again since the last reading
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
@@ -236,6 +237,15 @@ class PulseBus(WireBus[RateLimitedPort]):
                 sent.pop(channel, None)
         self._say_resting()
 
+    def resume(self, joints: Sequence[str]) -> None:
+        """As `ports.Bus`: pulses come on again one channel at a time, at the last goal, where the servo jumps to."""
+        off = self._resting.union(self._off or ())
+        back = [i for i in map(self.joints.index, joints) if self._channels[i] in off and i not in self._switched_off]
+        self._switched_off = [*self._switched_off, *back]  # first: no goal is sent to them yet
+        self._enabled = [*self._enabled, *(i for i in back if i not in self._enabled)]
+        self._resting -= {self._channels[i] for i in back}
+        self._off, self._off_unsent = None, False
+
     def _say_resting(self) -> None:
         wire = self._link
         if wire is not None:
@@ -330,8 +340,12 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._lose(error, now_s)
 
     def _readings(self, now_s: float) -> Mapping[str, Reading]:
-        """No positions; faults of the board."""
-        return {joint: Reading(None, float("inf"), self._faults.get(index)) for index, joint in enumerate(self.joints)}
+        """No positions; faults of the board, and whose pulses have come on again."""
+        arrived, self._arrived = self._arrived, []
+        return {
+            joint: Reading(None, float("inf"), self._faults.get(index), rejoined=index in arrived)
+            for index, joint in enumerate(self.joints)
+        }
 
     def _ask(self, wire: RateLimitedPort, now_s: float) -> bool:
         """Ask for faults once a second when the line is free; whether there was an answer to that."""
@@ -459,8 +473,9 @@ class PulseBus(WireBus[RateLimitedPort]):
 
     def _switch_on_again(self, index: int, now_s: float) -> None:
         servo = self._servos[index]
-        log.warning("%s (channel %d) has lost its pulses and comes on again", servo.joint, servo.id)
-        self._faults.pop(index, None)
+        if self._faults.pop(index, None) == _TORQUE_LOST:
+            log.warning("%s (channel %d) has lost its pulses and comes on again", servo.joint, servo.id)
+        self._arrived.append(index)
         self._next_on_s = now_s + _travel_s(servo)
         self._pending = True
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from threading import RLock
@@ -108,7 +109,7 @@ class ChainBus(WireBus[L], Generic[L]):
         self._release_packet = b""
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
         self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
-        self._letting_go: frozenset[int] = frozenset()  # asked for by `release`, not yet told to their members
+        self._asked: deque[tuple[int, bool]] = deque()  # released, or resumed (True); not yet passed to members
         self._sending = RLock()
         self._set_up()
 
@@ -207,7 +208,8 @@ class ChainBus(WireBus[L], Generic[L]):
         """
         link = self._connected()
         startup = self._begin(link)
-        self._released, self._letting_go = False, frozenset()
+        self._released = False
+        self._asked.clear()
         held = []
         for joint in joints:
             index = self.joints.index(joint)
@@ -255,9 +257,16 @@ class ChainBus(WireBus[L], Generic[L]):
         """As `ports.Bus`; from any thread."""
         indices = frozenset(self.joints.index(joint) for joint in joints)
         if indices:
-            self._letting_go |= indices
+            self._asked.extend([(index, False) for index in indices])
             ids = {self._servos[index].id: 0 for index in indices}
             self._send_at_once(self._sync_write_packet(self._telemetry.torque, ids))
+
+    def resume(self, joints: Sequence[str]) -> None:
+        """As `ports.Bus`."""
+        if self._released:  # by `torque_off`, which perhaps no poll has seen yet
+            self._asked.extend([(index, False) for index in range(len(self.joints))])
+            self._released = False
+        self._asked.extend([(self.joints.index(joint), True) for joint in joints])
 
     def _send_at_once(self, packet: bytes) -> None:
         alone = self._sending.acquire(timeout=_SENDING_S)  # a goal must not overtake it; a port that hangs may
@@ -271,11 +280,15 @@ class ChainBus(WireBus[L], Generic[L]):
             if alone:
                 self._sending.release()
 
-    def _let_go(self) -> None:
-        """Tell members what `release` asked for, in the thread that they belong to."""
-        indices, self._letting_go = self._letting_go, frozenset()
-        for index in indices:
-            self._members[index].released()
+    def _pass_on(self) -> None:
+        """Pass what `release` and `resume` asked for to the members, in the thread that they belong to."""
+        while self._asked:
+            index, back = self._asked.popleft()
+            member = self._members[index]
+            if back:
+                member.called_back(self._now_s())
+            else:
+                member.released()
         self._update_places()
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
@@ -371,8 +384,8 @@ class ChainBus(WireBus[L], Generic[L]):
         While the port is gone nothing is sent and nothing is raised.
         """
         self._check(self._enabled)
-        if self._letting_go:
-            self._let_go()
+        if self._asked:
+            self._pass_on()
         if self._accepted(goals_rad):
             self._update_places()
         link = self._link
@@ -381,7 +394,7 @@ class ChainBus(WireBus[L], Generic[L]):
         if link is None or not len(places):
             return
         with self._sending:
-            if self._released or self._letting_go:
+            if self._released or self._asked:
                 return
             self._counts["writes"] += 1
             try:
@@ -436,8 +449,8 @@ class ChainBus(WireBus[L], Generic[L]):
         if self._released:
             for member in self._members:
                 member.stopped()
-        if self._letting_go:
-            self._let_go()
+        if self._asked:
+            self._pass_on()
         with link.within(self._poll.budget_s, self._read_deadline_s + TURN_S):
             heard = self._poll.step(link, stamp_s)
             self._command(link, stamp_s)
@@ -500,7 +513,7 @@ class ChainBus(WireBus[L], Generic[L]):
                     break
 
     def _back(self, member: Member) -> None:
-        self._counts["reconnects"] += 1
+        self._counts["reconnects"] += not member.recalled
         self._arrived.append(member)
         self._forget(member.index)
         self._telemetry.ticks[member.index] = member.stands_ticks

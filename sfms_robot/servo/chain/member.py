@@ -1,4 +1,4 @@
-"""One servo of a chain: what state it is in, why, and what is asked of it next. Opens no port.
+"""One servo of a chain: its state, the reason for it, and its next request. Opens no port.
 
     off        no torque is wanted: before `enable`, after `stop`
     online     has torque and gets goals
@@ -6,14 +6,14 @@
     faulty     keeps its torque where it stands and gets no goals: policy "hold"
     limp       torque off is wanted; written in every poll until the servo says that it is off
     silent     does not answer; gets no goals
-    returning  is started up anew: identity, settings, goal := present, torque
+    returning  is started up again: identity, settings, goal := present, torque
     rebooting  the same after a reboot
     rejoining  holds where it stands, and waits for goals that begin there
-    given up   failed too often: as limp, until somebody enables it again
-    released   the same because somebody asked for it: no fault
+    given up   failed too often: as limp, until it is enabled or called back
+    released   the same because it was asked for: no fault
 
 The diagram and a table of all arrows are in docs/safety.md. A goal is sent to members that are online or reduced and
-have been seen with torque, and to nobody else. So a servo that was away moves only from where it stands.
+have been seen with torque, and to no others. So a servo that was away moves only from where it stands.
 Times are those of the port's clock, in seconds.
 """
 
@@ -96,9 +96,10 @@ class Member:
         state: see the module.
         liveness: whether it answers.
         identified: it has been checked against the head's file.
-        torque_seen: what it last said; None where nobody knows.
+        torque_seen: what it last said; None where it is not known.
         job: its way back, in steps of one exchange, and when the next is due.
         rejoined: it came to hold a position in this poll.
+        recalled: it was called back and had not been away.
         stands_ticks: where, while it is rejoining; told at some time since `stands_s`.
         off_written: torque off has been sent since it was wanted.
         mismatch: registers that do not hold what was asked of them, in words.
@@ -115,7 +116,7 @@ class Member:
         self.torque_seen: bool | None = None
         self.job: Steps[int] | None = None
         self.job_due_s = 0.0
-        self.rejoined = False
+        self.rejoined = self.recalled = False
         self.stands_ticks = 0
         self.stands_s: float | None = None
         self.off_written = False
@@ -202,6 +203,17 @@ class Member:
         if self.state is not State.OFF:
             self._release(math.inf)
             self.state = State.RELEASED
+
+    def called_back(self, now_s: float) -> None:
+        """Bring it back as if it had been away, unless it is driven or on its way; its faults count as known."""
+        if self.state in _DRIVEN | _COMING | {State.REJOINING, State.SILENT}:
+            return
+        self._attempts_s.clear()
+        if self.liveness.listed:
+            self._return(now_s)
+            self.recalled = True
+        else:
+            self.awaited()
 
     def _reset(self, state: State) -> None:
         self._drop_job()
@@ -366,10 +378,14 @@ class Member:
         return True
 
     def _holds(self, ticks: int) -> None:
+        recalled, bits, named = self.recalled, self._bits, self._named
         self._reset(State.REJOINING)
         self.identified = self.torque_seen = self.rejoined = True
         self.stands_ticks = ticks
-        log.warning("%s is back and holds where it stands", about(self.servo))
+        if recalled:
+            self.recalled, self._bits, self._named = True, bits, named
+        else:
+            log.warning("%s is back and holds where it stands", about(self.servo))
 
     # --- inside -------------------------------------------------------------------------------------------------
 
@@ -418,7 +434,7 @@ class Member:
 
     def _drop_job(self) -> None:
         job, self.job = self.job, None
-        self._back_s = math.inf
+        self._back_s, self.recalled = math.inf, False
         if job is not None:
             job.close()
 

@@ -58,7 +58,9 @@ class Rig:
             self.clock.wait_until(self.now_s + period_s)
             self.bus.write(self._eased(np.array(goals_rad, dtype=float), period_s), self.now_s)
             readings = self.bus.poll(self.now_s)
-            back = {i: r.position_rad for i, r in enumerate(readings.values()) if r.rejoined}
+            back = {
+                i: r.position_rad for i, r in enumerate(readings.values()) if r.rejoined and r.position_rad is not None
+            }
             self.easing.update(back)
         return readings
 

@@ -183,6 +183,46 @@ def test_some_joints_are_released_while_the_others_go_on(rig):
 
 
 @pytest.mark.emulated
+@pytest.mark.parametrize("how", ["release", "torque_off"])
+def test_joints_are_called_back_while_the_others_go_on(rig, how):
+    held = rig.hold()
+    rig.ticks(held, 5)
+    *gone, stays = rig.bus.joints
+    if how == "release":
+        rig.bus.release(gone)
+    else:
+        rig.bus.torque_off("release")
+    rig.ticks(held, 60)
+    assert rig.torques()[:-1] == [False] * len(gone)
+    before = rig.now_s
+    rig.bus.resume(rig.bus.joints)
+    assert rig.now_s == before  # only asked for
+    back: dict[str, int] = {}
+    goals = held.copy()
+    for k in range(300):
+        goals[-1] += (how == "release") * 0.001 * (k < 50)
+        readings = rig.ticks(goals, 1)
+        back |= {joint: k for joint, reading in readings.items() if reading.rejoined}
+    assert set(back) == set(gone if how == "release" else rig.bus.joints) and len(set(back.values())) > 1
+    assert rig.torques() == [True] * len(rig.ids) and all(reading.fault is None for reading in readings.values())
+    assert rig.shafts_rad() == near(goals, rig) and rig.bus.statistics()["reconnects"] == 0
+
+
+@pytest.mark.emulated
+def test_joints_that_come_back_may_be_released_again(rig):
+    held = rig.hold()
+    rig.ticks(held, 5)
+    for n in (1, 3, 8):
+        rig.bus.release(rig.bus.joints)
+        rig.ticks(held, 20)
+        rig.bus.resume(rig.bus.joints)
+        rig.ticks(held, n)
+    rig.bus.release(rig.bus.joints)
+    rig.ticks(held, 100)
+    assert not any(rig.torques())
+
+
+@pytest.mark.emulated
 def test_all_joints_may_be_released_and_goals_move_nothing(rig):
     held = rig.hold()
     rig.bus.release(rig.bus.joints)

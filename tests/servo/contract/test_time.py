@@ -185,6 +185,37 @@ def test_torque_off_waits_for_nobody_and_no_goal_follows_it(family):
 
 
 @pytest.mark.parametrize("family", CHAINS)
+def test_24_joints_come_back_in_many_ticks_and_the_watchdogs_of_4_that_hold_do_not_trip(family):
+    clock = Time()
+    face, neck = timed(family, 24, clock), timed(family, 4, clock, watchdog_ms=100)
+    neck.bus.joints = tuple(f"neck{i}" for i in neck.ids)
+    bus = CompositeBus({"face": face.bus, "neck": neck.bus}, [*face.bus.joints, *neck.bus.joints])
+    bus.connect()
+    held = bus.enable(bus.joints)
+    back: dict[str, float] = {}
+
+    def ticks(n):
+        for _ in range(n):
+            clock.wait_until((int(clock.t / 0.01 + 1e-6) + 1) * 0.01)
+            bus.write(held, clock.t)
+            readings = bus.poll(clock.t)
+            back.update((joint, clock.t) for joint, reading in readings.items() if reading.rejoined)
+
+    ticks(60)
+    bus.release(face.bus.joints)
+    ticks(50)
+    assert face.torques() == [0] * 24
+    began_s, mark = clock.t, len(neck.port.sent_at_s)
+    bus.resume(bus.joints)
+    assert clock.t == began_s
+    ticks(250)
+    assert set(back) == set(face.bus.joints) and len(set(back.values())) > 8
+    assert max(back.values()) - began_s < 1.5
+    assert face.torques() == [1] * 24 and neck.torques() == [1] * 4 and bus.statistics()["faults"] == []
+    assert np.diff(neck.port.sent_at_s[mark - 1 :]).max() < 0.03
+
+
+@pytest.mark.parametrize("family", CHAINS)
 def test_watchdogs_are_switched_off_after_the_torque(family):
     rig = timed(family, 8)
     rig.ticks(rig.hold(), 60)
