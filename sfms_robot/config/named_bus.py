@@ -33,7 +33,7 @@ def _family(name: str) -> str:
 
 def _crc(crc: bool, info: ValidationInfo) -> bool:
     if crc and info.data.get("family") != "maestro":
-        raise ValueError("expected false: of all boards and servos only a Maestro has this setting")
+        raise ValueError("expected false, as only a Maestro has this setting")
     return crc
 
 

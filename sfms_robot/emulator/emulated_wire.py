@@ -82,8 +82,8 @@ class EmulatedWire:
         if faults.echoes(now_s):
             self._post(Reply((), data), through_s, 0.0)
         for spoilt, late_s in faults.spoil(Reply((), data), now_s, TO_SERVOS):
-            arrives_s = max([now_s + late_s, *(each[0] for each in self._inbox)])  # bytes do not overtake one another
-            self._inbox.append((arrives_s, spoilt, baud))
+            # Bytes do not overtake one another.
+            self._inbox.append((max([now_s + late_s, *(each[0] for each in self._inbox)]), spoilt, baud))
         self.advance(now_s)
         if noise := faults.noise(now_s):
             self._post(Reply((), noise), self._free_s if self._on_the_wire else now_s, 0.0)

@@ -98,7 +98,7 @@ class Outcome:
     possible: bool = True
     escaped: str | None = None
     outside: int = 0
-    pulse_us: Sequence[float] | None = None
+    pulse_us: Sequence[float] = ()
     stale: int = 0
     recovered_s: float | None = None
     named: Sequence[str] = ()
@@ -207,8 +207,8 @@ def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
             judge.away = frozenset({2, 3})
         try:
             judge.see(rig.tick())
-            if tick % _BAD_GOALS_EVERY == 0:
-                rig.try_bad_goals()
+            if tick % _BAD_GOALS_EVERY == 0 and not dies:
+                rig.try_bad_goals(bool(judge.named))
         except Exception as error:  # what escapes is what is looked for
             reports += 1
             if not dies or reports > 1 or not isinstance(error, BusError):
@@ -221,7 +221,7 @@ def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
     outcome = replace(
         outcome,
         outside=judge.outside,
-        pulse_us=[edge(judge.pulses_us) for edge in (min, max)] if judge.pulses_us else None,
+        pulse_us=[edge(judge.pulses_us) for edge in (min, max) if judge.pulses_us],
         stale=judge.stale,
         recovered_s=judge.recovered_s(over_s),
         named=judge.named,
@@ -275,7 +275,7 @@ def measure(say: Callable[[str], None]) -> Told:
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
     outcomes = run_campaign(progress=say)
     plain = [asdict(each) | {"passed": each.passed} for each in outcomes]
-    passed, corrupted = all(each.passed for each in outcomes), corrupted_bytes(outcomes)
+    passed, corrupted = all(each["passed"] for each in plain), corrupted_bytes(outcomes)
     lines = [f"{family}, corrupted bytes: {', '.join(said.values())}" for family, said in corrupted.items()]
     return Told({"passed": passed, "runs": plain, "corrupted_bytes": corrupted}, table(outcomes), lines, passed)
 
@@ -296,8 +296,8 @@ def corrupted_bytes(outcomes: Sequence[Outcome]) -> dict[str, dict[str, str]]:
 def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     """Return a row per run, as printed."""
 
-    def short(value: float | None, digits: int = 3) -> float | None:
-        return None if value is None else round(value, digits)
+    def short(value: float | None) -> float | None:
+        return None if value is None else round(value, 3)
 
     return [
         {
@@ -306,7 +306,7 @@ def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
             "escaped": each.escaped or 0,
             "outside": each.outside,
             "stale": each.stale,
-            "back s": short(each.recovered_s, 2),
+            "back s": short(each.recovered_s),
             "out": len(each.named) + (each.refused is not None),
             "off s": short(each.off_s),
             "stop s": short(each.stop_s),

@@ -80,8 +80,7 @@ class Rig:
         self.conversion = calibration_of(head.joints)
         self._limiter = JerkLimiter(JointLimits.of(head), 1.0 / RATE_HZ)
         [model] = {joint.model for joint in head.joints.values()}
-        self.tick_us = load_firmware_map(model).tick_us or 0.0
-        self.tells_position = all("position" in told for told in self.bus.capabilities.values())
+        self.tick_us = load_firmware_map(model).tick_us or 0.0  # of a board, which reports no position; else 0
 
     def hold(self) -> None:
         self.bus.connect()
@@ -115,14 +114,15 @@ class Rig:
         angle = self._centre + way * math.sin(phase)
         return np.array([angle, way * turn * math.cos(phase), -way * turn * turn * math.sin(phase)])
 
-    def try_bad_goals(self) -> None:
+    def try_bad_goals(self, withheld: bool) -> None:
         """Send bad goals of the last joint. Raises AssertionError for one that is not refused.
 
-        Those out of range are left out while the servo does not follow: its goals are withheld then.
+        Those out of range are left out where a fault or the way back of a joint may hold its goals back.
         """
         bad_rad = [math.nan, math.inf]
-        if self.states()[-1]["goal"] == self.conversion.to_ticks(self.goals)[-1]:
-            bad_rad += [sign * (math.radians(LIMIT_DEG) + 0.5) for sign in (1, -1)]
+        if not withheld and self.states()[-1]["goal"] == self.conversion.to_ticks(self.goals)[-1]:
+            beyond_rad = math.radians(LIMIT_DEG) + 0.5
+            bad_rad += [beyond_rad, -beyond_rad]
         for bad in bad_rad:
             with suppress(ValueError):
                 self.bus.write(np.array([*self.goals[:-1], bad]), self.clock.now_s())
@@ -161,7 +161,7 @@ class Judge:
         for index, state in enumerate(states):
             if state["torque"] and state["goal"] is not None:
                 self._see_goal(index, state["goal"])
-                if "pulse" in state:
+                if rig.tick_us:
                     self.pulses_us.append(state["pulse"] * rig.tick_us)
         for index, reading in enumerate(readings.values()):
             self.stale += self._misdated(index, reading)
@@ -194,8 +194,8 @@ class Judge:
     def _well(self, index: int, reading: Reading, state: Mapping[str, Any], shaft_rad: float) -> bool:
         if reading.fault is not None:
             return True  # out of the game, and says why
-        told = not self._rig.tells_position or reading.age_s < _FRESH_S
-        return told and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
+        told = self._rig.tick_us or reading.age_s < _FRESH_S
+        return bool(told) and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
 
 
 @contextmanager

@@ -9,8 +9,9 @@
 4. A board that detects its baud rate hears nothing before the byte AA.
 5. Only two bytes or one ever come back, without any frame: to `GET_POSITION`, `GET_MOVING` and `GET_ERRORS`.
 
-Errors that the CRC-7 detects: any change of one byte behind which the packet still has its length. (A CRC of 7 bits
-misses one change of a whole byte, 0x91. That one flips the top bit, and rule 1 detects it.)
+The CRC-7 detects any change of one byte that leaves the packet its length. (A CRC of 7 bits misses one such change,
+0x91. That one flips the top bit, and rule 1 detects it.) Where a changed byte begins another command, the CRC of that
+one fits by chance in 1 of 128; Mini SSC has none.
 
 Source: Pololu Maestro Servo Controller User's Guide, pololu.com/docs/0J40, sections 4.b and 5.c to 5.f.
 """
