@@ -129,7 +129,7 @@ def test_any_change_of_one_byte_but_the_length_is_detected(at):
 
 
 def test_changed_length_passes_where_a_parameter_happens_to_be_the_right_sum():
-    wrong = bytearray(encode(1, protocol1.WRITE, b"\x1e\x01\x02\xd6"))
+    wrong = bytearray(encode(1, protocol1.WRITE, b"\x1e\x01\x02\xd5"))
     assert take(bytearray(wrong)) is not None
     wrong[3] = 5
     assert take(wrong) == Frame(1, protocol1.WRITE, b"\x1e\x01\x02")  # as sent, and the rest is lost
