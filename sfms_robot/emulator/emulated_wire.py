@@ -101,7 +101,7 @@ class EmulatedWire:
                         self._post(reply._replace(data=spoilt), due_s, late_s)
 
     def take(self, until_s: float, all_but_late: bool = False) -> list[Out]:
-        """What is due by `until_s`, in order; with `all_but_late` also what no fault holds back."""
+        """Return the bytes due by `until_s`, in order; with `all_but_late` also those that no fault holds back."""
         self._deliver(until_s)
         if not self._outbox:
             return []
@@ -120,7 +120,7 @@ class EmulatedWire:
 
     @property
     def next_s(self) -> float:
-        """When something happens by itself: a request arrives, an answer is due, a fault begins or ends."""
+        """Time of the next event without the host: a request arrives, an answer is due, a fault begins or ends."""
         return min([self._faults.next_s, *(out.due_s for out in self._outbox), *(each[0] for each in self._inbox)])
 
     def statistics(self) -> dict[str, Any]:

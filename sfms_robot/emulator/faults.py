@@ -1,10 +1,9 @@
-"""Faults on request: which, of whom, from when to when, how much.
+"""Faults on request: kind, ids, start, end and amount.
 
     KIND[:IDS][@START[-END]][=VALUE]        drop:3,5-7@2-4=0.5    delay:2=0.012    brownout@1    noise=0.1
 
-Times are seconds of the emulator's clock; an END left out means for good, except for the two that pass by themselves
-(brownout, hangup). Everything that is left to chance comes from one seeded generator, so that in virtual time the same
-requests meet the same faults.
+Times are seconds of the emulator's clock; a fault without an END lasts, except for the two that pass (brownout,
+hangup). All chance comes from one seeded generator, so that in virtual time the same requests meet the same faults.
 
 `drop`, `corrupt`, `delay` and their like hit what servos send; `request-drop`, `request-corrupt` and `request-delay`
 hit what the host sends, each write as a whole and for all servos of the wire alike. Corrupted: one byte of it became
@@ -26,7 +25,7 @@ from sfms_robot.errors import ConfigError
 
 
 class Kind(NamedTuple):
-    """What VALUE means (none where it is empty), its default and range, and how long the fault lasts by default."""
+    """Meaning of VALUE ("" takes none), its default and range, and how long the fault lasts by default."""
 
     meaning: str
     value: float = 1.0

@@ -1,8 +1,8 @@
-"""A Pololu Maestro as a bus. What all boards have in common is in `pulse_bus`; this is the Maestro's own.
+"""A Pololu Maestro as a bus: its protocol and its checks. `pulse_bus` holds what all boards share.
 
 1. Get Errors (A1) clears them, and shows that the board is there. One in the serial mode "UART, detect baud rate"
-   takes nothing before the baud indication byte AA, which is sent only when it does not answer: to one that is
-   running, AA alone may be a protocol error.
+   takes nothing before the baud indication byte AA, which is sent only when it does not answer: a board that runs
+   may take AA alone for a protocol error.
 2. Any error sends the channels to their home, which from the factory is no pulses at all. So after an error that it
    reports all goals are sent anew.
 3. A board may have "Enable CRC" on, which nothing on the wire says, so the head's file does (`crc`). A board that
