@@ -199,7 +199,7 @@ def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
 def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
     """Run the ticks and judge them; the trouble is over at `over_s`, or half of the buses die then.
 
-    A bus that dies is reported once, by a BusError, and the other one goes on.
+    A bus that dies is reported once, by a BusError, and the other one continues.
     """
     judge, reports, dies = Judge(rig), 0, outcome.case == HALF_DEAD
     for tick in range(outcome.ticks):
@@ -215,7 +215,7 @@ def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
                 outcome = replace(outcome, ticks=tick, escaped=f"{type(error).__name__}: {error}")
                 break
     if dies and not reports and rig.clock.now_s() > over_s + _SAID_BY_S:
-        outcome = replace(outcome, escaped="nothing: nobody said that a bus has failed")
+        outcome = replace(outcome, escaped="nothing: the failure of a bus was not reported")
     for chain in rig.chains.values():
         chain.clear_faults()  # what was dead is plugged in again: torque off has to reach it
     outcome = replace(
@@ -230,7 +230,7 @@ def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
 
 
 def _at_the_end(rig: Rig, outcome: Outcome) -> Outcome:
-    """Switch torque off, and count the servos that have it all the same."""
+    """Switch torque off, and count the servos that still have it."""
     rig.bus.stop("release")
     rig.bus.close()
     return replace(outcome, left_on=sum(bool(state["torque"]) for state in rig.states()))
