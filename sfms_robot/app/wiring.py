@@ -71,8 +71,9 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
         if multi_turn(table, needs):
             first, last = home_ticks(table.ticks_per_revolution, needs)
             ticks = max(first, min(ticks, last))
-        baud = head.buses[joint.bus].baud
-        servo = EmulatedServo(joint.id, joint.model, baud, ticks, registers=head.safety_of(name).stored)
+        bus = head.buses[joint.bus]
+        stored = {"crc": 1} if bus.crc else head.safety_of(name).stored
+        servo = EmulatedServo(joint.id, joint.model, bus.baud, ticks, registers=stored)
         by_bus.setdefault(joint.bus, []).append(servo)
     return by_bus
 

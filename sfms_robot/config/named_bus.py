@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, Field, WithJsonSchema
+from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema
 
 from sfms_robot.config.base import Model, Positive
 
@@ -31,6 +31,12 @@ def _family(name: str) -> str:
     return name
 
 
+def _crc(crc: bool, info: ValidationInfo) -> bool:
+    if crc and info.data.get("family") != "maestro":
+        raise ValueError("expected false, as only a Maestro has this setting")
+    return crc
+
+
 class Bus(Model):
     """One named bus of a head.
 
@@ -38,6 +44,7 @@ class Bus(Model):
     tries it at start. `watchdog_ms` 0 leaves the servos' own watchdog off. `stagger_ms` lies between two servos whose
     torque comes on. A bus on which nobody answers for `reconnect_s` has failed. `rs485`: who switches the direction of
     a half-duplex RS-485 driver, the program by the RTS line (rts) or the driver (kernel); none for adapters that do.
+    `crc`: a Maestro has "Enable CRC" on, and gets one with every command.
     """
 
     family: Annotated[str, AfterValidator(_family), WithJsonSchema({"enum": list(BUS_FAMILIES)})]
@@ -49,6 +56,7 @@ class Bus(Model):
     stagger_ms: Annotated[float, Field(ge=0, le=1000)] = 5.0
     reconnect_s: Positive = 30.0
     rs485: Literal["rts", "kernel"] | None = None
+    crc: Annotated[bool, AfterValidator(_crc)] = False
 
 
 def highest_rate_hz(family: str, baud: int, joints: int) -> float:

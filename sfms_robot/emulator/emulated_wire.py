@@ -8,13 +8,12 @@ through. What leaves later than it was due is the emulator's own doing, and is c
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 from sfms_robot.emulator.device import Device, Reply, replies_of, servos_of
-from sfms_robot.emulator.faults import Fault, Faults, parse_fault
+from sfms_robot.emulator.faults import TO_SERVOS, Fault, Faults, parse_fault
 from sfms_robot.errors import ConfigError
 
 Timing = Literal["instant", "wire"]
@@ -48,6 +47,7 @@ class EmulatedWire:
         self._devices = list(devices)
         self._on_the_wire = timing == "wire"
         self._faults = Faults(seed=seed)
+        self._inbox: deque[tuple[float, bytes, int | None]] = deque()  # (arrives at, data, baud), in that order
         self._outbox: list[Out] = []
         self._number = 0
         self._free_s = 0.0  # until then the line is busy
@@ -78,20 +78,31 @@ class EmulatedWire:
         if self.hung:
             return
         faults = self._faults
-        heard_s = self._occupy(now_s, len(data), baud)
+        through_s = self._occupy(now_s, len(data), baud)
         if faults.echoes(now_s):
-            self._post(Reply((), data), heard_s, 0.0)
-        for device in self._devices:
-            for reply in replies_of(device, data, baud, now_s):
-                start_s = max(now_s, self._free_s) + (reply.pause_s if self._on_the_wire else 0.0)
-                due_s = self._occupy(start_s, len(reply.data), baud)
-                for spoilt, late_s in faults.spoil(reply, now_s):
-                    self._post(reply._replace(data=spoilt), due_s, late_s)
+            self._post(Reply((), data), through_s, 0.0)
+        for spoilt, late_s in faults.spoil(Reply((), data), now_s, TO_SERVOS):
+            # Bytes do not overtake one another.
+            self._inbox.append((max([now_s + late_s, *(each[0] for each in self._inbox)]), spoilt, baud))
+        self.advance(now_s)
         if noise := faults.noise(now_s):
             self._post(Reply((), noise), self._free_s if self._on_the_wire else now_s, 0.0)
 
+    def _deliver(self, until_s: float) -> None:
+        """Hand the requests that arrive by `until_s` to the devices, and post their answers."""
+        while self._inbox and self._inbox[0][0] <= until_s:
+            now_s, data, baud = self._inbox.popleft()
+            self._turn_faults(now_s)
+            for device in self._devices:
+                for reply in replies_of(device, data, baud, now_s):
+                    start_s = max(now_s, self._free_s) + (reply.pause_s if self._on_the_wire else 0.0)
+                    due_s = self._occupy(start_s, len(reply.data), baud)
+                    for spoilt, late_s in self._faults.spoil(reply, now_s):
+                        self._post(reply._replace(data=spoilt), due_s, late_s)
+
     def take(self, until_s: float, all_but_late: bool = False) -> list[Out]:
-        """What is due by `until_s`, in order; with `all_but_late` also what no fault holds back."""
+        """Return the bytes due by `until_s`, in order; with `all_but_late` also those that no fault holds back."""
+        self._deliver(until_s)
         if not self._outbox:
             return []
         out = sorted(each for each in self._outbox if each.due_s <= until_s or (all_but_late and not each.late))
@@ -109,9 +120,8 @@ class EmulatedWire:
 
     @property
     def next_s(self) -> float:
-        """When something happens by itself: an answer is due, a fault begins or ends."""
-        due_s = min((out.due_s for out in self._outbox), default=math.inf)
-        return min(due_s, self._faults.next_s)
+        """Time of the next event without the host: a request arrives, an answer is due, a fault begins or ends."""
+        return min([self._faults.next_s, *(out.due_s for out in self._outbox), *(each[0] for each in self._inbox)])
 
     def statistics(self) -> dict[str, Any]:
         """Counts since the start; how late answers left [ms] and how long the line was busy [s]."""
@@ -160,10 +170,13 @@ class EmulatedWire:
         return self._faults.texts(now_s)
 
     def advance(self, now_s: float) -> None:
-        """Let begin and end what is due."""
-        if self._faults.next_s <= now_s:
-            for time_s, fault, began in self._faults.edges(now_s):
-                self._happen(fault, began, time_s)
+        """Let requests arrive and faults begin and end by `now_s`, in the order of their times."""
+        self._deliver(now_s)
+        self._turn_faults(now_s)
+
+    def _turn_faults(self, now_s: float) -> None:
+        for time_s, fault, began in self._faults.edges(now_s):
+            self._happen(fault, began, time_s)
 
     def idle(self, now_s: float) -> None:
         """Move everything on, so that nobody has to make up for a long silence."""
@@ -185,6 +198,7 @@ class EmulatedWire:
         kind = fault.kind
         if kind == "hangup":
             self.hung = began
+            self._inbox.clear()
             self._outbox.clear()
         elif kind == "brownout":
             self._brown_out(fault, began, now_s)

@@ -1,10 +1,13 @@
-"""Faults on request: which, of whom, from when to when, how much.
+"""Faults on request: kind, ids, start, end and amount.
 
     KIND[:IDS][@START[-END]][=VALUE]        drop:3,5-7@2-4=0.5    delay:2=0.012    brownout@1    noise=0.1
 
-Times are seconds of the emulator's clock; an END left out means for good, except for the two that pass by themselves
-(brownout, hangup). Everything that is left to chance comes from one seeded generator, so that in virtual time the same
-requests meet the same faults.
+Times are seconds of the emulator's clock; a fault without an END lasts, except for the two that pass (brownout,
+hangup). All chance comes from one seeded generator, so that in virtual time the same requests meet the same faults.
+
+`drop`, `corrupt`, `delay` and their like hit what servos send; `request-drop`, `request-corrupt` and `request-delay`
+hit what the host sends, each write as a whole and for all servos of the wire alike. Corrupted: one byte of it became
+another.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from sfms_robot.errors import ConfigError
 
 
 class Kind(NamedTuple):
-    """What VALUE means (none where it is empty), its default and range, and how long the fault lasts by default."""
+    """Meaning of VALUE ("" takes none), its default and range, and how long the fault lasts by default."""
 
     meaning: str
     value: float = 1.0
@@ -32,15 +35,20 @@ class Kind(NamedTuple):
     ids: bool = True
 
 
-_FRACTION: Final = "fraction of replies"
+_OF_REPLIES: Final = Kind("fraction of replies")
+_OF_REQUESTS: Final = Kind("fraction of requests", ids=False)
+TO_SERVOS: Final = "request-"  # kinds of faults between host and servos begin with this; the others hit replies
 KINDS: Final[dict[str, Kind]] = {
-    "drop": Kind(_FRACTION),
+    "drop": _OF_REPLIES,
     "delay": Kind("seconds", 0.02, 0.0, 60.0),
-    "corrupt": Kind(_FRACTION),
-    "duplicate": Kind(_FRACTION),
-    "truncate": Kind(_FRACTION),
-    "echo": Kind("fraction of requests", ids=False),
-    "noise": Kind("fraction of requests", ids=False),
+    "corrupt": _OF_REPLIES,
+    "duplicate": _OF_REPLIES,
+    "truncate": _OF_REPLIES,
+    "echo": _OF_REQUESTS,
+    "noise": _OF_REQUESTS,
+    "request-drop": _OF_REQUESTS,
+    "request-corrupt": _OF_REQUESTS,
+    "request-delay": Kind("seconds", 0.02, 0.0, 60.0, ids=False),
     "silent": Kind(""),
     "mute": Kind(""),
     "stuck": Kind(""),
@@ -52,7 +60,7 @@ KINDS: Final[dict[str, Kind]] = {
     "hangup": Kind("", lasts_s=1.0, ids=False),
 }
 _SPEC: Final = re.compile(
-    r"(?P<kind>[a-z]+)(:(?P<ids>[0-9,-]+))?(@(?P<start>[0-9.]+)(?P<dash>-(?P<end>[0-9.]+)?)?)?(=(?P<value>-?[0-9.e-]+))?"
+    r"(?P<kind>[a-z-]+)(:(?P<ids>[0-9,-]+))?(@(?P<start>[0-9.]+)(?P<dash>-(?P<end>[0-9.]+)?)?)?(=(?P<value>-?[0-9.e-]+))?"
 )
 
 
@@ -160,16 +168,20 @@ class Faults:
                 self._faults.remove(fault)
             yield time_s, fault, began
 
-    def spoil(self, reply: Reply, now_s: float) -> list[tuple[bytes, float]]:
-        """What becomes of a reply: (bytes, seconds late), none when it is lost."""
-        out = [(reply.data, 0.0)]
+    def spoil(self, packet: Reply, now_s: float, way: str = "") -> list[tuple[bytes, float]]:
+        """Return what becomes of a reply, or on the way `TO_SERVOS` of what one write of the host sent.
+
+        Each is (bytes, seconds late); none when it is lost.
+        """
+        out = [(packet.data, 0.0)]
         for fault in self._faults:
-            if not fault.meets(reply.servos, now_s):
+            if not fault.kind.startswith(way) or not fault.meets(packet.servos, now_s):
                 continue
-            if fault.kind == "delay":
+            kind = fault.kind.removeprefix(way)
+            if kind == "delay":
                 out = [(data, late_s + fault.value) for data, late_s in out]
-            elif fault.kind in _SPOILERS and self._random.random() < fault.value:
-                out = [(spoilt, late_s) for data, late_s in out for spoilt in _SPOILERS[fault.kind](data, self._random)]
+            elif kind in _SPOILERS and self._random.random() < fault.value:
+                out = [(spoilt, late_s) for data, late_s in out for spoilt in _SPOILERS[kind](data, self._random)]
         return out
 
     def echoes(self, now_s: float) -> bool:
@@ -185,8 +197,9 @@ class Faults:
 
 
 def _corrupted(data: bytes, dice: random.Random) -> list[bytes]:
+    """Return `data` with one byte replaced by any other."""
     at = dice.randrange(len(data))
-    return [data[:at] + bytes([data[at] ^ 1 << dice.randrange(8)]) + data[at + 1 :]]
+    return [data[:at] + bytes([data[at] ^ dice.randrange(1, 256)]) + data[at + 1 :]]
 
 
 _SPOILERS: Final = {

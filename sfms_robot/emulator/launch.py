@@ -33,6 +33,7 @@ READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be lat
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
 
 _START_S = 20.0
+_BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
 
 class Chain:
@@ -265,9 +266,11 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
         bauds = sorted(table.baud_codes.values())
         if bauds and servo.baud not in bauds:
             raise ConfigError.at("emulated chain", "baud", servo.baud, f"is no rate of {servo.model}", bauds)
-        if table.channels is not None and (servo.registers or servo.supply_v is not None):
-            problem = "is a board of hobby servos: it has no registers, and does not know its supply"
-            raise ConfigError.at("emulated chain", "model", servo.model, problem)
+        if table.channels is not None:
+            if servo.registers.keys() - _BOARD_SETTINGS.get(table.family, set()) or servo.supply_v is not None:
+                problem = "is a board of hobby servos: it has no registers, and does not know its supply"
+                raise ConfigError.at("emulated chain", "model", servo.model, problem)
+            continue
         for name, value in servo.registers.items():
             register = table.registers.get(name)
             if register is None:

@@ -155,11 +155,15 @@ class Board(ABC):
 
 
 class MaestroBoard(Board):
-    """A Pololu Maestro as it leaves the factory: it detects its baud rate, home is off, an error sends all home."""
+    """A Pololu Maestro as it leaves the factory: it detects its baud rate, home is off, an error sends all home.
+
+    "Enable CRC" is on where something stored says so: `crc` of any of its servos.
+    """
 
     def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
         super().__init__(table, servos)
         self.baud: int | None = None
+        self.crc = any(servo.registers.get("crc") for servo in servos)
         self.limits = [self._ticks(*maestro.FACTORY_PULSE_US) for _ in self.channels]
 
     def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes:
@@ -173,7 +177,7 @@ class MaestroBoard(Board):
             return b""
         self._buffer += data
         out = b""
-        while (command := maestro.maybe_command(self._buffer)) is not None:
+        while (command := maestro.maybe_command(self._buffer, crc=self.crc)) is not None:
             out += self._obey(command, now_s)
         return out
 

@@ -7,6 +7,7 @@ import pytest
 
 from sfms_robot.app.bench.campaign import (
     CASES,
+    CORRUPT,
     HALF_DEAD,
     MANY_TURNS,
     MUTE_AT_STOP,
@@ -14,6 +15,7 @@ from sfms_robot.app.bench.campaign import (
     SPECS,
     STORED,
     Outcome,
+    corrupted_bytes,
     one,
     run_campaign,
     table,
@@ -23,7 +25,9 @@ from sfms_robot.app.bench.fuzz import BYTES, fuzz_one
 from sfms_robot.emulator.faults import KINDS
 from sfms_robot.errors import ConfigError
 
-IMPOSSIBLE = {(case, board) for case in (STORED, MANY_TURNS) for board in ("maestro", "ssc32")} | {
+BOARDS = ("maestro", "maestro-crc", "ssc32")
+UNCHECKED = ("maestro", "ssc32")
+IMPOSSIBLE = {(case, board) for case in (STORED, MANY_TURNS) for board in BOARDS} | {
     (MANY_TURNS, family) for family in ("dynamixel1", "scs")
 }
 SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
@@ -81,8 +85,29 @@ def test_bus_that_dies_takes_no_other_with_it(family):
     assert outcome.passed, outcome
 
 
-def test_a_family_that_cannot_have_a_fault_says_so():
-    outcome = one("maestro", "voltage", ticks=10)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_corrupted_byte_moves_no_servo_out_of_its_limits_where_packets_have_a_checksum(family):
+    outcome = one(family, CORRUPT, ticks=500)
+    [(name, said)] = corrupted_bytes([outcome]).items()
+    assert outcome.passed and name == family, outcome
+    if family in UNCHECKED:
+        assert outcome.outside > 0 and said["checksum"] == "no checksum"
+        shortest_us, longest_us = (992, 2000) if family == "maestro" else (500, 2500)  # what the board itself allows
+        assert shortest_us <= outcome.pulse_us[0] <= outcome.pulse_us[1] <= longest_us
+    else:
+        assert outcome.outside == 0 and said["goals"] == "0 outside limits"
+
+
+@pytest.mark.parametrize("family", ["dynamixel2", "sts", "maestro-crc", "ssc32"])
+@pytest.mark.parametrize("fault", ["request-drop", "request-delay"])
+def test_requests_that_come_late_or_never_do_no_harm(family, fault):
+    outcome = one(family, fault, ticks=300)
+    assert outcome.passed and not outcome.outside, outcome
+
+
+@pytest.mark.parametrize("family", BOARDS)
+def test_a_family_that_cannot_have_a_fault_says_so(family):
+    outcome = one(family, "voltage", ticks=10)
     assert not outcome.possible
     assert table([outcome])[0]["passed"] == "-"
 
@@ -103,6 +128,18 @@ def test_old_position_told_as_fresh_is_noticed(rig):
         told.append(rig.tick())
         judge.see({name: replace(r, position_rad=told[-10:][0][name].position_rad) for name, r in told[-1].items()})
     assert judge.stale > 0
+
+
+def test_bad_goal_that_is_taken_is_noticed(rig):
+    class TakesAnything:
+        def write(self, goals_rad, now_s):
+            return None
+
+    rig.tick()
+    rig.try_bad_goals(withheld=False)
+    rig.bus = TakesAnything()
+    with pytest.raises(AssertionError, match="a goal of nan rad is not refused"):
+        rig.try_bad_goals(withheld=False)
 
 
 def test_joint_that_does_not_follow_is_noticed(rig):
@@ -132,6 +169,13 @@ def test_anything_amiss_fails(what):
     fine = Outcome("sts", "drop", 1000, recovered_s=0.1)
     assert fine.passed
     assert not replace(fine, **what).passed
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_goal_outside_limits_is_stated_and_no_failure_only_for_corrupted_bytes_without_a_checksum(family):
+    outcome = Outcome(family, CORRUPT, 1000, recovered_s=0.1, outside=1)
+    assert outcome.passed == (family in UNCHECKED)
+    assert not replace(outcome, case="drop").passed
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -296,12 +296,12 @@ def test_every_model_that_has_a_map_can_be_examined(family):
     assert all(row["voltage_V"] and row["faults"] == "" for row in report["servos"])
 
 
-def board(model: str, family: str, baud: int, rate_hz: float) -> dict:
+def board(model: str, family: str, baud: int, rate_hz: float, registers: dict | None = None, **line) -> dict:
     """What is said of 24 channels of a board."""
-    with launch([EmulatedServo(i, model, baud) for i in range(24)], virtual=True) as chain:
+    with launch([EmulatedServo(i, model, baud, registers=registers or {}) for i in range(24)], virtual=True) as chain:
         sick = Patient(chain, 1, "xl330-m288", ())
         wanted = dict(enumerate([sick.wanted[1]] * 24))
-        return sick.examined(rate_hz, shown="/dev/ttyACM0", family=family, baud=baud, wanted=wanted)
+        return sick.examined(rate_hz, shown="/dev/ttyACM0", family=family, baud=baud, wanted=wanted, **line)
 
 
 @pytest.mark.parametrize("model", ["maestro-24", "ssc-32"])
@@ -312,6 +312,17 @@ def test_a_board_that_answers_is_fit_and_one_that_does_not_comes_with_its_serial
         report = sick.examined(50.0, shown="/dev/ttyACM0", family=family)
     assert told(report, "error") == [f"bus: no {family} board answers"] and report["exit_code"] == 4
     assert ("USB Dual Port" if family == "maestro" else "jumpers") in fix_of(report, "board answers")
+
+
+@pytest.mark.parametrize("stored", [{}, {"crc": 1}])
+@pytest.mark.parametrize("crc", [False, True])
+def test_a_maestro_answers_where_its_crc_setting_is_that_of_the_heads_file(stored, crc):
+    report = board("maestro-24", "maestro", 115_200, 50.0, stored, crc=crc)
+    if crc == bool(stored):
+        assert told(report, "error") == []
+    else:
+        assert told(report, "error") == ["bus: no maestro board answers"]
+        assert "Enable CRC" in fix_of(report, "board answers")
 
 
 def test_a_board_of_hobby_servos_is_opened_and_reckoned_with():

@@ -36,6 +36,7 @@ WRONG = {
     "lag of days": (dict(joint=", lag_ms: 1.0e9"), "joints.jaw.lag_ms = 1000000000.0: .*less than or equal to 500"),
     "deadline of days": (dict(bus=", read_deadline_ms: 1.0e9"), "buses.main.read_deadline_ms = .* to 100"),
     "stagger of days": (dict(bus=", stagger_ms: 1.0e9"), "buses.main.stagger_ms = .* equal to 1000"),
+    "crc of servos": (dict(bus=", crc: true"), "buses.main.crc = True: expected false, as only a Maestro"),
     "register by true": (dict(joint=", safety: {registers: {led: true}}"), "joints.jaw.safety.registers.led = True"),
     "a newer version": (dict(more="version: 2\nunheard_of: 3"), "version = 2 is of a newer sfms-robot; .* version 1"),
     "no version": (dict(more="version: -1"), "version = -1"),

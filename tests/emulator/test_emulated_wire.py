@@ -80,6 +80,44 @@ def test_delayed_reply_comes_after_the_next_one():
     assert ids_in(wire.take(0.01)) == [1, 2]
 
 
+def write_led(servo: int, value: int) -> bytes:
+    return encode_instruction(servo, dxl2.WRITE, b"\x41\x00" + bytes([value]))  # register 65
+
+
+def test_request_that_is_dropped_or_corrupted_is_not_obeyed():
+    wire = wire_of(1, faults=["request-drop@1-2", "request-corrupt@2-3"])
+    for now_s, obeyed in ((0.5, True), (1.5, False), (2.5, False), (3.5, True)):
+        wire.receive(write_led(1, 1), BAUD, now_s)
+        assert bool(wire.take(now_s)) == obeyed
+        assert wire.servo(1).read(65, 1, now_s)[1] == bytes([obeyed])
+        wire.servo(1).write(65, b"\x00", now_s)
+    assert wire.digest()[1] == 4 * len(write_led(1, 1))  # the host has sent them all
+
+
+def test_requests_that_come_late_keep_their_order():
+    wire = wire_of(1, faults=["request-delay@0-1=0.02"])
+    wire.receive(write_led(1, 1), BAUD, 0.99)
+    wire.receive(write_led(1, 0), BAUD, 1.0)  # not delayed, and still behind the other
+    assert wire.take(1.0) == [] and wire.next_s == pytest.approx(1.01)
+    wire.advance(1.01)
+    assert ids_in(wire.take(1.01)) == [1, 1] and wire.servo(1).read(65, 1, 1.01)[1] == b"\x00"
+
+
+def test_answer_to_a_late_request_is_there_by_the_time_it_is_due():
+    wire = wire_of(1, faults=["request-delay=0.002"])
+    wire.receive(sync_read(1), BAUD, 0.0)
+    assert ids_in(wire.take(0.003)) == [1]
+
+
+def test_unplugging_the_adapter_loses_requests_on_their_way():
+    wire = wire_of(1, faults=["request-delay=0.02", "hangup@1-1.01"])
+    wire.receive(write_led(1, 1), BAUD, 0.99)
+    wire.advance(1.005)
+    assert wire.next_s == pytest.approx(1.01)  # the end of the fault, and nothing else
+    wire.advance(2.0)
+    assert wire.take(2.0) == [] and wire.servo(1).read(65, 1, 2.0)[1] == b"\x00"
+
+
 def test_echo_comes_before_the_answer_and_noise_behind():
     wire = wire_of(1, faults=["echo", "noise"])
     request = sync_read(1)

@@ -208,6 +208,7 @@ def test_stale_link_of_a_killed_emulator_is_replaced(tmp_path):
             {},
             "model = 'maestro-24' is a board of hobby servos: it has no registers",
         ),
+        ([EmulatedServo(1, "ssc-32", registers={"crc": 1})], {}, "model = 'ssc-32' is a board of hobby servos"),
         ([EmulatedServo(24, "maestro-24")], {}, r"id = 24 is not a servo id \(0..23\)"),
         ([EmulatedServo(1)], {"faults": ["bang"]}, "has no such kind as 'bang'"),
         ([EmulatedServo(1)], {"faults": ["drop:7"]}, "'drop:7' concerns no servo of this wire"),

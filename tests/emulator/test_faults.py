@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.emulator.device import Reply
-from sfms_robot.emulator.faults import KINDS, Faults, parse_fault
+from sfms_robot.emulator.faults import KINDS, TO_SERVOS, Faults, parse_fault
 from sfms_robot.errors import ConfigError
 
 REPLY = Reply((3,), bytes(range(40)))
@@ -22,6 +22,8 @@ REPLY = Reply((3,), bytes(range(40)))
         ("brownout@1", "brownout", None, 1.0, 1.2, 0.0),
         ("hangup@1-3", "hangup", None, 1.0, 3.0, 1.0),
         ("load:1=-0.25", "load", {1}, 0.0, math.inf, -0.25),
+        ("request-corrupt@1-2=0.3", "request-corrupt", None, 1.0, 2.0, 0.3),
+        ("request-delay", "request-delay", None, 0.0, math.inf, 0.02),
     ],
 )
 def test_spec_is_read(text, kind, ids, start_s, end_s, value):
@@ -41,6 +43,8 @@ def test_spec_is_read(text, kind, ids, start_s, end_s, value):
         ("drop@1.2.3", "holds a number that is none"),
         ("stuck:1=4", "takes no value"),
         ("noise:3", "cannot name ids"),
+        ("request-drop:3", "cannot name ids: request-drop concerns the whole wire"),
+        ("request-drop=2", "is out of range: fraction of requests of request-drop (0..1)"),
         ("voltage", "needs a value in volts"),
         ("drop three", "is no fault"),
         ("", "is no fault"),
@@ -74,6 +78,15 @@ def test_what_becomes_of_a_reply():
     [(wrong, _)] = spoilt("corrupt")
     assert len(wrong) == 40 and sum(a != b for a, b in zip(wrong, REPLY.data, strict=True)) == 1
     assert spoilt("duplicate", "delay=0.01", "drop:4") == [(REPLY.data, 0.01)] * 2
+
+
+def test_faults_of_requests_and_of_replies_stay_apart():
+    faults = Faults(map(parse_fault, ("request-drop", "request-delay=0.01", "drop:3")))
+    assert faults.spoil(REPLY, 0.0) == [] and faults.spoil(Reply((4,), b"x"), 0.0) == [(b"x", 0.0)]
+    assert faults.spoil(Reply((), b"x"), 0.0, TO_SERVOS) == []
+    late = Faults(map(parse_fault, ("request-delay=0.01", "request-corrupt", "delay", "drop")))
+    [(wrong, late_s)] = late.spoil(REPLY, 0.0, TO_SERVOS)
+    assert late_s == 0.01 and sum(a != b for a, b in zip(wrong, REPLY.data, strict=True)) == 1
 
 
 def test_fault_is_only_there_in_its_time_and_for_its_ids():

@@ -124,6 +124,23 @@ def test_board_is_unplugged_when_every_channel_is_dead():
     assert errors(board) == 0
 
 
+CRC_CASES = [
+    (maestro.sealed(maestro.set_target(0, 6000)), 6000, 0),
+    (maestro.sealed(maestro.addressed(maestro.set_target(0, 6000))), 6000, 0),
+    (bytes([maestro.MINI_SSC, 0, 127]), 6000, 0),
+    (maestro.set_target(0, 6000) + b"\x00", 0, maestro.CRC_ERROR),
+    (maestro.set_target(0, 6000), 0, maestro.PROTOCOL_ERROR),  # the next command interrupts it
+]
+
+
+@pytest.mark.parametrize(("sent", "pulse", "error"), CRC_CASES)
+def test_board_with_crc_obeys_what_has_one_and_answers_without(sent, pulse, error):
+    board = maestro_board(channels=[0], registers={"crc": 1})
+    board.receive(sent, 115200, 0.0)
+    answer = board.receive(maestro.sealed(maestro.get_errors()), 115200, 0.0)
+    assert answer == error.to_bytes(2, "little") and board.servo(0).pulse == pulse
+
+
 def test_channel_without_a_servo_is_nobody():
     board = maestro_board(channels=[4])
     assert board.servo(4).id == 4 and board.servo(5) is None

@@ -5,7 +5,7 @@ from emulated_devices import device_of, servos_of
 from emulated_port import EmulatedPort, Straight
 from virtual_time import Time
 
-from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.config import Bus, Safety, load_firmware_map
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 
@@ -13,12 +13,24 @@ LIMIT_RAD = 0.7
 
 
 class Bench:
-    """One board with servos on `channels`, and its bus. `stiff`: channels whose joints hold at the end."""
+    """One board with servos on `channels`, and its bus. `stiff`: channels whose joints hold at the end.
 
-    def __init__(self, model="maestro-24", channels=(0, 1, 2, 5), baud=115200, limit_rad=LIMIT_RAD, stiff=(), **more):
+    `crc`: what the head's file says of the board's "Enable CRC", and what it really is.
+    """
+
+    def __init__(
+        self,
+        model="maestro-24",
+        channels=(0, 1, 2, 5),
+        baud=115200,
+        limit_rad=LIMIT_RAD,
+        stiff=(),
+        crc=(False, False),
+        **more,
+    ):
         firmware_map = load_firmware_map(model)
         self.clock, self.ports = Time(), []
-        self.board = device_of(*servos_of(model, *channels, baud=baud))
+        self.board = device_of(*servos_of(model, *channels, baud=baud, registers={"crc": 1} if crc[1] else {}))
         safety = {True: Safety(stop="hold"), False: Safety()}
         servos = [BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety[i in stiff]) for i in channels]
 
@@ -26,7 +38,8 @@ class Bench:
             self.ports.append(self.new_port(self.board, baud, self.clock))
             return self.ports[-1]
 
-        conversion, more = Straight(firmware_map, limit_rad), {"confirmed": True} | more
+        config = Bus(family=firmware_map.family, baud=baud, crc=crc[0])
+        conversion, more = Straight(firmware_map, limit_rad), {"confirmed": True, "config": config} | more
         self.bus = family_named(firmware_map.family).bus_class()("face", servos, conversion, open_port, baud, **more)
 
     def new_port(self, *rest):

@@ -126,3 +126,14 @@ def test_vendor_sdk_reads_our_fast_status():
     answer, result, _ = Protocol2PacketHandler().fastSyncReadRx(VendorPort(wire), dxl2.BROADCAST, 2 * 6)
     assert result == 0
     assert bytes(answer[:4]) == b"\x00\x01\x01\x02" and bytes(answer[6:10]) == b"\x80\x02\x03\x04"
+
+
+WRITE = encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, bytes.fromhex("74 00 04 00 01 00 08 00 00 02 34 08 00 00"))
+
+
+@pytest.mark.parametrize("at", range(len(WRITE)))
+def test_any_change_of_one_byte_is_detected(at):
+    for change in range(1, 256):
+        wrong = bytearray(WRITE)
+        wrong[at] ^= change
+        assert take(wrong) is None

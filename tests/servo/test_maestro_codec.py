@@ -1,3 +1,5 @@
+import itertools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,6 +34,14 @@ def test_commands_are_built_as_published():
     assert BUILT.items() <= PUBLISHED.items()
 
 
+CRC_PUBLISHED = bytes.fromhex("83 01 17")  # section 5.d of the guide
+
+
+def test_crc_is_the_published_one_and_over_a_packet_with_it_zero():
+    assert maestro.sealed(CRC_PUBLISHED[:2]) == CRC_PUBLISHED
+    assert maestro.crc7(CRC_PUBLISHED) == 0
+
+
 @given(words)
 def test_word_round_trip(value):
     assert maestro.from_word(maestro.word(value)) == value
@@ -49,6 +59,32 @@ def test_reader_gives_back_what_the_builders_made(command, addressed):
     buffer = bytearray(maestro.addressed(command, 7) if addressed else command)
     assert maybe_command(buffer, 7) == Command(command[0], command[1:])
     assert not buffer
+
+
+@given(commands, st.booleans())
+def test_reader_gives_back_commands_with_a_crc(command, addressed):
+    sealed = maestro.addressed(command, 7) if addressed else command
+    if command[0] != maestro.MINI_SSC:
+        sealed = maestro.sealed(sealed)
+    assert byte_by_byte(lambda buffer: maybe_command(buffer, 7, crc=True), sealed) == Command(command[0], command[1:])
+
+
+@pytest.mark.parametrize("addressed", [False, True])
+def test_no_target_changed_in_one_byte_gets_past_the_crc(addressed):
+    command = maestro.set_target(3, 6000)
+    sent = maestro.sealed(maestro.addressed(command, 7) if addressed else command)
+    for at, change in itertools.product(range(len(sent)), range(1, 256)):
+        wrong = bytearray(sent)
+        wrong[at] ^= change
+        while (taken := maybe_command(wrong, 7, crc=True)) is not None:
+            assert taken.error or taken.code not in (maestro.SET_TARGET, maestro.SET_TARGETS), (at, change)
+
+
+def test_byte_that_becomes_ff_begins_a_command_without_a_crc():
+    wrong = bytearray(maestro.sealed(maestro.set_target(3, 2)))
+    wrong[1] = maestro.MINI_SSC
+    assert maybe_command(wrong, crc=True).error
+    assert maybe_command(wrong, crc=True) == Command(maestro.MINI_SSC, bytes([2, 0]))
 
 
 @given(commands, st.booleans())

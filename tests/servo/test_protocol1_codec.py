@@ -117,6 +117,24 @@ def test_flipped_bit_is_no_frame_of_that_servo_with_other_content(data, bit, dra
         assert len(frame.params) < len(data)  # at most a shorter one inside, which its length gives away
 
 
+SYNC_WRITE = encode(protocol1.BROADCAST, protocol1.SYNC_WRITE, bytes.fromhex("1e 02 01 00 02 02 34 01 03 cd 02"))
+
+
+@pytest.mark.parametrize("at", [i for i in range(len(SYNC_WRITE)) if i != 3])
+def test_any_change_of_one_byte_but_the_length_is_detected(at):
+    for change in range(1, 256):
+        wrong = bytearray(SYNC_WRITE)
+        wrong[at] ^= change
+        assert salvage(wrong) == []
+
+
+def test_changed_length_passes_where_a_parameter_happens_to_be_the_right_sum():
+    wrong = bytearray(encode(1, protocol1.WRITE, b"\x1e\x01\x02\xd5"))
+    assert take(bytearray(wrong)) is not None
+    wrong[3] = 5
+    assert take(wrong) == Frame(1, protocol1.WRITE, b"\x1e\x01\x02")  # as sent, and the rest is lost
+
+
 def test_error_bits_about_the_request_are_told_from_those_about_the_servo():
     assert dxl1.refusal_text(dxl1.RANGE | dxl1.OVERLOAD) == "range error"
     assert dxl1.refusal_text(dxl1.OVERLOAD | dxl1.VOLTAGE | dxl1.OVERHEATING) == ""

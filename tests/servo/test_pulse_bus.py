@@ -81,6 +81,34 @@ def test_maestro_takes_neighbours_in_one_command_where_it_can():
     assert [small.port.sent[-1][i] for i in range(0, 16, 4)] == [maestro.SET_TARGET] * 4
 
 
+@pytest.mark.parametrize("model", ["maestro-24", "maestro-6"])
+def test_every_command_to_a_maestro_with_crc_has_one(model):
+    bench = Bench(model, crc=(True, True))
+    held = bench.hold()
+    bench.ticks(held + 0.1, 15)
+    assert list(bench.pulses().values()) == list(bench.bus._conversion.to_ticks(held + 0.1))
+    bench.bus.stop("release")
+    counts = bench.bus.statistics()
+    assert bench.on() == [] and counts["faults"] == [] and counts["errors"] == 0
+
+
+@pytest.mark.parametrize(
+    ("file", "board", "cure"),
+    [(False, True, "expects a CRC: set crc: true for this bus"), (True, False, "expects no CRC: set crc: false")],
+)
+def test_wrong_crc_setting_is_named_with_its_cure(file, board, cure):
+    bench = Bench(crc=(file, board))
+    with pytest.raises(BusError, match=rf"^bus 'face' on emulated at 115200 baud: the maestro-24 {cure}.*'Enable CRC'"):
+        bench.bus.connect()
+    assert bench.port.closed
+
+
+def test_connecting_to_a_maestro_with_crc_leaves_no_error_behind():
+    bench = Bench(crc=(True, True))
+    bench.bus.connect()
+    assert bench.board.errors == 0
+
+
 def test_slow_wire_carries_the_newest_goals_and_never_piles_up():
     bench = Bench("ssc-32", channels=range(24), baud=9600)
     bench.hold()

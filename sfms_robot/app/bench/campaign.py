@@ -4,14 +4,18 @@ One run: four emulated servos follow a slow wave under the limiter, as in the lo
 in after a while, and when it has passed they get time to come back; or the servos are not as the head's file says from
 the start, or half of them are lost for good. Judged from outside, by what the emulated servos hold and where they are:
 
-    escaped       an exception left the bus that should not have
-    outside       goals outside the limits of a joint that a servo held, and bad goals that were not refused
+    escaped       an exception left the bus that should not have, or a bad goal was not refused
+    outside       goals outside the limits of a joint that a servo held
+    pulse_us      the shortest and longest pulse that a board made
     stale         readings that tell another position than the servo had at the time they name
     recovered_s   from the end of the fault until every joint is read, has torque and follows its goal, for good
     named         joints that stay out, with their fault named: protection that is latched, or a servo left alone
     refused       what the bus said at the start, of servos that contradict the head's file
     off_s, stop_s until the torque was off, and until `stop` returned, where nobody answers
     left_on       servos that had torque when all was over
+
+What a corrupted byte of the host can do is a statement per family (`corrupted_bytes`). On a board without a checksum
+goals outside the limits are part of it, and no failure.
 
 A run is the same every time: time is virtual, and the dice are seeded.
 """
@@ -20,19 +24,29 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.bench.campaign_rig import FAMILIES, LIMIT_DEG, RATE_HZ, RECOVERY_S, Judge, Rig, head_of, plugged_in
+from sfms_robot.app.bench.campaign_rig import (
+    FAMILIES,
+    LIMIT_DEG,
+    RATE_HZ,
+    RECOVERY_S,
+    Judge,
+    Rig,
+    head_of,
+    plugged_in,
+)
 from sfms_robot.app.bench.measure import Told
 from sfms_robot.app.wiring import emulated
-from sfms_robot.config import Head, load_firmware_map
+from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.faults import KINDS
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.port import Port, WrappedPort
+from sfms_robot.servo.port import WrappedPort
 
 TICKS: Final = 1000
 _QUIET, _FAULTY = 0.1, 0.5  # fraction of the ticks before the fault, and with it
@@ -51,6 +65,9 @@ SPECS: Final[Mapping[str, str]] = {
     "truncate": "truncate{two}{when}=0.3",
     "echo": "echo{when}",
     "noise": "noise{when}=0.5",
+    "request-drop": "request-drop{when}=0.3",
+    "request-corrupt": "request-corrupt{when}=0.3",
+    "request-delay": "request-delay{when}=0.03",
     "silent": "silent{one}{when}",
     "mute": "mute{one}{when}",
     "stuck": "stuck{one}{when}",
@@ -61,6 +78,7 @@ SPECS: Final[Mapping[str, str]] = {
     "brownout": "brownout{when}",
     "hangup": "hangup{when}",
 }
+CORRUPT: Final = "request-corrupt"
 STORED, MANY_TURNS, OUTSIDE = "stored limits", "many turns", "found outside"
 HALF_DEAD, MUTE_AT_STOP = "one bus of two dead", "mute at stop"
 STARTS: Final = (STORED, MANY_TURNS, OUTSIDE)
@@ -80,6 +98,7 @@ class Outcome:
     possible: bool = True
     escaped: str | None = None
     outside: int = 0
+    pulse_us: Sequence[float] = ()
     stale: int = 0
     recovered_s: float | None = None
     named: Sequence[str] = ()
@@ -101,16 +120,17 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        harmless = self.escaped is None and not self.outside and not self.stale and not self.left_on
+        unchecked = self.case == CORRUPT and not FAMILIES[self.family][-1]
+        harmless = self.escaped is None and (unchecked or not self.outside) and not self.stale and not self.left_on
         return not self.possible or (harmless and self.as_stated)
 
 
 @dataclass
 class SilencePort(WrappedPort):
-    """A port on which silence costs time; what is written arrives at once, and is said."""
+    """A port on which silence costs time; what is written arrives at once, and `arrived` is called."""
 
     baud: int
-    arrived: Callable[[], None] = field(default=lambda: None)
+    arrived: Callable[[], None]
 
     def write(self, data: bytes) -> None:
         self.inner.write(data)
@@ -125,41 +145,32 @@ class SilencePort(WrappedPort):
 
 
 def one(family: str, case: str, ticks: int = TICKS) -> Outcome:
-    """`ticks` of one family in one case."""
+    """Run `ticks` of one family in one case."""
     if case == MUTE_AT_STOP:
         return _mute_at_stop(family)
-    if case == HALF_DEAD:
-        return _half_dead(family, ticks)
-    head = head_of(family)
-    servos = _found(head, case) if case in STARTS else emulated(head)["main"]
-    if servos is None:
+    head = head_of(family, _FAILS_AFTER_S if case == HALF_DEAD else None)
+    servos = emulated(head)
+    if case in STARTS:
+        servos["main"] = _found(servos["main"], case)
+    if not servos["main"] or (case == "voltage" and load_firmware_map(servos["main"][0].model).tick_us):
         return Outcome(family, case, 0, possible=False)
-    with plugged_in(head, {"main": servos}) as rig:
+    with plugged_in(head, servos) as rig:
         try:
             rig.hold()
         except ServoError as error:
             return _at_the_end(rig, Outcome(family, case, 0, refused=str(error)))
-        start_s = rig.clock.now_s() + _QUIET * ticks / RATE_HZ
-        end_s = start_s + _FAULTY * ticks / RATE_HZ
-        if case in KINDS and not _injected(rig, _spec(case, rig.ids, start_s, end_s)):
-            return Outcome(family, case, 0, possible=False)
-        return _at_the_end(rig, _ride(rig, Outcome(family, case, ticks), end_s if case in KINDS else start_s))
+        over_s = start_s = rig.clock.now_s() + _QUIET * ticks / RATE_HZ
+        if case == HALF_DEAD:
+            rig.chains["other"].inject(f"silent@{start_s:g}")
+        elif case in KINDS:
+            over_s += _FAULTY * ticks / RATE_HZ
+            names = {"one": f":{rig.ids[1]}", "two": f":{rig.ids[1]},{rig.ids[2]}"}
+            rig.chains["main"].inject(SPECS[case].format(when=f"@{start_s:g}-{over_s:g}", **names))
+        return _ride(rig, Outcome(family, case, ticks), over_s)
 
 
-def _injected(rig: Rig, spec: str) -> bool:
-    """Whether the servos of this family can have that fault."""
-    try:
-        rig.chains["main"].inject(spec)
-    except BusError as error:
-        if "concerns no servo" not in str(error):
-            raise
-        return False
-    return True
-
-
-def _found(head: Head, case: str) -> list[EmulatedServo] | None:
-    """The head's servos, two of them not as its file says; None where this family cannot be found like that."""
-    servos = list(emulated(head)["main"])
+def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
+    """Return the servos, two of them not as the head's file says; none where the family cannot be found like that."""
     table = load_firmware_map(servos[0].model)
     turn = round(table.ticks_per_revolution)
     changes: list[dict[str, Any]]
@@ -169,13 +180,13 @@ def _found(head: Head, case: str) -> list[EmulatedServo] | None:
     elif case == STORED:
         names = [name for name in table.registers if name.endswith(("position_limit", "angle_limit"))]
         if not names:
-            return None
-        sides = {"min": -1, "cw_": -1, "max": 1, "ccw": 1}
-        narrow = {name: table.center_ticks + sides[name[:3]] * turn // 20 for name in names}
+            return []
+        sides = {name: 1 if name.startswith(("max", "ccw")) else -1 for name in names}
+        narrow = {name: table.center_ticks + side * turn // 20 for name, side in sides.items()}
         changes = [{"registers": narrow}] * 2
     else:
         if not table.registers or table.ticks_per_revolution != turn:
-            return None  # a board, or a potentiometer, which knows one turn only
+            return []  # a board, or a potentiometer, which knows one turn only
         registers = {}
         if "multi_turn_offset" in table.registers:
             registers = {"cw_angle_limit": 4095, "ccw_angle_limit": 4095}
@@ -185,87 +196,64 @@ def _found(head: Head, case: str) -> list[EmulatedServo] | None:
     return [servos[0], *(replace(s, **change) for s, change in zip(servos[1:3], changes, strict=True)), servos[3]]
 
 
-def _ride(rig: Rig, outcome: Outcome, end_s: float) -> Outcome:
-    """Its ticks, judged; what is wrong is over at `end_s`."""
-    judge, accepted, ticks = Judge(rig), 0, outcome.ticks
-    for tick in range(ticks):
+def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
+    """Run the ticks and judge them; the trouble is over at `over_s`, or half of the buses die then.
+
+    A bus that dies is reported once, by a BusError, and the other one continues.
+    """
+    judge, reports, dies = Judge(rig), 0, outcome.case == HALF_DEAD
+    for tick in range(outcome.ticks):
+        if dies and rig.clock.now_s() >= over_s:
+            judge.away = frozenset({2, 3})
         try:
-            readings = rig.tick()
-            judge.see(readings)
-            if tick % _BAD_GOALS_EVERY == 0:
-                accepted += rig.refuses(readings[rig.bus.joints[-1]])
+            judge.see(rig.tick())
+            if tick % _BAD_GOALS_EVERY == 0 and not dies:
+                rig.try_bad_goals(bool(judge.named))
         except Exception as error:  # what escapes is what is looked for
-            escaped = f"{type(error).__name__}: {error}"
-            return replace(outcome, ticks=tick, escaped=escaped, outside=judge.outside + accepted, stale=judge.stale)
-    return _judged(replace(outcome, outside=accepted), judge, end_s)
-
-
-def _judged(outcome: Outcome, judge: Judge, end_s: float) -> Outcome:
-    recovered_s, outside = judge.recovered_s(end_s), outcome.outside + judge.outside
-    return replace(outcome, outside=outside, stale=judge.stale, recovered_s=recovered_s, named=judge.named)
+            reports += 1
+            if not dies or reports > 1 or not isinstance(error, BusError):
+                outcome = replace(outcome, ticks=tick, escaped=f"{type(error).__name__}: {error}")
+                break
+    if dies and not reports and rig.clock.now_s() > over_s + _SAID_BY_S:
+        outcome = replace(outcome, escaped="nothing: the failure of a bus was not reported")
+    for chain in rig.chains.values():
+        chain.clear_faults()  # what was dead is plugged in again: torque off has to reach it
+    outcome = replace(
+        outcome,
+        outside=judge.outside,
+        pulse_us=[edge(judge.pulses_us) for edge in (min, max) if judge.pulses_us],
+        stale=judge.stale,
+        recovered_s=judge.recovered_s(over_s),
+        named=judge.named,
+    )
+    return _at_the_end(rig, outcome)
 
 
 def _at_the_end(rig: Rig, outcome: Outcome) -> Outcome:
-    """Torque off; who has it all the same?"""
+    """Switch torque off, and count the servos that still have it."""
     rig.bus.stop("release")
     rig.bus.close()
     return replace(outcome, left_on=sum(bool(state["torque"]) for state in rig.states()))
 
 
-def _half_dead(family: str, ticks: int) -> Outcome:
-    """Two buses; after a while nobody answers on one of them any more, which is said once; the other goes on."""
-    head = head_of(family, _FAILS_AFTER_S)
-    outcome, said = Outcome(family, HALF_DEAD, ticks), 0
-    with plugged_in(head) as rig:
-        rig.hold()
-        judge, dead_s = Judge(rig), rig.clock.now_s() + _QUIET * ticks / RATE_HZ
-        rig.chains["other"].inject(f"silent@{dead_s:g}")
-        for tick in range(ticks):
-            if rig.clock.now_s() >= dead_s:
-                judge.away = frozenset({2, 3})
-            try:
-                judge.see(rig.tick())
-            except Exception as error:  # one BusError is the news that a bus has failed
-                said += 1
-                if said > 1 or not isinstance(error, BusError):
-                    outcome = replace(outcome, ticks=tick, escaped=f"{type(error).__name__}: {error}")
-                    break
-        if not said and rig.clock.now_s() > dead_s + _SAID_BY_S:
-            outcome = replace(outcome, escaped="nothing: nobody said that a bus has failed")
-        rig.chains["other"].clear_faults()  # plugged in again: torque off has to reach it
-        return _at_the_end(rig, _judged(outcome, judge, dead_s))
-
-
 def _mute_at_stop(family: str) -> Outcome:
-    """Everybody hears and nobody answers when `stop` is called, and silence costs time."""
-    head, ports = head_of(family), list[SilencePort]()
+    """Call `stop` while all obey and none answers, and silence costs time."""
+    head, start_s, off_s = head_of(family), np.inf, np.inf
 
-    def wrapped(port: Port) -> Port:
-        ports.append(SilencePort(port, head.buses["main"].baud))
-        return ports[-1]
+    def arrived() -> None:
+        nonlocal off_s
+        if rig.clock.now_s() >= start_s and not any(state["torque"] for state in rig.states()):
+            off_s = min(off_s, rig.clock.now_s() - start_s)
 
-    with plugged_in(head, wrap=wrapped) as rig:
+    with plugged_in(head, wrap=lambda port: SilencePort(port, head.buses["main"].baud, arrived)) as rig:
         rig.hold()
         for _ in range(round(_QUIET * TICKS)):
             rig.tick()
         rig.chains["main"].inject("mute")
-        start_s, off_s = rig.clock.now_s(), np.inf
-
-        def arrived() -> None:
-            nonlocal off_s
-            if not any(state["torque"] for state in rig.states()):
-                off_s = min(off_s, rig.clock.now_s() - start_s)
-
-        ports[-1].arrived = arrived
+        start_s = rig.clock.now_s()
         rig.bus.stop("release")
         stop_s = rig.clock.now_s() - start_s
-        ports[-1].arrived = lambda: None
         return _at_the_end(rig, Outcome(family, MUTE_AT_STOP, 0, off_s=float(off_s), stop_s=stop_s))
-
-
-def _spec(fault: str, ids: Sequence[int], start_s: float, end_s: float) -> str:
-    when = f"@{start_s:g}-{end_s:g}"
-    return SPECS[fault].format(one=f":{ids[1]}", two=f":{ids[1]},{ids[2]}", when=when)
 
 
 def run_campaign(
@@ -274,27 +262,43 @@ def run_campaign(
     ticks: int = TICKS,
     progress: Callable[[str], None] = lambda line: None,
 ) -> list[Outcome]:
-    """Every case on every family."""
-    cases = list(cases)
+    """Run every case on every family."""
     out = []
-    for family in families:
-        for case in cases:
-            progress(f"{family}: {case}")
-            out.append(one(family, case, ticks))
+    for family, case in product(families, cases):
+        progress(f"{family}: {case}")
+        out.append(one(family, case, ticks))
     return out
 
 
 def measure(say: Callable[[str], None]) -> Told:
-    """`run_campaign`, as `bench` tells it."""
+    """Return `run_campaign` in the form of a bench."""
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
     outcomes = run_campaign(progress=say)
     plain = [asdict(each) | {"passed": each.passed} for each in outcomes]
-    passed = all(each.passed for each in outcomes)
-    return Told({"passed": passed, "runs": plain}, table(outcomes), passed=passed)
+    passed, corrupted = all(each["passed"] for each in plain), corrupted_bytes(outcomes)
+    lines = [f"{family}, corrupted bytes: {', '.join(said.values())}" for family, said in corrupted.items()]
+    return Told({"passed": passed, "runs": plain, "corrupted_bytes": corrupted}, table(outcomes), lines, passed)
+
+
+def corrupted_bytes(outcomes: Sequence[Outcome]) -> dict[str, dict[str, str]]:
+    """Return, per family, its checksum and what came of corrupted requests, in words."""
+    return {
+        each.family: {
+            "checksum": FAMILIES[each.family][-1] or "no checksum",
+            "goals": f"{each.outside} outside limits",
+            "pulses": "{:g} to {:g} us".format(*each.pulse_us) if each.pulse_us else "no pulses",
+        }
+        for each in outcomes
+        if each.case == CORRUPT
+    }
 
 
 def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """A row per run, as printed."""
+    """Return a row per run, as printed."""
+
+    def short(value: float | None) -> float | None:
+        return None if value is None else round(value, 3)
+
     return [
         {
             "family": each.family,
@@ -302,10 +306,10 @@ def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
             "escaped": each.escaped or 0,
             "outside": each.outside,
             "stale": each.stale,
-            "back s": None if each.recovered_s is None else round(each.recovered_s, 2),
+            "back s": short(each.recovered_s),
             "out": len(each.named) + (each.refused is not None),
-            "off s": None if each.off_s is None else round(each.off_s, 3),
-            "stop s": None if each.stop_s is None else round(each.stop_s, 3),
+            "off s": short(each.off_s),
+            "stop s": short(each.stop_s),
             "left on": each.left_on,
             "passed": ("yes" if each.passed else "NO") if each.possible else "-",
         }

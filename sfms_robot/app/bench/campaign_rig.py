@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Final
 
 import numpy as np
@@ -31,15 +31,16 @@ _STALE_TICKS: Final = 3  # rounding, and what the servo moves while it answers
 _FRESH_S: Final = 0.3
 _FOLLOWS_RAD: Final = 0.15
 
-# Family -> (bus family, model, ids, baud).
-FAMILIES: Final[Mapping[str, tuple[str, str, Sequence[int], int]]] = {
-    "dynamixel2": ("dynamixel", "xl330-m288", (1, 2, 3, 4), 1_000_000),
-    "dynamixel1": ("dynamixel1", "ax-12a", (1, 2, 3, 4), 1_000_000),
-    "dynamixel1-mx": ("dynamixel1", "mx-28-1.0", (1, 2, 3, 4), 1_000_000),
-    "sts": ("feetech", "sts3215", (1, 2, 3, 4), 1_000_000),
-    "scs": ("feetech", "scs0009", (1, 2, 3, 4), 1_000_000),
-    "maestro": ("maestro", "maestro-24", (0, 1, 2, 5), 115_200),
-    "ssc32": ("ssc32", "ssc-32", (0, 1, 2, 5), 115_200),
+# Family -> (bus family, model, ids, baud, what its servos or board check a packet with; "" where they take any byte).
+FAMILIES: Final[Mapping[str, tuple[str, str, Sequence[int], int, str]]] = {
+    "dynamixel2": ("dynamixel", "xl330-m288", (1, 2, 3, 4), 1_000_000, "CRC-16"),
+    "dynamixel1": ("dynamixel1", "ax-12a", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "dynamixel1-mx": ("dynamixel1", "mx-28-1.0", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "sts": ("feetech", "sts3215", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "scs": ("feetech", "scs0009", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "maestro": ("maestro", "maestro-24", (0, 1, 2, 5), 115_200, ""),
+    "maestro-crc": ("maestro", "maestro-24", (0, 1, 2, 5), 115_200, "CRC-7"),
+    "ssc32": ("ssc32", "ssc-32", (0, 1, 2, 5), 115_200, ""),
 }
 
 
@@ -50,20 +51,19 @@ def head_of(family: str, reconnect_s: float | None = None) -> Head:
     """
     if family not in FAMILIES:
         raise ConfigError.at("campaign", "family", family, "is not a family", FAMILIES)
-    kind, model, ids, baud = FAMILIES[family]
+    kind, model, ids, baud, checksum = FAMILIES[family]
     center = load_firmware_map(model).center_ticks
-    bus: dict[str, Any] = {"family": kind, "baud": baud, "rate_hz": RATE_HZ}
-    if reconnect_s is None:
-        buses, names = {"main": bus}, ["main"] * len(ids)
-    else:
+    bus: dict[str, Any] = {"family": kind, "baud": baud, "rate_hz": RATE_HZ, "crc": checksum == "CRC-7"}
+    names = ["main"] * len(ids)
+    if reconnect_s is not None:
         bus["reconnect_s"] = reconnect_s
-        buses, names = {"main": bus, "other": bus}, ["main", "main", "other", "other"]
+        names[2:] = ["other", "other"]
     joint = {"model": model, "zero_ticks": center, "limits": "all"}
     reach = {"min_deg": -LIMIT_DEG, "max_deg": LIMIT_DEG}
     plain: dict[str, Any] = {
         "name": "campaign",
         "description": f"four {model}",
-        "buses": buses,
+        "buses": dict.fromkeys(names, bus),
         "limits": {"all": {"speed_deg_s": 120, "acceleration_deg_s2": 1500, "jerk_deg_s3": 90000}},
         "joints": {f"joint{i}": {**joint, **reach, "id": i, "bus": on} for i, on in zip(ids, names, strict=True)},
     }
@@ -79,7 +79,8 @@ class Rig:
         self._wires = [chains[joint.bus] for joint in head.joints.values()]
         self.conversion = calibration_of(head.joints)
         self._limiter = JerkLimiter(JointLimits.of(head), 1.0 / RATE_HZ)
-        self.tells_position = all("position" in told for told in self.bus.capabilities.values())
+        [model] = {joint.model for joint in head.joints.values()}
+        self.tick_us = load_firmware_map(model).tick_us or 0.0  # of a board, which reports no position; else 0
 
     def hold(self) -> None:
         self.bus.connect()
@@ -113,21 +114,19 @@ class Rig:
         angle = self._centre + way * math.sin(phase)
         return np.array([angle, way * turn * math.cos(phase), -way * turn * turn * math.sin(phase)])
 
-    def refuses(self, reading: Reading) -> int:
-        """Bad goals of the last joint that are not refused; its goals are withheld while its `reading` has a fault."""
-        out_of_range = (
-            () if reading.fault is not None else (math.radians(LIMIT_DEG) + 0.5, -math.radians(LIMIT_DEG) - 0.5)
-        )
-        accepted = 0
-        for bad in (math.nan, math.inf, *out_of_range):
-            goals = self.goals.copy()
-            goals[-1] = bad
-            try:
-                self.bus.write(goals, self.clock.now_s())
-            except ValueError:
-                continue
-            accepted += 1
-        return accepted
+    def try_bad_goals(self, withheld: bool) -> None:
+        """Send bad goals of the last joint. Raises AssertionError for one that is not refused.
+
+        Those out of range are left out where a fault or the way back of a joint may hold its goals back.
+        """
+        bad_rad = [math.nan, math.inf]
+        if not withheld and self.states()[-1]["goal"] == self.conversion.to_ticks(self.goals)[-1]:
+            beyond_rad = math.radians(LIMIT_DEG) + 0.5
+            bad_rad += [beyond_rad, -beyond_rad]
+        for bad in bad_rad:
+            with suppress(ValueError):
+                self.bus.write(np.array([*self.goals[:-1], bad]), self.clock.now_s())
+                raise AssertionError(f"a goal of {bad:g} rad is not refused")
 
     def states(self) -> list[dict[str, Any]]:
         """What an onlooker sees of every servo now."""
@@ -151,6 +150,7 @@ class Judge:
         self._shafts: list[Doubles] = []
         self._slack_rad = _STALE_TICKS / np.abs(rig.conversion.ticks_per_rad)
         self.outside = self.stale = 0
+        self.pulses_us: list[float] = []
         self.well_since_s: float | None = None
         self.named: list[str] = []
 
@@ -161,6 +161,8 @@ class Judge:
         for index, state in enumerate(states):
             if state["torque"] and state["goal"] is not None:
                 self._see_goal(index, state["goal"])
+                if rig.tick_us:
+                    self.pulses_us.append(state["pulse"] * rig.tick_us)
         for index, reading in enumerate(readings.values()):
             self.stale += self._misdated(index, reading)
         seen = [(i, joint, r) for i, (joint, r) in enumerate(readings.items()) if i not in self.away]
@@ -192,8 +194,8 @@ class Judge:
     def _well(self, index: int, reading: Reading, state: Mapping[str, Any], shaft_rad: float) -> bool:
         if reading.fault is not None:
             return True  # out of the game, and says why
-        told = not self._rig.tells_position or reading.age_s < _FRESH_S
-        return told and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
+        told = self._rig.tick_us or reading.age_s < _FRESH_S
+        return bool(told) and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
 
 
 @contextmanager

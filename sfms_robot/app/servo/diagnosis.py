@@ -28,7 +28,8 @@ _MEASURED: Final = {"input voltage": "voltage", "overheating": "temperature"}
 _POLOLU: Final = "1ffb"
 _BOARD_HELP: Final = {
     "maestro": "use the first of its two USB ports (command port) with serial mode USB Dual Port or USB Chained, or "
-    "its RX and TX with serial mode UART at the baud of the head's file; Pololu's Maestro Control Center sets the mode",
+    "its RX and TX with serial mode UART at the baud of the head's file; Pololu's Maestro Control Center sets the "
+    "mode, and Enable CRC, which has to be what `crc` of the bus says",
     "ssc32": "set the board's baud jumpers to the baud of the head's file; an SSC-32U leaves the factory at 9600",
 }
 _HOT_C: Final = 10  # this close to its limit a servo is about to switch off

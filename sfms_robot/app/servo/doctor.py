@@ -39,6 +39,7 @@ from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_s
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
+from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
@@ -74,6 +75,7 @@ class Line:
     wanted: dict[int, Wanted]
     head: str | None = None
     ports: str | None = None
+    crc: bool = False
 
 
 def examine(
@@ -171,7 +173,8 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
     for name, device in where.items():
         bus = described.buses[name]
         shown = SIM if port == SIM else device
-        yield Line(name, device, shown, bus.family, bus.baud, bus.rate_hz, _wanted(described, name), head, port)
+        want = _wanted(described, name)
+        yield Line(name, device, shown, bus.family, bus.baud, bus.rate_hz, want, head=head, ports=port, crc=bus.crc)
 
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
@@ -276,22 +279,22 @@ def _clear_turns(wire: Wire, seen: FoundServo) -> None:
         raise ServoError(f"id {seen.id} does not forget its turns: {refusal if answer else 'no answer'}")
 
 
-def _board_answers(family: str, port: Port) -> bool | None:
-    """Whether the board answers the one question that it has; None where nothing can be asked."""
-    question, size = (maestro.addressed(maestro.get_errors()), 2) if family == "maestro" else (ssc32.query_moving(), 1)
-    port.discard_input()
-    port.write(question)
-    end_s, data = port.now_s() + _BOARD_S, bytearray()
-    while len(data) < size and (part := port.read(size, end_s)):
-        data += part
-    return len(data) >= size
+def _board_answers(line: Line, port: Port) -> bool:
+    """Return whether the board answers the one question that it has, and not before its CRC where the head has one."""
+    wire = RateLimitedPort(port, _first_baud(line), _BOARD_S)
+    question, size = ssc32.query_moving(), 1
+    if line.family == "maestro":
+        question, size = maestro.addressed(maestro.get_errors()), 2
+    parts = [question, bytes([maestro.crc7(question)])] if line.crc else [question]
+    answers = [wire.exchange(part, size) for part in parts]
+    return answers.pop() is not None and not any(answers)
 
 
 def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], dict[str, Any]]:
     """What can be said of a board of hobby servos, whose port could be opened."""
     budget = board_budget(line.family, max(1, len(line.wanted)), _first_baud(line))
     command = Command(line.shown, line.family)
-    answers = _board_answers(line.family, port)
+    answers = _board_answers(line, port)
     found = judge_board(line.family, len(line.wanted), answers, adapter)
     findings = [*found, *judge_rate(budget, line.rate_hz, None, command)]
     facts = {"baud": budget.baud, "rate_hz": line.rate_hz, "servos": [], "fixed": [], "fast_sync_read": None}

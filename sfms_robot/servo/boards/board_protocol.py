@@ -25,7 +25,7 @@ class BoardStatus(NamedTuple):
 
 
 class BoardProtocol(Protocol):
-    """Bytes to and from one kind of board. Pure but for `read_pulses`, which is handed the port."""
+    """Bytes to and from one kind of board. Pure but for `misfit` and `read_pulses`, which are handed the port."""
 
     @property
     def status_length(self) -> int:
@@ -33,6 +33,12 @@ class BoardProtocol(Protocol):
 
     def status_request(self, restarted: bool) -> bytes:
         """Asks the board for its status; `restarted`: it may have been switched off since it last answered."""
+
+    def misfit(self, exchange: Exchange, present: bool) -> str | None:
+        """Return how the board is set otherwise than the head's file says, and the cure; None when it is not.
+
+        `present`: it has answered `status_request`.
+        """
 
     def decode_status(self, answer: bytes) -> BoardStatus | None:
         """None for what is no answer."""

@@ -89,6 +89,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._confirmed = confirmed
         self._lowest = np.array([servo.min_rad for servo in servos])
         self._highest = np.array([servo.max_rad for servo in servos])
+        self._crc = config is not None and config.crc
         table = board_of(name, servos)
         self.model = table.model
         if beyond := pulses_beyond(servos, conversion, table, table.pulse_us or (0.0, 0.0)):
@@ -131,12 +132,18 @@ class PulseBus(WireBus[RateLimitedPort]):
     # --- start and stop -----------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open and find the board. Pulses are left as they are. Raises PortError, or BusError when nobody answers."""
+        """Open and find the board, pulses left unchanged.
+
+        Raises PortError; BusError when the board does not answer, or is set otherwise than the head's file says.
+        """
         wire = self._open()
         self._forget()
         self._off, self._off_unsent = None, False
         try:
-            if not self._present(wire):
+            present = self._present(wire)
+            if misfit := self._protocol.misfit(wire.exchange, present):
+                raise self._absent(wire, f"the {self.model} {misfit}")
+            if not present:
                 raise self._absent(wire)
             self._pulses = self._protocol.read_pulses(wire.exchange, self._channels) or {}
         except BaseException:
@@ -148,8 +155,9 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _open(self) -> RateLimitedPort:
         return RateLimitedPort(self._open_port(), self._baud, self._read_deadline_s)
 
-    def _absent(self, wire: RateLimitedPort) -> BusError:
-        return BusError(f"bus {self.name!r} on {wire.port.name} at {self._baud} baud: no {self.model} answers")
+    def _absent(self, wire: RateLimitedPort, problem: str = "") -> BusError:
+        problem = problem or f"no {self.model} answers"
+        return BusError(f"bus {self.name!r} on {wire.port.name} at {self._baud} baud: {problem}")
 
     def _present(self, wire: RateLimitedPort) -> bool:
         return any(self._answers(wire, restarted) for _ in range(_TRIES) for restarted in (False, True))

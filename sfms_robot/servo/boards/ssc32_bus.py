@@ -27,6 +27,9 @@ class _Ssc32:
         """After a restart, a carriage return in front ends whatever line noise had begun."""
         return b"\r" * restarted + ssc32.query_moving()
 
+    def misfit(self, exchange: Exchange, present: bool) -> str | None:
+        return None
+
     def decode_status(self, answer: bytes) -> BoardStatus | None:
         return BoardStatus() if answer in (ssc32.DONE, ssc32.MOVING) else None
 

@@ -3,10 +3,15 @@
 1. A command byte has its top bit set, data bytes do not; so a reader that lost its place finds it again at the next
    command byte. Words of 14 bits travel low seven bits first. (The one exception, Mini SSC, takes 0..254.)
 2. Compact protocol: command, data. Pololu protocol, for several boards on one wire: AA, device number, command
-   without its top bit, data. (A third form, with CRC, is not spoken here.)
+   without its top bit, data. A board whose setting "Enable CRC" is on expects one byte more behind either, the CRC-7
+   of all bytes before it; its answers carry none.
 3. Targets and positions are in quarter microseconds of pulse; target 0 switches the pulses off.
 4. A board that detects its baud rate hears nothing before the byte AA.
 5. Only two bytes or one ever come back, without any frame: to `GET_POSITION`, `GET_MOVING` and `GET_ERRORS`.
+
+The CRC-7 detects any change of one byte that leaves the packet its length. (A CRC of 7 bits misses one such change,
+0x91. That one flips the top bit, and rule 1 detects it.) Where a changed byte begins another command, the CRC of that
+one fits by chance in 1 of 128; Mini SSC has none.
 
 Source: Pololu Maestro Servo Controller User's Guide, pololu.com/docs/0J40, sections 4.b and 5.c to 5.f.
 """
@@ -35,10 +40,12 @@ FACTORY_PULSE_US: Final = (992, 2000)  # of every channel; wider is set over USB
 
 # Bits of the error register, section 4.e; bits 6 to 8 are the script's.
 SIGNAL_ERROR: Final = 1 << 0  # Serial Signal Error: a stop bit was not where it should be
+CRC_ERROR: Final = 1 << 3  # Serial CRC Error: the byte behind a command was not its CRC
 PROTOCOL_ERROR: Final = 1 << 4  # Serial Protocol Error: a command that is none, or one cut short
 TIMEOUT_ERROR: Final = 1 << 5  # Serial Timeout: no command for as long as its setting says
 WIRE_ERRORS: Final = 0x1F  # bytes were lost or damaged on the way: nothing is wrong with the board itself
 
+_POLYNOMIAL: Final = 0x91  # of the CRC, section 5.d
 _DATA_LENGTH: Final = {
     SET_TARGET: 3,
     SET_SPEED: 3,
@@ -91,6 +98,21 @@ def get_errors() -> bytes:
     return bytes([GET_ERRORS])
 
 
+def crc7(packet: bytes) -> int:
+    """Return the CRC of a packet, 0..127, worked out from the lowest bit of each byte on; 0 for one with its CRC."""
+    crc = 0
+    for byte in packet:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc ^ _POLYNOMIAL if crc & 1 else crc) >> 1
+    return crc
+
+
+def sealed(packet: bytes) -> bytes:
+    """Append its CRC to a command, compact or addressed."""
+    return packet + bytes([crc7(packet)])
+
+
 def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
     """A compact command in the Pololu protocol, for one of several boards on a wire.
 
@@ -99,8 +121,10 @@ def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
     return bytes([BAUD_INDICATION, device, command[0] & 0x7F]) + command[1:]
 
 
-def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE) -> Command | None:
+def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = False) -> Command | None:
     """Take the next command for board `device` off the front of `buffer`, or None: more bytes are needed.
+
+    `crc`: a CRC byte follows every command but Mini SSC.
 
     What a board would call an error comes as a Command with `error` set and the offending bytes removed. Commands to
     other boards are dropped silently. What stays in the buffer after None is at most one unfinished command.
@@ -128,6 +152,8 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE) -> Command | 
         if end < 0:
             del buffer[:start]
             return Command(code, error=PROTOCOL_ERROR)
+        checked = crc and code != MINI_SSC
+        end += checked
         cut = next((i for i in range(start, min(end, len(buffer))) if code != MINI_SSC and buffer[i] >= 0x80), None)
         if cut is not None:  # another command interrupts this one
             del buffer[:cut]
@@ -138,7 +164,9 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE) -> Command | 
         del buffer[:end]
         if other:
             continue
-        return Command(code, whole[start:])
+        if checked and crc7(whole):
+            return Command(code, error=CRC_ERROR)
+        return Command(code, whole[start : end - checked])
     return None
 
 

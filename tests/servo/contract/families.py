@@ -22,15 +22,21 @@ STARTS_RAD = (-0.2, 0.0, 0.4, 0.1)
 
 @dataclass(frozen=True)
 class Family:
-    """`bus`: its name in `servo.families`. `other`: a model that is not `model`, and says so when it is asked; None
-    where nobody can tell.
+    """`bus`: its name in `servo.families`. `checksum`: of its packets, "" for none. `other`: a model that is not
+    `model`, and says so when it is asked; None where nobody can tell.
     """
 
     bus: str
     model: str
     ids: Sequence[int]
     baud: int
+    checksum: str = ""
     other: str | None = None
+
+    @property
+    def crc(self) -> bool:
+        """A Maestro with "Enable CRC" on."""
+        return self.checksum == "CRC-7"
 
     @property
     def table(self) -> Table:
@@ -42,15 +48,17 @@ class Family:
 
     def plugged(self, model: str | None = None) -> list[EmulatedServo]:
         """Servos that stand here and there."""
-        starts = self.start_ticks()
-        return [EmulatedServo(i, model or self.model, self.baud, t) for i, t in zip(self.ids, starts, strict=True)]
+        model, stored = model or self.model, {"crc": 1} if self.crc else {}
+        starts = zip(self.ids, self.start_ticks(), strict=True)
+        return [EmulatedServo(i, model, self.baud, ticks, registers=stored) for i, ticks in starts]
 
     def start_ticks(self) -> list[int]:
         return [int(t) for t in self.conversion.to_ticks(np.array(STARTS_RAD)[: len(self.ids)])]
 
     def build(self, open_port: Callable[[], Port], deadline_s: float) -> Bus:
         maps = [load_firmware_map(self.model)] * len(self.ids)
-        return bus_of(maps, self.ids, open_port, LIMIT_RAD, baud=self.baud, read_deadline_s=deadline_s)
+        options = {"baud": self.baud, "read_deadline_s": deadline_s, "crc": self.crc}
+        return bus_of(maps, self.ids, open_port, LIMIT_RAD, **options)
 
     def on(self, servos: str) -> Family:
         """The same family with other servos: `MODEL:IDS[@BAUD]`, ids as 1-3 or 1+4."""
