@@ -59,7 +59,7 @@ class LoopbackServer(ThreadingHTTPServer):
         self._thread: threading.Thread | None = None
 
     def begin(self) -> None:
-        """Answer from now on, in threads of its own. Idempotent."""
+        """Start to answer, in threads. Idempotent."""
         if self._thread is None:
             self._thread = threading.Thread(target=self.serve_forever, name=self._name, daemon=True)
             self._thread.start()
@@ -81,7 +81,7 @@ class LoopbackServer(ThreadingHTTPServer):
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread of its own."""
+        """Serve a connection in a new thread."""
         self._since_s[request] = self._now()
         super().process_request(request, client_address)
 
