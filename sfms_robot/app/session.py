@@ -180,6 +180,7 @@ class RunOptions:
     fleet: str | None = None
     zenoh: Path | None = None
     engine: EngineName = "auto"
+    packages: tuple[str, ...] = ()
 
     @property
     def hears(self) -> str:

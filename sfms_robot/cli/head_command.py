@@ -13,6 +13,9 @@ from sfms_robot.cli.json_line import print_json
 from sfms_robot.errors import ConfigError
 
 INTERRUPTED = 130
+PACKAGES = typer.Option(
+    [], "--package", metavar="DIR", help="A folder outside the head's that meshes may lie in; may be repeated."
+)
 
 app = typer.Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_args_is_help=True)
 app.command("fit")(fit)
@@ -46,6 +49,7 @@ def check(
     data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
     plot: Path | None = typer.Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
     listener: str | None = typer.Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
+    packages: list[str] = PACKAGES,
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
@@ -54,7 +58,7 @@ def check(
 
     if plot is not None:
         checked_png(plot, "--plot")
-    checked = check_head(name, data, listener)
+    checked = check_head(name, data, listener, packages)
     if plot is not None and not checked.problems:
         from sfms_robot.app.head.head_plot import plot as draw
 
@@ -76,11 +80,20 @@ def show(
     urdf: Path | None = typer.Option(
         None, "--urdf", metavar="FILE.png", help="Draw the robot, and tell what its URDF's joints follow."
     ),
+    packages: list[str] = PACKAGES,
     json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
 ) -> None:
     """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
     if urdf is not None:
-        _show_urdf(name, urdf, json)
+        from sfms_robot.app.head.head_scene import draw_scene
+        from sfms_robot.app.plot_style import checked_png
+        from sfms_robot.cli.show_head import print_scene
+
+        told = draw_scene(name, checked_png(urdf, "--urdf"), packages)
+        if json:
+            print_json(told)
+        else:
+            print_scene(told)
         return
     from sfms_robot.config.provenance import provenance, refusals
 
@@ -96,20 +109,6 @@ def show(
     from sfms_robot.cli.show_head import print_provenance
 
     print_provenance(name, joints, refused)
-
-
-def _show_urdf(name: str, png: Path, json: bool) -> None:
-    from sfms_robot.app.head.head_scene import draw_scene
-    from sfms_robot.app.plot_style import checked_png
-
-    checked_png(png, "--urdf")
-    told = draw_scene(name, png)
-    if json:
-        print_json(told)
-        return
-    from sfms_robot.cli.show_head import print_scene
-
-    print_scene(told)
 
 
 @app.command("calibrate")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from sfms_robot.cli.head_command import PACKAGES
 from sfms_robot.cli.json_line import print_json
 from sfms_robot.data import head_names, listener_names, speaker_names
 
@@ -33,6 +34,7 @@ def run(
         rich_help_panel=HEAD,
         help="'sim' for emulated servos, 'auto' for the adapter that is plugged in, a device, or NAME=DEVICE per bus.",
     ),
+    packages: list[str] = PACKAGES,
     intensity: list[str] = typer.Option(
         [], metavar="REGION=V", rich_help_panel=HEAD, help="How far a region goes, 0 to 2; may be repeated."
     ),
@@ -190,10 +192,12 @@ def run(
         )
         from sfms_robot.app import session
         from sfms_robot.app.listen.panel import live_panel
+        from sfms_robot.cli import show  # before the run: afterwards there may be no descriptor to import it with
 
         options = session.RunOptions(
             head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
             tuple(intensity), tuple(style), tuple(without), halt_on, status, calm, play, fleet, zenoh, runs_on,
+            packages=tuple(packages),
         )  # fmt: skip
         panel = None if json else live_panel
         if page is None:
@@ -204,13 +208,10 @@ def run(
             report = stack.enter_context(page_session(page, options)).run(panel, feed)
     if json:
         print_json(report)
+    elif dry_run:
+        show.print_dry_run(report)
     else:
-        from sfms_robot.cli.show import print_dry_run, print_run
-
-        if dry_run:
-            print_dry_run(report)
-        else:
-            print_run(report, record)
+        show.print_run(report, record)
     if report.get("error"):
         print(f"sfms-robot: {report['error']}", file=sys.stderr)
     raise typer.Exit(report.get("exit_code", 0))

@@ -100,6 +100,8 @@ def print_scene(told: Mapping[str, Any]) -> None:
         print(f"by forward kinematics: {', '.join(told['by_kinematics'])}")
     if told["undriven"]:
         print(f"nothing in the picture follows: {', '.join(told['undriven'])}")
+    for line in told["left_out"]:
+        print(f"left out: {line}")
 
 
 class Terminal:

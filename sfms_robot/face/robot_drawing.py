@@ -154,8 +154,10 @@ def _mesh(file: Path) -> Any:
         raise ConfigError(f"{file}: a picture needs one of {', '.join(_READERS)}")
     reader = getattr(vtkIOPLY if name == "PLYReader" else vtkIOGeometry, f"vtk{name}")()
     reader.SetFileName(str(file))
+    for part in (reader, reader.GetExecutive()):  # of a part with an observer vtk prints no error
+        part.AddObserver("ErrorEvent", lambda *_: None)
     reader.Update()
-    if not reader.GetOutput().GetNumberOfPoints():
+    if reader.GetErrorCode() or not reader.GetOutput().GetNumberOfPoints():
         raise ConfigError(f"{file}: not a mesh that can be read")
     return reader
 

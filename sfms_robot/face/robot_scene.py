@@ -12,7 +12,9 @@ by forward kinematics, where the URDF has joints of these names. What follows no
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -27,6 +29,8 @@ from sfms_robot.face.urdf import MOVING, Urdf, read_urdf
 from sfms_robot.frames import POSE_CHANNELS, Doubles
 
 URDF_FILE: Final = "robot.urdf"
+MESHES: Final = (".stl", ".obj", ".ply", ".dae")
+MOST_MESH_BYTES: Final = 64 * 2**20
 _POSE: Final = tuple(f"pose_{channel}" for channel in POSE_CHANNELS)
 
 
@@ -48,18 +52,21 @@ class RobotScene:
 
     Attributes:
         urdf: the file.
-        robot: what it holds.
-        meshes: file name of a mesh as the URDF has it -> the file; empty for a URDF of primitive shapes.
+        robot: what it holds, without the visuals of `left_out`.
+        meshes: file name of a mesh as the URDF has it -> the file, links followed; empty for primitive shapes.
+        left_out: one line for each mesh that may not be served or drawn.
         joints: the URDF joints that `values` gives, in its order; mimic joints are left to who draws.
         follows: joint of the head -> the URDF joint that it moves.
         undriven: joints of the head that move nothing in the picture.
     """
 
-    def __init__(self, head: Head, urdf: Path, neck: ForwardNeck | None = None) -> None:
-        """Raises ConfigError of one line: the URDF is broken, a mesh is not there, a joint named for it is not."""
-        self.urdf, self.robot = urdf, read_urdf(urdf)
+    def __init__(self, head: Head, urdf: Path, neck: ForwardNeck | None = None, packages: Sequence[str] = ()) -> None:
+        """Read a URDF. Raises ConfigError of one line: it is broken, or a joint that is named for it is not in it."""
         description = head.urdf or RobotDescription(file=URDF_FILE)
-        self.meshes = _meshes(self.robot, urdf, _packages(head, description))
+        self.urdf, self.robot = urdf, read_urdf(urdf)
+        self.meshes: dict[str, Path] = {}
+        self.left_out: list[str] = []
+        self._find_meshes(head.folder or Path(), description.packages, packages)
         self._names = tuple(head.joints)
         self._rest = np.array([joint.rest_rad for joint in head.joints.values()])
         self._read = self._rest.copy()  # the last angles that were finite
@@ -81,13 +88,30 @@ class RobotScene:
             )
 
     @classmethod
-    def of(cls, head: Head, neck: ForwardNeck | None = None) -> RobotScene | None:
-        """The scene of a head, or None for a head of somebody's own without `urdf`.
+    def of(cls, head: Head, neck: ForwardNeck | None = None, packages: Sequence[str] = ()) -> RobotScene | None:
+        """Return the scene of a head; None for one that is not shipped and has no `urdf`. Raises ConfigError.
 
-        `neck`: the head's forward kinematics, for a platform or a differential. Raises ConfigError.
+        Args:
+            neck: the head's forward kinematics, for a platform or a differential.
+            packages: folders outside the head's that meshes may come from.
         """
         file = urdf_file(head)
-        return None if file is None else cls(head, file, neck)
+        return None if file is None else cls(head, file, neck, packages)
+
+    def _find_meshes(self, own: Path, named: Mapping[str, str], folders: Sequence[str]) -> None:
+        """Fill `meshes` and `left_out`. `own`: the head's folder; `named`: folders of packages, from there on."""
+        inside = [Path(os.path.realpath(each)) for each in (own, *map(Path, folders))]
+        visuals = []
+        for visual in self.robot.visuals:
+            if visual.shape == "mesh":
+                file = Path(os.path.realpath(_mesh_file(visual.mesh, self.urdf.parent, own, named)))
+                if expected := mesh_problem(file, inside):
+                    where = f"{self.urdf}: link {visual.link}: mesh filename"
+                    self.left_out.append(f"{where}: expected {expected}, got {visual.mesh!r}")
+                    continue
+                self.meshes[visual.mesh] = file
+            visuals.append(visual)
+        self.robot = replace(self.robot, visuals=tuple(visuals))
 
     def values(self, read_rad: Doubles) -> Doubles:
         """Angles (J,) in the head's order -> values (U,) of `joints`; an angle that is not finite stays as it last was.
@@ -214,25 +238,23 @@ def _turn(roll: float, pitch: float, yaw: float) -> Doubles:
     )
 
 
-def _packages(head: Head, description: RobotDescription) -> dict[str, Path]:
-    return {name: (head.folder or Path()) / folder for name, folder in description.packages.items()}
+def mesh_problem(file: Path, folders: Sequence[Path]) -> str | None:
+    """Return what was expected of a mesh that may not be served or drawn, None for one that may.
+
+    A head's folder is data that people pass on: its URDF must not make other files of this machine public. `file` and
+    `folders` are without links (`os.path.realpath`).
+    """
+    if not any(file.is_relative_to(folder) for folder in folders):
+        return f"a file in {' or '.join(map(str, folders))} (--package names another folder)"
+    if not os.path.isfile(file):
+        return f"a file ({file} is not there; urdf.packages says where packages lie)"
+    if file.suffix.lower() not in MESHES or file.stat().st_size > MOST_MESH_BYTES:
+        return f"one of {', '.join(MESHES)}, of at most {MOST_MESH_BYTES >> 20} MiB"
+    return None
 
 
-def _meshes(robot: Urdf, urdf: Path, packages: Mapping[str, Path]) -> dict[str, Path]:
-    """Every mesh that the URDF names, and where it lies. Raises ConfigError for one that is not there."""
-    found = {}
-    for visual in robot.visuals:
-        if visual.shape == "mesh":
-            file = _mesh_file(visual.mesh, urdf.parent, packages)
-            if not file.is_file():
-                hint = " (urdf.packages says where packages lie)" if visual.mesh.startswith("package://") else ""
-                raise ConfigError(f"{urdf}: link {visual.link!r}: no mesh {visual.mesh!r} at {file}{hint}")
-            found[visual.mesh] = file
-    return found
-
-
-def _mesh_file(name: str, folder: Path, packages: Mapping[str, Path]) -> Path:
+def _mesh_file(name: str, folder: Path, own: Path, packages: Mapping[str, str]) -> Path:
     if name.startswith("package://"):
         package, _, inside = name.removeprefix("package://").partition("/")
-        return packages.get(package, folder / package) / inside
+        return own / packages.get(package, folder / package) / inside
     return folder / name.removeprefix("file://")

@@ -48,6 +48,7 @@ LOOK_S: Final = 0.1  # between two looks at what is lost
 WARMTH_S: Final = 1.0  # and at how warm servos are
 AWAY_S: Final = 1.0  # a position older than this: the servo is away
 PINCH: Final = "pinch"  # a fault that begins so
+_LOADED: Final = np.fft, np.ma  # numpy imports both at their first use, which must not be inside the loop
 _TURNING: Final = [CHANNEL_INDEX[name] for name in CHANNELS if name in ("yaw", "pitch") or name.startswith("eyeLook")]
 
 

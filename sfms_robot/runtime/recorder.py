@@ -20,6 +20,7 @@ import math
 import queue
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -253,13 +254,15 @@ def check_folder(folder: Path, overwrite: bool = False) -> None:
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
-    """DIR/report.json, whole or not at all. Where it cannot be written that is said: it is printed all the same."""
+    """Write DIR/report.json, whole or not at all. An error is logged: the report is printed all the same."""
     part = folder / (REPORT_FILE + ".part")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         part.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
         part.replace(folder / REPORT_FILE)
     except OSError as error:
+        with suppress(OSError):
+            part.unlink()
         _log.error("--record %s: the report cannot be written: %s", folder, error.strerror or error)
 
 

@@ -72,7 +72,7 @@ class WebSocketWire:
 
     def __init__(self) -> None:
         self._protocol = ServerProtocol(max_size=LONGEST)
-        self._parts: list[bytes] = []
+        self._parts: list[Frame] = []
 
     def push(self, data: bytes) -> Iterator[bytes | None]:
         self._protocol.receive_data(data)
@@ -80,9 +80,13 @@ class WebSocketWire:
             if isinstance(event, Request):
                 self._shake(event)
             elif isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
-                self._parts.append(bytes(event.data))
+                self._parts.append(event)
                 if event.fin:
-                    message, self._parts = b"".join(self._parts), []
+                    parts, self._parts = self._parts, []
+                    message = b"".join(part.data for part in parts)
+                    if parts[0].opcode is Opcode.TEXT and message.decode(errors="ignore").encode() != message:
+                        self._protocol.fail(CloseCode.INVALID_DATA)  # RFC 6455, 8.1
+                        raise PacketError("no WebSocket: a text that is not UTF-8")
                     yield message
             yield None
         if self._protocol.handshake_exc is not None:

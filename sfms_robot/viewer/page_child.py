@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import logging
 import os
 import secrets
 import socket
 import ssl
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,8 @@ from typing import IO, Any, Final
 
 import orjson
 import uvicorn
+from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from sfms_robot.child_process import take_pipes
 from sfms_robot.errors import ConfigError, PortError, RobotError
@@ -25,11 +28,46 @@ from sfms_robot.viewer.page_process import BEAT_S, DOCUMENT, HEADER, PERSON, PIC
 from sfms_robot.viewer.page_server import PageServer
 from sfms_robot.viewer.visitor_commands import LONGEST_PERSON, Command
 
-SceneOf = Callable[[str], RobotScene | None]
+SceneOf = Callable[[str, Sequence[str]], RobotScene | None]
 NICE: Final = 5  # the servo loop goes first
 TRIED: Final = 20  # ports
 MOST_UNSENT: Final = 2_000_000  # bytes for a run that does not read: a visitor's voice is left out then
 SEND_BUFFER: Final = 65_536  # bytes on their way to a visitor: pictures that are a second old are of no use
+HALF_OPEN_S: Final = 10.0  # for a TLS handshake, and for the head of a request
+
+
+class PromptHttp(H11Protocol):
+    """HTTP of uvicorn on one connection, which ends when the head of a request is not there in time."""
+
+    half_open_s = HALF_OPEN_S
+
+    def connection_made(self, transport: Any) -> None:
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._await_request()
+
+    def handle_events(self) -> None:
+        """Read what came, and stop waiting when a request begins."""
+        before = self.scope
+        super().handle_events()
+        if self.scope is not before:
+            self._deadline.cancel()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request, which may have come already."""
+        self._await_request()
+        super().on_response_complete()
+
+    def _await_request(self) -> None:
+        self._deadline = self.loop.call_later(self.half_open_s, self.transport.abort)
+
+
+class PageLoop(asyncio.SelectorEventLoop):
+    """Event loop whose servers end a TLS handshake that is not over in time."""
+
+    async def create_server(self, *given: Any, ssl: Any = None, **more: Any) -> asyncio.Server:
+        """Make a server as asyncio does."""
+        return await super().create_server(*given, ssl=ssl, ssl_handshake_timeout=ssl and HALF_OPEN_S, **more)
 
 
 class RunPipe:
@@ -64,7 +102,7 @@ class RunPipe:
 class FromRun(asyncio.Protocol):
     """What the run sends, done as it comes; of pictures that come at once the newest is shown. Ends with the pipe."""
 
-    def __init__(self, page: PageServer, over: asyncio.Event, scene_of: SceneOf | None) -> None:
+    def __init__(self, page: PageServer, over: asyncio.Event, scene_of: SceneOf) -> None:
         self._page, self._over, self._scene_of = page, over, scene_of
         self._unread = bytearray()
 
@@ -93,13 +131,10 @@ class FromRun(asyncio.Protocol):
     def connection_lost(self, error: Exception | None) -> None:
         self._over.set()
 
-    def _scene(self, head: str) -> RobotScene | None:
-        return None if self._scene_of is None else self._scene_of(head)
-
     def _document(self, visitor: int, told: dict[str, Any]) -> None:
         do = told.pop("do")
         if do == "begin":
-            self._page.begin(told, partial(self._scene, told.pop("scene", "")))
+            self._page.begin(told, partial(self._scene_of, told.pop("scene", ""), told.pop("packages", ())))
         elif do == "end":
             self._page.end(told["report"])
         elif do == "error":
@@ -111,7 +146,7 @@ class FromRun(asyncio.Protocol):
             self._page.tell(orjson.dumps({"type": do, **told}), keep=do != "status")
 
 
-def main(scene_of: SceneOf | None = None) -> None:
+def main(scene_of: SceneOf = lambda *_: None) -> None:
     """Serve until the pipe ends. The first message says where. `scene_of`: gives the picture of a head by its name."""
     incoming, outgoing = take_pipes()
     first = _first_document(incoming.fileno())
@@ -120,7 +155,8 @@ def main(scene_of: SceneOf | None = None) -> None:
     if hasattr(os, "nice"):
         os.nice(NICE)
     address, run = Address(**first), RunPipe()
-    asyncio.run(_serve(address, run, incoming, outgoing, scene_of))
+    with asyncio.Runner(loop_factory=PageLoop) as runner:
+        runner.run(_serve(address, run, incoming, outgoing, scene_of))
 
 
 def _first_document(pipe: int) -> dict[str, Any] | None:
@@ -139,9 +175,7 @@ def _first_document(pipe: int) -> dict[str, Any] | None:
     return first
 
 
-async def _serve(
-    address: Address, run: RunPipe, incoming: IO[bytes], outgoing: IO[bytes], scene_of: SceneOf | None
-) -> None:
+async def _serve(address: Address, run: RunPipe, incoming: IO[bytes], outgoing: IO[bytes], scene_of: SceneOf) -> None:
     await run.open(outgoing)
     try:
         listening = bound(address)
@@ -155,12 +189,15 @@ async def _serve(
     page = PageServer(run, token)
     loop = asyncio.get_running_loop()
     await loop.connect_read_pipe(lambda: FromRun(page, over, scene_of), incoming)
-    config = uvicorn.Config(
-        page.app, ws="websockets-sansio", http="h11", lifespan="off", loop="none", log_config=None, log_level="error",
-        access_log=False, ws_max_size=LONGEST_PERSON, ws_per_message_deflate=False, ssl_certfile=address.certificate,
-        ssl_keyfile=address.key, timeout_graceful_shutdown=1, server_header=False,
-    )  # fmt: skip
-    server = uvicorn.Server(config)
+    server = web_server(
+        page.app,
+        ws="websockets-sansio",
+        loop="none",
+        ws_max_size=LONGEST_PERSON,
+        ws_per_message_deflate=False,
+        ssl_certfile=address.certificate,
+        ssl_keyfile=address.key,
+    )
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     page.prepare()
     run.send(0, bound=url(address, host, port, token), token=token, taken=_taken(address, port))
@@ -170,6 +207,26 @@ async def _serve(
             await asyncio.wait_for(over.wait(), BEAT_S)
     server.should_exit = True
     await serving
+
+
+def web_server(app: ASGIApp, **options: Any) -> uvicorn.Server:
+    """Return the server of a page. `options`: further ones of `uvicorn.Config`.
+
+    Of a text that is not UTF-8 nothing is logged: its connection is closed with code 1007.
+    """
+    logging.getLogger("uvicorn.error").addFilter(lambda record: UnicodeDecodeError not in (record.exc_info or ()))
+    config = uvicorn.Config(
+        app,
+        http=PromptHttp,
+        lifespan="off",
+        log_config=None,
+        log_level="error",
+        access_log=False,
+        timeout_graceful_shutdown=1,
+        server_header=False,
+        **options,
+    )
+    return uvicorn.Server(config)
 
 
 def bound(address: Address) -> socket.socket:

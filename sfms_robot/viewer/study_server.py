@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import orjson
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
@@ -30,7 +29,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.origin import is_loopback, token_admits
 from sfms_robot.viewer.compressed_files import CompressedFiles
 from sfms_robot.viewer.human_file import human_gz
-from sfms_robot.viewer.page_child import bound, url
+from sfms_robot.viewer.page_child import bound, url, web_server
 from sfms_robot.viewer.page_process import Address
 from sfms_robot.viewer.page_server import STATIC, guarded_app
 
@@ -101,12 +100,8 @@ def serve_study(study: Comparison, address: Address, ready: Callable[[str, int |
     listening = bound(address)
     host, port = listening.getsockname()[:2]
     token = None if is_loopback(host) else secrets.token_urlsafe(12)
-    config = uvicorn.Config(
-        study_app(study, token), http="h11", ws="none", lifespan="off", log_config=None, log_level="error",
-        access_log=False, timeout_graceful_shutdown=1, server_header=False,
-    )  # fmt: skip
     ready(url(address, host, port, token), None if address.port in (0, port) else address.port)
-    uvicorn.Server(config).run(sockets=[listening])
+    web_server(study_app(study, token), ws="none").run(sockets=[listening])
 
 
 async def _refused(request: Request, error: Exception) -> Response:

@@ -1,6 +1,7 @@
 """A page and the runs behind it, in real time on emulated servos; and flags that cannot be, refused at once."""
 
 import json
+import shutil
 import threading
 from contextlib import closing
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ from sfms_robot.app.listen.preflight import begin_page
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.session import RunOptions
 from sfms_robot.config import Calmness
+from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.safety import Interrupt
 
@@ -94,6 +96,23 @@ def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
     assert hello["intensity"]["neck"] == 0.5 and hello["calmness"]["nod"] == 4.0  # what was turned stays turned
     errors = [told["error"] for told in visit.seen if told["type"] == "error"]
     assert len(errors) == 1 and "nobody" in errors[0]
+
+
+@pytest.mark.slow
+def test_a_run_leaves_a_mesh_out_that_may_not_be_served_and_names_it_once(tmp_path, caplog, capfd):
+    head = tmp_path / "op3_head"
+    shutil.copytree(data_dir("configs") / "heads" / "op3_head", head)
+    mesh = '<visual><geometry><mesh filename="/etc/passwd"/></geometry></visual></link>'
+    robot = (data_dir("sim") / "heads" / "op3_head" / "robot.urdf").read_text()
+    (head / "robot.urdf").write_text(robot.replace("</link>", mesh, 1))
+    with (head / "head.yaml").open("a") as file:
+        file.write("\nurdf: robot.urdf\n")
+    options = RunOptions(head=str(head), audio="none", duration_s=0.5, packages=(str(tmp_path / "parts"),))
+    with closing(begin_page("0")) as page, page_session(page, options) as pages:
+        assert pages.run()["exit"] == "done"
+    (line,) = [record.message for record in caplog.records if "/etc/passwd" in record.message]
+    assert line.startswith(f"{head}/robot.urdf: link ") and line.endswith("the page leaves it out")
+    assert "/etc/passwd" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,10 @@
 """`run` from end to end in virtual time: the shipped listener, a recorded person, emulated servos on a pty."""
 
 import dataclasses
+import os
+import socket
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +16,53 @@ from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError, PortError
 
 SHORT = RunOptions(duration_s=3.0, fast=True, seed=3)
+WATCHED = """
+import json, sys
+from pathlib import Path
+from sfms_robot.app import session
+from sfms_robot.app.listen.page_observer import PageObserver
+from sfms_robot.app.listen.page_recorder import PageRecorder
+from sfms_robot.app.listen.run_teller import RunTeller
+from sfms_robot.config import load_head
+from sfms_robot.ports import Observer
+from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.viewer.page_process import Address, PageProcess
+
+class Outlet:
+    def hears(self, audio, time_s): pass
+    def tells(self, kind, time_s, **values): pass
+
+class Looks(Interrupt, Observer):
+    "Asked before torque comes on, and at every tick."
+    before = None
+    def __call__(self):
+        self.before = self.before or set(sys.modules)
+        return super().__call__()
+    def tick(self, seen):
+        document = json.dumps(shown[0]())
+        self.after = set(sys.modules)
+    def close(self): pass
+
+class Shown:
+    def __init__(self, document, *_): shown.append(document)
+    def __enter__(self): pass
+    def __exit__(self, *_): pass
+
+listener, folder = sys.argv[1], Path(sys.argv[2])
+shown, looks, joints = [], Looks(), list(load_head("face28").joints)
+page = PageProcess(Address(port=0))
+page.wait()
+page.say("begin", head="face28")
+recorder = PageRecorder(page, folder, joints, {})
+recorder.record(True)
+watcher = PageObserver(page, joints)
+watcher.document = lambda: shown[0]()
+options = session.RunOptions(listener=listener, duration_s=3.0, fast=True, record=folder / "run", status="0")
+observers = [watcher, recorder, RunTeller(Outlet()), looks]
+report = session.run(options, Shown, observers=observers, interrupt=looks)
+page.close()
+print(json.dumps([report["exit"], report["observers_detached"], sorted(looks.after - looks.before)]))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +80,16 @@ def test_the_report_has_what_it_promises(report):
     bus = report["bus"]
     assert bus["writes"] == report["ticks"] <= bus["reads"]
     assert (bus["errors"], bus["silent"], bus["faults"]) == (0, [], [])
+
+
+@pytest.mark.parametrize("listener", ["sfms-small", "arig-small"])
+def test_nothing_is_imported_for_the_first_time_while_torque_is_on(listener, tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:  # a service manager
+        manager.bind(str(tmp_path / "notify"))
+        environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")}
+        words = [sys.executable, "-c", WATCHED, listener, str(tmp_path)]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.stdout.splitlines()[-1:] == ['["done", {}, []]'], done.stderr
 
 
 def test_in_virtual_time_wall_clock_figures_are_null(report):

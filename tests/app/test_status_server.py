@@ -1,15 +1,20 @@
-"""The status document over HTTP: on loopback, whole, and a port that is taken is said in one line."""
+"""The small HTTP servers: the status document whole and on loopback; slow clients and strangers cost little."""
 
 import json
 import socket
 import threading
-from contextlib import closing
+from collections import defaultdict
+from contextlib import ExitStack, closing
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import pytest
+from virtual_time import Time
 
+from sfms_robot.app.fleet.fleet_page import FleetPage
 from sfms_robot.app.listen.status_server import AUTO, StatusServer
+from sfms_robot.app.loopback_server import CONNECTION_S, MOST_CONNECTIONS, Answer, LoopbackServer
+from sfms_robot.app.serve.metrics import MetricsServer
 from sfms_robot.cli.main import main
 from sfms_robot.errors import ConfigError, PortError
 
@@ -44,7 +49,7 @@ def test_who_does_not_wait_for_the_answer_is_nobodys_trouble(capfd) -> None:
     with closing(StatusServer("0")) as server:
         server.serve(slow)
         with socket.create_connection(("127.0.0.1", server.port)) as gone:
-            gone.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            gone.sendall(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
         asked.set()
         with urlopen(server.url, timeout=60) as answer:  # served by another thread
             assert len(answer.read()) > 10_000_000
@@ -79,3 +84,111 @@ def test_a_port_in_use_is_found_before_a_listener_is_loaded(capsys, monkeypatch)
         main(["run", "--duration", "1", "--status", str(server.port)])
     assert ended.value.code == PortError.exit_code
     assert f"--status {server.port}: Address already in use" in capsys.readouterr().err
+
+
+LIMIT_S = 30.0  # for what is bound to come
+REQUEST = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nAccept: text/plain\r\n\r\n"
+
+
+def to_its_end(connection: socket.socket) -> bytes:
+    """All that comes until the other side closes."""
+    received = b""
+    try:
+        while part := connection.recv(65536):
+            received += part
+    except ConnectionResetError:
+        pass
+    return received
+
+
+class NoHeads:
+    """A fleet in which there is no head."""
+
+    def states(self):
+        return []
+
+    def follow(self, told):
+        pass
+
+
+def figures():
+    nothing = dict.fromkeys(("p50", "p99"))
+    return defaultdict(lambda: None, listener="a", server="b", heads=3, delay_ms=nothing, batch_size=nothing)
+
+
+@pytest.fixture(params=["status", "metrics", "fleet"])
+def address(request):
+    """One of the three servers; gives its URL."""
+    with ExitStack() as stack:
+        if request.param == "status":
+            server = stack.enter_context(closing(StatusServer("0")))
+            server.serve(lambda: {"state": "idle"})
+        elif request.param == "metrics":
+            pytest.importorskip("prometheus_client")
+            server = stack.enter_context(MetricsServer("0"))
+            server.serve(figures)
+        else:
+            server = stack.enter_context(closing(FleetPage(NoHeads(), 0)))
+        yield server.url
+
+
+@pytest.mark.parametrize(
+    ("host", "code"),
+    [
+        ("127.0.0.1", b"200"),
+        ("localhost:1", b"200"),
+        ("robots.example", b"403"),
+        ("robots.example:8775", b"403"),
+        ("", b"403"),
+    ],
+)
+def test_a_client_that_calls_this_machine_by_a_strangers_name_is_not_answered(address, host, code) -> None:
+    port = int(address.split(":")[2].partition("/")[0])
+    with socket.create_connection(("127.0.0.1", port), LIMIT_S) as client:
+        client.sendall(b"GET / HTTP/1.1\r\nHost: %s\r\n\r\n" % host.encode())
+        answer = to_its_end(client)
+    assert answer.split()[1] == code and (code == b"200" or len(answer.partition(b"\r\n\r\n")[2]) < 60)
+
+
+def test_the_metrics_are_those_of_that_moment() -> None:
+    pytest.importorskip("prometheus_client")
+    with MetricsServer("0") as server:
+        server.serve(figures)
+        with urlopen(server.url, timeout=LIMIT_S) as answer:
+            assert answer.headers["Content-Type"].startswith("text/plain")
+            assert 'sfms_heads{listener="a",server="b"} 3.0' in answer.read().decode()
+
+
+def test_beside_400_slow_clients_a_request_is_answered_and_few_stay_open(address) -> None:
+    port = int(address.split(":")[2].partition("/")[0])
+    with ExitStack() as stack:
+        slow = [stack.enter_context(socket.create_connection(("127.0.0.1", port), LIMIT_S)) for _ in range(400)]
+        for index, client in enumerate(slow):
+            try:
+                client.sendall(REQUEST[: index % len(REQUEST)])
+            except ConnectionError:
+                pass  # it had to make room already
+        with urlopen(address, timeout=CONNECTION_S) as answer:
+            assert answer.status == 200
+        assert not b"".join(to_its_end(client) for client in slow[: 400 - MOST_CONNECTIONS])
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET / HT", REQUEST[:-2], b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n{"]
+)
+def test_a_request_that_is_not_whole_in_time_ends_its_connection(sent) -> None:
+    time = Time()
+
+    class Reads(Answer):
+        def do_POST(self):
+            self.rfile.read(9)
+
+    server = LoopbackServer(0, Reads, "test", now=time.now_s)
+    server.begin()
+    with closing(server), socket.create_connection(("127.0.0.1", server.port), LIMIT_S) as client:
+        client.sendall(sent)
+        with socket.create_connection(("127.0.0.1", server.port), LIMIT_S) as later:  # so that the first one is taken
+            later.sendall(REQUEST)
+            assert to_its_end(later)
+        time.t = CONNECTION_S
+        assert to_its_end(client) == b""

@@ -1,14 +1,18 @@
 """A head's URDF follows the angles that its servos read."""
 
+import json
+
 import numpy as np
 import pytest
 
 from sfms_robot.app.catalogue import shipped_heads
-from sfms_robot.app.head.head_scene import scene_of
+from sfms_robot.app.head.head_check import check
+from sfms_robot.app.head.head_scene import draw_scene, scene_of
 from sfms_robot.config import load_head
 from sfms_robot.config.check import check_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.robot_drawing import render_robot
+from sfms_robot.face.robot_scene import MOST_MESH_BYTES
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 HEADS = [head["name"] for head in shipped_heads()]
@@ -126,7 +130,6 @@ def test_a_head_may_look_like_a_shipped_one_and_needs_no_picture(tmp_path):
     "urdf, told",
     [
         ("owl2.urdf", "urdf.file = 'owl2.urdf' is neither a file nor a shipped head (face24_maestro, "),
-        ("{file: owl.urdf}", "no mesh 'package://owl/head.stl' at .*urdf.packages says where packages lie"),
         (
             "{file: owl.urdf, packages: {owl: parts}, joints: {jaw: Beak}}",
             "urdf.joints.jaw.joint = 'Beak' is not a joint",
@@ -141,6 +144,75 @@ def test_what_is_wrong_with_it_is_one_line(tmp_path, urdf, told):
     with pytest.raises(ConfigError) as caught:
         scene_of(owl(tmp_path, urdf))
     assert all(part in str(caught.value) for part in told.split(".*")) and "\n" not in str(caught.value)
+
+
+OUTSIDE = "expected a file in FOLDER (--package names another folder), got"
+
+
+@pytest.mark.parametrize(
+    ("mesh", "expected"),
+    [
+        ("../beside/a.stl", OUTSIDE),
+        ("BESIDE/a.stl", OUTSIDE),
+        ("file://BESIDE/a.stl", OUTSIDE),
+        ("/etc/passwd", OUTSIDE),
+        ("package://beside/a.stl", OUTSIDE),
+        ("package://owl//etc/passwd", OUTSIDE),
+        ("link.stl", OUTSIDE),
+        ("linked/a.stl", OUTSIDE),
+        ("parts/none.stl", "expected a file ("),
+        ("package://eagle/head.stl", "is not there; urdf.packages says where packages lie), got"),
+        ("", "is not there"),
+        ("x" * 5000, "is not there"),
+        ("round.stl", "is not there"),
+        ("notes.txt", "expected one of .stl, .obj, .ply, .dae, of at most 64 MiB, got"),
+        ("notes.stl", "expected one of .stl, .obj, .ply, .dae, of at most 64 MiB, got"),
+        ("large.stl", "of at most 64 MiB, got"),
+    ],
+)
+def test_a_mesh_that_may_not_be_public_is_left_out_and_named(tmp_path, command_line, mesh, expected):
+    folder, beside = tmp_path / "owl", tmp_path / "beside"
+    folder.mkdir()
+    beside.mkdir()
+    (beside / "a.stl").write_text(TRIANGLE)
+    owl(folder, "{file: owl.urdf, packages: {owl: parts, beside: ../beside}, joints: {jaw: BeakJoint}}")
+    (folder / "link.stl").symlink_to(beside / "a.stl")
+    (folder / "linked").symlink_to(beside)
+    (folder / "round.stl").symlink_to(folder / "round.stl")
+    (folder / "notes.txt").write_text("secret")
+    (folder / "notes.stl").symlink_to(folder / "notes.txt")
+    with (folder / "large.stl").open("wb") as large:
+        large.truncate(MOST_MESH_BYTES + 1)
+    mesh = mesh.replace("BESIDE", str(beside))
+    (folder / "owl.urdf").write_text(
+        URDF.replace(
+            "<link", f'<link name="x"><visual><geometry><mesh filename="{mesh}"/></geometry></visual></link><link', 1
+        ).replace("</robot>", '<joint name="x" type="fixed"><parent link="base"/><child link="x"/></joint></robot>')
+    )
+    scene = scene_of(load_head(str(folder)))
+    assert list(scene.meshes) == ["package://owl/head.stl"] and [each.link for each in scene.robot.visuals] == ["head"]
+    (line,) = scene.left_out
+    assert line.startswith(f"{folder}/owl.urdf: link x: mesh filename: expected ") and "\n" not in line
+    assert expected.replace("FOLDER", str(folder)) in line
+    assert check(str(folder)).problems == [line]
+    if len(mesh) < 100:
+        ended = command_line("head", "check", folder, "--json")
+        assert ended.code == 2 and json.loads(ended.out)["problems"] == [line]
+
+
+def test_meshes_may_come_from_folders_of_the_command_line(tmp_path, command_line):
+    parts = tmp_path / "parts"
+    owl(tmp_path)
+    (tmp_path / "owl").mkdir()
+    for name in ("head.yaml", "owl.urdf"):
+        (tmp_path / name).rename(tmp_path / "owl" / name)
+    head = tmp_path / "owl" / "head.yaml"
+    head.write_text(head.read_text().replace("owl: parts", "owl: ../parts"))
+    assert scene_of(load_head(str(tmp_path / "owl"))).meshes == {}
+    given = scene_of(load_head(str(tmp_path / "owl")), [str(parts)])
+    assert given.meshes == {"package://owl/head.stl": parts / "head.stl"} and not given.left_out
+    assert command_line("head", "check", tmp_path / "owl").code == 2
+    assert command_line("head", "check", tmp_path / "owl", "--package", parts, "--json").code == 0
 
 
 def test_head_check_tells_joints_that_the_head_has_not(tmp_path):
@@ -166,6 +238,30 @@ def test_a_mesh_that_cannot_be_read_is_told(tmp_path):
     scene.meshes["package://owl/head.stl"] = tmp_path / "parts" / "head.step"
     with pytest.raises(ConfigError, match="a picture needs one of .stl"):
         render_robot(tmp_path / "a.png", scene, scene.rest(), (64, 48))
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+
+
+@pytest.mark.parametrize(
+    "content", [b"", LFS, b"solid a\nfacet normal 0 0 1\nouter loop\nvertex x", bytes(80) + b"\2\0\0\0" + bytes(60)]
+)
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply"])
+def test_a_broken_mesh_is_one_line_of_ours_and_none_of_vtk(tmp_path, capfd, suffix, content):
+    pytest.importorskip("vtkmodules")
+    scene = scene_of(owl(tmp_path))
+    scene.meshes["package://owl/head.stl"] = file = tmp_path / f"a{suffix}"
+    file.write_bytes(content)
+    with pytest.raises(ConfigError, match=f"^{file}: not a mesh that can be read$"):
+        render_robot(tmp_path / "a.png", scene, scene.rest(), (64, 48))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_picture_leaves_out_what_may_not_be_drawn_and_says_so(tmp_path):
+    pytest.importorskip("vtkmodules")
+    owl(tmp_path, "{file: owl.urdf, joints: {jaw: BeakJoint}}")
+    told = draw_scene(str(tmp_path), tmp_path / "a.png")
+    assert (tmp_path / "a.png").is_file() and "package://owl/head.stl" in told["left_out"][0]
 
 
 def test_the_two_inmoov_heads_are_one_robot():

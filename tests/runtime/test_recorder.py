@@ -170,6 +170,12 @@ def test_a_report_that_cannot_be_written_is_said_and_loses_nothing(tmp_path, cap
     assert "the report cannot be written" in caplog.text
 
 
+def test_a_report_that_cannot_be_written_leaves_no_part_of_it(tmp_path):
+    (tmp_path / "report.json").mkdir()
+    write_report(tmp_path, {"version": 1})
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
 def test_a_recording_is_not_overwritten_unasked(tmp_path):
     check_folder(tmp_path)
     Recorder(tmp_path, JOINTS).close()

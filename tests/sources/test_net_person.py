@@ -305,11 +305,28 @@ def test_a_run_that_takes_only_speech_says_so():
         assert last_words(program) == "this run takes no voice from programs (--audio push)"
 
 
-def test_a_caller_who_says_nothing_is_closed(run, monkeypatch):
+@pytest.mark.parametrize("sent", [b"", b"GE", b"GET / HTTP/1.1\r\nHost: x\r\n"])
+def test_a_caller_who_says_nothing_whole_is_closed(run, monkeypatch, sent):
     monkeypatch.setattr(net_server, "HELLO_S", 0.02)
     with socket.create_connection(run.person.address, WAIT_S) as silent:
+        silent.sendall(sent)
         assert silent.recv(100) == b""
     assert run.told["refused"] == 1
+
+
+@pytest.mark.parametrize("text", [b"\xff", [b'{"type":"hush', b'\xc3"}']])
+def test_a_text_that_is_not_utf_8_ends_its_connection_with_code_1007(run, text, caplog):
+    for _ in range(2):
+        program = joined(WebSocket(run, feeds=["speech"]))
+        program.socket.send(text, text=True)
+        with pytest.raises(ConnectionClosed) as closed:
+            program.socket.recv(WAIT_S)
+        program.close()
+        assert closed.value.rcvd.code == 1007
+    assert len([record for record in caplog.records if "not UTF-8" in record.message]) == 1
+    program = joined(WebSocket(run, feeds=["voice"]))
+    program.socket.send([b'{"type": "hello", "version": 1, "name": "\xc3', b'\xa9"}'], text=True)
+    assert last_words(program) == "a second hello"
 
 
 def test_no_more_programs_than_there_is_room_for(run):

@@ -10,6 +10,7 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 from contextlib import ExitStack, closing, contextmanager
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -19,10 +20,13 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from sfms_robot.app.listen.preflight import PAGE
+from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, InputError, PortError
 from sfms_robot.viewer.frame_record import Picture, pack_picture, rare_json
+from sfms_robot.viewer.page_child import HALF_OPEN_S, PromptHttp, web_server
 from sfms_robot.viewer.page_process import Address, PageProcess
-from sfms_robot.viewer.page_server import STATIC
+from sfms_robot.viewer.page_server import STATIC, PageServer
 
 WAIT_S = 30.0  # for what is bound to come
 RARE = rare_json("listening", (), {}, None)
@@ -223,6 +227,71 @@ def test_while_one_floods_the_others_are_served(page):
         assert heard(other) == {"type": "pong", "id": "here"}
 
 
+@pytest.mark.parametrize("text", [b"\xff", b'{"type":"ping","id":"\xc3"}', [b"\xc3", b"("]])
+def test_a_text_that_is_not_utf_8_ends_its_connection_with_code_1007_and_without_a_word(capfd, text):
+    with closing(PageProcess(Address(port=0))) as page:
+        page.wait()
+        page.say("begin", **HELLO)
+        with visit(page) as visitor, pytest.raises(ConnectionClosed) as closed:
+            visitor.send(text, text=True)
+            while True:
+                visitor.recv(timeout=WAIT_S)
+        with visit(page) as other:
+            other.send([b'{"type":"ping","id":"\xc3', b'\xa9"}'], text=True)  # whole in the end
+            assert heard(other, "pong")["id"] == "\xe9"
+    assert closed.value.rcvd.code == 1007
+    assert capfd.readouterr().err == ""
+
+
+HALF_OPEN = (
+    b"",
+    b"GET",
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n",
+    b"GET /ws HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n",
+    b"GET /etc HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET / HTTP/1.1\r\nHo",  # a whole one first
+    b"GET /etc HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n12",
+)
+
+
+def all_end(url, count=150):
+    """Open so many requests that are not whole; others are answered meanwhile, and the server ends them all."""
+    place = ("127.0.0.1", int(url.split(":")[2].partition("/")[0]))
+    with ExitStack() as stack:
+        visitor = stack.enter_context(connect(url.replace("http", "ws", 1) + "ws", open_timeout=WAIT_S))
+        half_open = [stack.enter_context(socket.create_connection(place, WAIT_S)) for _ in range(count)]
+        for index, client in enumerate(half_open):
+            client.sendall(HALF_OPEN[index % len(HALF_OPEN)])
+        assert b"<!doctype html>" in got(url)[0]
+        for client in half_open:
+            try:
+                while client.recv(4096):
+                    pass
+            except ConnectionResetError:
+                pass
+        assert visitor.ping().wait(WAIT_S)  # whose request was whole
+
+
+def test_150_half_open_requests_are_ended_in_time():
+    class Prompt(PromptHttp):
+        half_open_s = HALF_OPEN_S / 20
+
+    server = web_server(PageServer(Asked(), None).app, ws="websockets-sansio")
+    server.config.http = Prompt
+    listening = socket.create_server(("127.0.0.1", 0), backlog=200)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+    thread.start()
+    try:
+        all_end(f"http://127.0.0.1:{listening.getsockname()[1]}/")
+    finally:
+        server.should_exit = True
+        thread.join(WAIT_S)
+
+
+@pytest.mark.slow
+def test_the_pages_process_ends_150_half_open_requests(page):
+    all_end(page.url)
+
+
 def test_a_page_of_an_older_version_is_told_so(page):
     with visit(page) as visitor:
         says(visitor, "hello", version=0)
@@ -247,6 +316,36 @@ def test_what_is_not_there_is_not_found(page):
     for path in ("recording", "robot/robot.urdf", "etc/passwd", "static/../page_server.py"):
         with pytest.raises(HTTPError, match="404"):
             got(page.url + path)
+
+
+def test_of_what_a_urdf_names_only_meshes_of_the_heads_folder_are_served(tmp_path):
+    """A head's folder is data that people pass on. `kept`: a folder that the command line names."""
+    head, kept, other = (tmp_path / name for name in ("head", "kept", "other"))
+    for folder in (head, kept, other):
+        folder.mkdir()
+        (folder / "a.stl").write_text("solid a\nendsolid")
+    (head / "link.stl").symlink_to(other / "a.stl")
+    (head / "texture.png").write_bytes(b"not a mesh")
+    served = {"a.stl": 200, "link.stl": 404, f"{kept}/a.stl": 200}
+    served |= dict.fromkeys(["/etc/passwd", "../other/a.stl", f"file://{other}/a.stl", "texture.png"], 404)
+    visuals = "".join(f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in served)
+    robot = (data_dir("sim") / "heads" / "op3_head" / "robot.urdf").read_text()
+    (head / "robot.urdf").write_text(robot.replace("</link>", f"{visuals}</link>", 1))
+    text = (data_dir("configs") / "heads" / "op3_head" / "head.yaml").read_text()
+    (head / "head.yaml").write_text(f"{text}\nurdf: robot.urdf\n")
+    with closing(PageProcess(Address(port=0), PAGE)) as page:
+        page.wait()
+        page.say("begin", **HELLO, scene=str(head), packages=[str(kept)])
+        with visit(page) as visitor:
+            assert heard(visitor, "hello")["urdf"] == "robot/robot.urdf"
+        codes = {}
+        for name in [*served, "head.yaml", "%2e%2e/other/a.stl"]:
+            try:
+                codes[name] = 200 if got(page.url + "robot/" + name)[0] else 0
+            except HTTPError as error:
+                with error:
+                    codes[name] = error.code
+    assert codes == served | {"head.yaml": 404, "%2e%2e/other/a.stl": 404}
 
 
 def test_a_recording_is_downloaded(page, tmp_path):

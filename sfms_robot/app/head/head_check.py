@@ -15,6 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sfms_robot.app.head.faces import recorded_faces
+from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.safety_settings import check_safety
 from sfms_robot.app.wiring import firmware_maps
@@ -92,10 +93,11 @@ class HeadCheck:
         return asdict(self)
 
 
-def check(name: str, data: Path | None = None, listener: str | None = None) -> HeadCheck:
-    """A head by shipped name or folder, on the bundled faces or those in a folder.
+def check(name: str, data: Path | None = None, listener: str | None = None, packages: Sequence[str] = ()) -> HeadCheck:
+    """Check a head by shipped name or folder, on the bundled faces or those in a folder.
 
-    Raises ConfigError for bad data, and for a listener that is none.
+    `packages`: folders outside the head's that meshes may come from. Raises ConfigError for bad data, and for a
+    listener that is not one.
     """
     limited = limitation(listener) if listener is not None else None
     problems = check_head(name)
@@ -105,8 +107,11 @@ def check(name: str, data: Path | None = None, listener: str | None = None) -> H
     try:
         check_safety(head, head.joints, firmware_maps(head.joints))
         retargeter = HeadRetargeter(head, 1.0 / _TICK_HZ)
-    except ConfigError as error:  # what no servo of it can do, or a home that is out of reach
+        scene = scene_of(head, packages)
+    except ConfigError as error:  # what no servo of it can do, a home that is out of reach, a broken URDF
         return HeadCheck(head.name, [str(error)])
+    if scene and scene.left_out:
+        return HeadCheck(head.name, scene.left_out)
     clips = recorded_faces(data)
     angles = [_angles(retargeter, _at_ticks(clip)) for clip in clips]
     neck = _neck(retargeter.neck, clips) if retargeter.neck else None

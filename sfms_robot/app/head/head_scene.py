@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,16 +16,22 @@ _CELL_PX: Final = (300, 290)
 _COLUMNS: Final = 3
 
 
-def scene_of(head: Head) -> RobotScene | None:
-    """The robot to be drawn; None for a head of somebody's own whose file names no URDF. Raises ConfigError."""
+def scene_of(head: Head, packages: Sequence[str] = ()) -> RobotScene | None:
+    """Return the robot to be drawn; None for a head that is not shipped and names no URDF. Raises ConfigError.
+
+    `packages`: folders outside the head's that meshes may come from.
+    """
     neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
-    return RobotScene.of(head, neck)
+    return RobotScene.of(head, neck, packages)
 
 
-def draw_scene(name: str, png: Path) -> dict[str, Any]:
-    """Draw a head at rest, and tell which URDF it is and what its joints follow. Raises ConfigError, MissingExtra."""
+def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> dict[str, Any]:
+    """Draw a head at rest; return which URDF it is, what its joints follow, and the meshes that were left out.
+
+    `packages` as for `scene_of`. Raises ConfigError, MissingExtra.
+    """
     head = load_head(name)
-    scene = scene_of(head)
+    scene = scene_of(head, packages)
     if scene is None:
         raise ConfigError(f"{head.folder or name}/head.yaml: urdf says what the head looks like, and is not there")
     from sfms_robot.face.robot_drawing import render_robot
@@ -37,6 +44,7 @@ def draw_scene(name: str, png: Path) -> dict[str, Any]:
         "follows": dict(scene.follows),
         "by_kinematics": [joint for joint in scene.joints if joint not in scene.follows.values()],
         "undriven": list(scene.undriven),
+        "left_out": scene.left_out,
     }
 
 

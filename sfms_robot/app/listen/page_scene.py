@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from sfms_robot.config import load_head
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.viewer import page_child
@@ -12,8 +14,8 @@ def main() -> None:
     page_child.main(named_scene)
 
 
-def named_scene(head: str) -> RobotScene | None:
-    """The picture of a head by its name or folder; None: it has none. Raises ConfigError."""
+def named_scene(head: str, packages: Sequence[str]) -> RobotScene | None:
+    """Return the picture of a head by its name or folder; None: it has none. Raises ConfigError."""
     from sfms_robot.app.head.head_scene import scene_of  # half a second of imports, which a page has not to wait for
 
-    return scene_of(load_head(head))
+    return scene_of(load_head(head), packages)

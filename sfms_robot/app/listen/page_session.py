@@ -89,8 +89,12 @@ class PageSession:
         with ExitStack() as stack:
             feed = feed or self._listener(stack)
             halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
-            scene_of(head)  # a picture that is broken is said before anything moves
-            self.page.say("begin", scene=str(options.head), **self._facts(head, knobs, calmness))
+            scene = scene_of(head, options.packages)  # a picture that is broken is said before anything moves
+            for line in scene.left_out if scene else ():
+                logger.warning("%s; the page leaves it out", line)
+            self.page.say(
+                "begin", scene=str(options.head), packages=options.packages, **self._facts(head, knobs, calmness)
+            )
             recorder = PageRecorder(self.page, self._folder, list(head.joints), options.facts(head))
             lonely = self._lonely(interrupt)
             stack.callback(recorder.close)

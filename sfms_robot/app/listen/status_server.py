@@ -8,18 +8,15 @@ Read only: who can read it can change nothing.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Final
 
-from sfms_robot.app.loopback_server import Answer, LoopbackServer
+from sfms_robot.app.loopback_server import Answer, Document, LoopbackServer
 from sfms_robot.endpoint import HIGHEST_PORT, port_number
 from sfms_robot.errors import ConfigError, PortError
 
 AUTO: Final = "auto"  # `--status` without a port: `PORT`, or the next that is free
 PORT: Final = 8775
 _TRIED: Final = 20
-
-Document = Callable[[], Mapping[str, Any]]
 
 
 class StatusServer:
@@ -54,29 +51,22 @@ class StatusServer:
         self._server.close()
 
 
-class _Server(LoopbackServer):
-    def __init__(self, port: int) -> None:
-        super().__init__(port, _Answer, "status")
-        self.document: Document = dict
-
-
 class _Answer(Answer):
     def do_GET(self) -> None:
         if self.path not in ("/", "/status"):
             self.send_error(404)
             return
-        assert isinstance(self.server, _Server)
         self.answer(200, json.dumps(self.server.document(), allow_nan=False).encode(), "application/json")
 
 
-def _bound(wanted: str) -> _Server:
+def _bound(wanted: str) -> LoopbackServer:
     if wanted != AUTO and port_number(wanted) is None:
         raise ConfigError(f"--status {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or none)")
     ports = [*range(PORT, PORT + _TRIED), 0] if wanted == AUTO else [int(wanted)]
     problem: object = None
     for port in ports:
         try:
-            return _Server(port)
+            return LoopbackServer(port, _Answer, "status")
         except OSError as error:
             problem = error.strerror or error
     raise PortError(f"--status {wanted}: {problem} (another port, or 0 for a free one)")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, Final
 
+from sfms_robot.app.loopback_server import Answer, Document, LoopbackServer
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
 
@@ -29,8 +30,6 @@ _FIGURES: Final[tuple[tuple[str, str, str, tuple[str, ...], float], ...]] = (
     ("cost_scale", "gauge", "How much longer batches take than measured at the start", ("cost_scale",), 1.0),
 )
 
-Statistics = Callable[[], Mapping[str, Any]]
-
 
 class MetricsServer:
     """Holds its port from construction until it is left; answers from `serve` on.
@@ -48,37 +47,40 @@ class MetricsServer:
             raise MissingExtra.of("--metrics", "remote") from error
         self._host, self._port = _address(wanted)
         self._taken = wanted
-        self._server: Any = None
         self.url = ""
 
     def __enter__(self) -> MetricsServer:
-        from prometheus_client import CollectorRegistry, start_http_server
-
-        self._registry = CollectorRegistry()
         try:
-            self._server, self._thread = start_http_server(self._port, self._host, self._registry)
+            self._server = LoopbackServer(self._port, _Answer, "metrics", host=self._host)
         except OSError as error:
             raise PortError(f"--metrics {self._taken}: {error.strerror or error}") from error
-        self.url = f"http://{self._host}:{self._server.server_port}/metrics"
+        self.url = f"{self._server.url}metrics"
         return self
 
-    def serve(self, statistics: Statistics) -> None:
+    def serve(self, statistics: Document) -> None:
         """Answer with these from now on."""
-        self._registry.register(_Collector(statistics))
+        self._server.document = statistics
+        self._server.begin()
 
     def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
+        self._server.close()
+
+
+class _Answer(Answer):
+    def do_GET(self) -> None:
+        from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+
+        self.answer(200, generate_latest(_Collector(self.server.document)), CONTENT_TYPE_LATEST)
 
 
 class _Collector:
-    """Asks for the statistics whenever Prometheus does."""
+    """The statistics as Prometheus reads them."""
 
-    def __init__(self, statistics: Statistics) -> None:
+    def __init__(self, statistics: Document) -> None:
         self._statistics = statistics
 
     def collect(self) -> Iterable[Any]:
+        """Yield one metric for each figure that the statistics hold now."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         told = self._statistics()
