@@ -33,9 +33,9 @@ from sfms_robot.errors import ConfigError, RobotError
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.open_feed import NamedFeed, open_feed
-from sfms_robot.listeners.plugins import REMOTE, listener_folder
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.network import check_zenoh
+from sfms_robot.plugins import REMOTE, listener_folder
 from sfms_robot.ports import Observer, PlanFeed, Retargeter, Source, Timeline
 from sfms_robot.realtime import realtime_priority
 from sfms_robot.retarget.spontaneous import HeadLife

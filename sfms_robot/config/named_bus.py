@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, WithJsonSchema
 
 from sfms_robot.config.base import Model, Positive
+from sfms_robot.plugins import plugins
 
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
 BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
@@ -25,7 +25,7 @@ def _family(name: str) -> str:
     name = FORMER_FAMILIES.get(name, name)
     if name in BUS_FAMILIES:
         return name
-    known = [*BUS_FAMILIES, *(entry.name for entry in entry_points(group=BUS_GROUP))]
+    known = [*BUS_FAMILIES, *plugins(BUS_GROUP)]
     if name not in known:
         raise ValueError(f"is not a family of buses ({', '.join(known)})")
     return name

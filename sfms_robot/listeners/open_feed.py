@@ -6,9 +6,9 @@ from pathlib import Path
 
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.plugins import REMOTE
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote import RemoteListener
+from sfms_robot.plugins import REMOTE
 
 NamedFeed = ListenerProcess | RemoteListener
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.config.calmness import Calmness
-from sfms_robot.listeners.plugins import REMOTE as PREFIX
 from sfms_robot.listeners.remote import RemoteListener
 from sfms_robot.network import LOOPBACK, Connection, check_name, session_config
+from sfms_robot.plugins import REMOTE as PREFIX
 
 if TYPE_CHECKING:
     import zenoh

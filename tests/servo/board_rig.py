@@ -27,7 +27,7 @@ class Bench:
             return self.ports[-1]
 
         conversion, more = Straight(firmware_map, limit_rad), {"confirmed": True} | more
-        self.bus = family_named(firmware_map.family).bus_class()("face", servos, conversion, open_port, baud, **more)
+        self.bus = family_named(firmware_map.family).build("face", servos, conversion, open_port, baud, **more)
 
     def new_port(self, *rest):
         return EmulatedPort(*rest)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.listeners.plugins import listener_folder
+from sfms_robot.plugins import listener_folder
 from sfms_robot.servo.discovery import access_problem, is_address
 from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 
