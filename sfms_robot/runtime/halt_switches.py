@@ -32,7 +32,7 @@ _ACTIVE_LOW, _INPUT, _RISING, _PULL_UP = 1 << 1, 1 << 2, 1 << 4, 1 << 8
 _REQUEST: Final = struct.Struct("=I252x 32s Q260x4x I4x20x i")
 _VALUES: Final = struct.Struct("=QQ")  # bits, mask
 _EVENT_BYTES: Final = 48  # struct gpio_v2_line_event
-_LINE: Final = re.compile(r"(?P<chip>/dev/gpiochip\d+):(?P<line>\d+)(?P<high>,active-high)?")
+_LINE: Final = re.compile(r"(?P<chip>/dev/gpiochip\d+):(?P<line>\d{1,9})(?P<high>,active-high)?")
 
 Ioctl = Callable[[int, int, bytearray], Any]
 

@@ -64,7 +64,11 @@ def test_what_cannot_be_obeyed_is_one_line(run, command, said):
     assert said in answer["error"] and "\n" not in answer["error"]
 
 
-@pytest.mark.parametrize("message", [b"", b"\xff\xfe", b"[]", b"{" * 10_000, b'{"command": ["halt"]}'])
+@pytest.mark.parametrize(
+    "message",
+    [b"", b"\xff\xfe", b"[]", b"{" * 10_000, b'{"command": ["halt"]}',
+     b'{"command": "knobs", "intensity": {"neck": 1' + 400 * b"0" + b"}}"],
+)  # fmt: skip
 def test_nonsense_is_answered_and_does_nothing(run, message):
     controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
     assert "error" in controls.obey(message)

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs
 from sfms_robot.config import Calmness
 from sfms_robot.config.base import parse
+from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, RobotError
 from sfms_robot.network import Connection, check_name, session_config
 from sfms_robot.ports import Observer, Tick
@@ -69,7 +70,7 @@ class FleetControls:
     def obey(self, message: bytes) -> dict[str, str]:
         """The effect of a command, or why it has none. Never raises."""
         try:
-            asked = json.loads(message[:_LONGEST]) if len(message) <= _LONGEST else None
+            asked = json.loads(message[:_LONGEST], parse_int=whole_number) if len(message) <= _LONGEST else None
             if not isinstance(asked, dict) or asked.get("command") not in COMMANDS:
                 raise ConfigError(f'no command: {{"command": ...}} with one of {", ".join(COMMANDS)}')
             self._do(asked["command"], asked)
