@@ -1,4 +1,4 @@
-"""What other packages bring: entry points of the groups `sfms_robot.listeners`, `.sources` and `.buses`.
+"""Plug-ins of other packages: entry points of the groups `sfms_robot.listeners`, `.sources` and `.buses`.
 
 An entry of the first two names a callable that takes the text behind the colon of NAME:ARGUMENT ("" without one) and
 returns a `ports.Listener` or a source; an entry of the third names a `servo.families.BusFamily`. They are imported only
