@@ -2,13 +2,17 @@
 
 Without a configuration everything stays on this machine: who serves listens on 127.0.0.1:7447, who calls connects
 there, and nobody looks for others by multicast. A file of zenoh's own form (JSON5: endpoints, TLS, access control)
-replaces all that; docs/remote.md has one for TLS with certificates of both sides.
+replaces all that; docs/remote.md has one for TLS with certificates of both sides. An endpoint that is neither
+on loopback nor encrypted needs `--insecure`.
 """
 
 from __future__ import annotations
 
+import ipaddress
 import json
+import re
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -23,9 +27,29 @@ LEASE_MS: Final = 2000  # a link that says nothing for so long is dead, and is m
 QUEUE: Final = 16  # messages that wait for a busy machine, the most that zenoh takes; with its own 2 frames are lost
 RETRY: Final = {"period_init_ms": 250, "period_max_ms": 250, "period_increase_factor": 1.0}
 AWAY_S: Final = 5.0  # after which somebody who waits for a router is told
+SAFE: Final = ("tls", "quic", "unixsock-stream", "unixpipe", "serial", "vsock")  # encrypted, or not a network
 NAME_CHARACTERS: Final = "letters, digits, '-', '_' and '.'"
 
 Role = Literal["serve", "call"]
+
+
+@dataclass(frozen=True)
+class Router:
+    """The router that a session connects to, or is.
+
+    Attributes:
+        file: zenoh's configuration; None for loopback.
+        insecure: allow endpoints beyond loopback without TLS.
+    """
+
+    file: Path | None = None
+    insecure: bool = False
+
+    def __str__(self) -> str:
+        return LOOPBACK if self.file is None else f"the endpoints of {self.file}"
+
+
+LOCAL: Final = Router()
 
 
 def check_zenoh() -> None:
@@ -43,21 +67,25 @@ def check_name(name: str, what: str) -> str:
     return name
 
 
-def session_config(role: Role, file: Path | None = None, endpoint: str | None = None) -> zenoh.Config:
-    """How a session connects: as `file` says, else on loopback, else at `endpoint`.
+def session_config(role: Role, router: Router = LOCAL, endpoint: str | None = None) -> zenoh.Config:
+    """Return how a session connects: as the router's file says, else on loopback, else at `endpoint`.
 
-    Raises ConfigError for a file or an endpoint that zenoh does not take, MissingExtra without zenoh.
+    Raises ConfigError for a file or an endpoint that zenoh does not take, or that anyone on the network could use;
+    MissingExtra without zenoh.
     """
     check_zenoh()
     import zenoh
 
-    if file is not None:
+    if (file := router.file) is not None:
         if not file.is_file():
             raise ConfigError(f"{file}: no such file (a configuration of zenoh, JSON5)")
         try:
-            return zenoh.Config.from_file(str(file))
+            given = zenoh.Config.from_file(str(file))
         except Exception as error:  # zenoh raises its own and plain exceptions alike
             raise ConfigError(f"{file}: zenoh cannot use it: {_first_line(error)}") from error
+        if not router.insecure:
+            _check_secure(given, file)
+        return given
     where = [endpoint or LOOPBACK]
     settings: dict[str, Any] = {
         "mode": "router" if role == "serve" else "client",
@@ -77,6 +105,34 @@ def session_config(role: Role, file: Path | None = None, endpoint: str | None = 
         except Exception as error:
             raise ConfigError(f"zenoh endpoint {endpoint!r}: {_first_line(error)}") from error
     return config
+
+
+def _check_secure(config: zenoh.Config, file: Path) -> None:
+    """Raise ConfigError for an endpoint beyond loopback without TLS, and for multicast that may find one."""
+    mode = json.loads(config.get_json("mode")) or "peer"
+    found: list[tuple[str, str]] = []
+    for key in ("listen", "connect"):
+        endpoints = json.loads(config.get_json(f"{key}/endpoints"))
+        if isinstance(endpoints, dict):
+            endpoints = endpoints.get(mode, [])
+        found += [(f"{key}.endpoints", each) for each in endpoints if not _is_secure(each)]
+    looks = json.loads(config.get_json("scouting/multicast/enabled")) is not False
+    if looks and not (mode == "client" and endpoints):
+        found.append(("scouting.multicast.enabled", "true"))
+    if found:
+        raise ConfigError(
+            f"{file}: {found[0][0]}: expected loopback or TLS, got {found[0][1]}: "
+            "see TLS in docs/remote.md, or --insecure on a network that you trust"
+        )
+
+
+def _is_secure(endpoint: str) -> bool:
+    protocol, _, address = endpoint.partition("/")
+    host = re.split("[?#]", address)[0].rpartition(":")[0].strip("[]")
+    try:
+        return protocol in SAFE or host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def serve_session(config: zenoh.Config) -> zenoh.Session:

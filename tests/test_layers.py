@@ -23,6 +23,7 @@ BASE = {
     "endpoint",
     "origin",
     "network",
+    "plugins",
     "realtime",
 }
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}

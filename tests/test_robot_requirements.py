@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
 LEFT_OUT = {"torch", "scipy"}
@@ -22,10 +23,36 @@ def requirements() -> list[Requirement]:
     return [Requirement(line) for line in lines if line and not line.startswith("#")]
 
 
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+WANTED = [Requirement(each) for each in PROJECT["dependencies"]]
+EXTRAS = [Requirement(each) for extra in PROJECT["optional-dependencies"].values() for each in extra]
+
+
 def test_it_is_what_the_package_depends_on_without_torch():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = [Requirement(each) for each in project["dependencies"]]
-    assert sorted(map(str, requirements())) == sorted(str(each) for each in wanted if each.name not in LEFT_OUT)
+    assert sorted(map(str, requirements())) == sorted(str(each) for each in WANTED if each.name not in LEFT_OUT)
+
+
+@pytest.mark.parametrize("one", [each for each in WANTED + EXTRAS if each.name != "sfms-robot"], ids=str)
+def test_every_dependency_has_a_lower_bound_and_ends_at_a_major_version(one):
+    bounds = {each.operator: each.version for each in one.specifier}
+    if "==" in bounds or "<=" in bounds:  # one version, or the last before a change named beside it
+        return
+    assert set(bounds) == {">=", "<"} and bounds["<"].isdigit()
+    assert Version(bounds[">="]).major < int(bounds["<"])
+
+
+@pytest.mark.parametrize(
+    ("neighbour", "needs"),
+    [
+        ("pipecat", ["soxr==1.0.0"]),
+        ("lerobot", ["dynamixel-sdk==3.8.4"]),
+        ("reachy-mini", ["numpy==2.2.5", "onnxruntime==1.27.0", "starlette==0.52.1", "websockets==15.0.1"]),
+    ],
+)
+def test_versions_that_neighbours_need_are_in_the_ranges(neighbour, needs):
+    ranges = {each.name: each.specifier for each in WANTED}
+    for name, _, version in (each.partition("==") for each in needs):
+        assert version in ranges[name], f"{neighbour}: {name}"
 
 
 def installed(wanted: list[Requirement]) -> set[str]:

@@ -223,7 +223,7 @@ def _build_one(
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, where.read_deadline_s)
-    bus: Bus = family.bus_class()(
+    bus: Bus = family.build(
         name,
         servos,
         calibration_of(joints),

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_name
+from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.limitation import limitation
 from sfms_robot.app.listen.report import figures_so_far, run_report
@@ -33,9 +33,9 @@ from sfms_robot.errors import ConfigError, RobotError
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.open_feed import NamedFeed, open_feed
-from sfms_robot.listeners.plugins import REMOTE, listener_folder
 from sfms_robot.listeners.process import ListenerProcess
-from sfms_robot.network import check_zenoh
+from sfms_robot.network import Router, session_config
+from sfms_robot.plugins import REMOTE, listener_folder
 from sfms_robot.ports import Observer, PlanFeed, Retargeter, Source, Timeline
 from sfms_robot.realtime import realtime_priority
 from sfms_robot.retarget.spontaneous import HeadLife
@@ -181,6 +181,13 @@ class RunOptions:
     zenoh: Path | None = None
     engine: EngineName = "auto"
     packages: tuple[str, ...] = ()
+    insecure: bool = False
+    fleet_key: Path | None = None
+
+    @property
+    def router(self) -> Router:
+        """Router of a fleet, or of a listener on another machine."""
+        return Router(self.zenoh, self.insecure)
 
     @property
     def hears(self) -> str:
@@ -283,7 +290,10 @@ def _check(options: RunOptions) -> None:
     """What cannot be had together, or not here, before anything is opened. Raises ConfigError."""
     if options.fleet is not None:
         fleet_name(options.fleet)
-        check_zenoh()
+        session_config("call", options.router)
+        fleet_key(options.fleet_key)
+    elif options.fleet_key is not None:
+        raise ConfigError(f"--fleet-key {options.fleet_key}: no fleet is joined (--fleet)")
     if options.fast and split_kind(options.hears)[0] == "mic":
         raise ConfigError(f"--audio {options.hears}: what a microphone hears takes real time, --fast has none")
     if options.fast and options.play is not None:
@@ -356,7 +366,7 @@ def _watchers(options: RunOptions, status: RunStatus, controls: FleetControls, s
     if manager.wanted:
         watchers.append(NotifyingObserver(manager))
     if options.fleet is not None:
-        head = FleetHead(options.fleet, status.document, controls, options.zenoh)
+        head = FleetHead(options.fleet, status.document, controls, options.router, fleet_key(options.fleet_key))
         stack.callback(head.close)
         watchers.append(head)
     return watchers
@@ -391,7 +401,7 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
         listener = load_listener(options.listener, calmness=options.calmness, engine=options.engine, threads=1)
         feed = InlineFeed(listener, options.seed, FAST_LATENCY_S, engine_name(listener))
     else:
-        feed = open_feed(options.listener, options.seed, options.calmness, options.zenoh, options.engine)
+        feed = open_feed(options.listener, options.seed, options.calmness, options.router, options.engine)
     stack.callback(feed.close)
     return feed
 

@@ -1,0 +1,17 @@
+"""The command line. This file comes first and imports next to nothing, so that Ctrl-C is quiet from the start."""
+
+import os
+import signal
+import sys
+
+
+def start() -> None:
+    """Run `sfms-robot`. Ctrl-C while its modules are imported ends the process with exit code 130, without a word."""
+    before = signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    from sfms_robot.cli.main import main
+
+    try:
+        signal.signal(signal.SIGINT, before)
+        main()
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -149,6 +149,15 @@ def run(
         rich_help_panel=OUTPUT,
         help="zenoh's configuration (JSON5), for --fleet and --listener zenoh/NAME. Default: tcp/127.0.0.1:7447.",
     ),
+    insecure: bool = typer.Option(
+        False, "--insecure", rich_help_panel=OUTPUT, help="Allow endpoints of --zenoh beyond loopback without TLS."
+    ),
+    fleet_key: Path | None = typer.Option(
+        None,
+        metavar="FILE",
+        rich_help_panel=OUTPUT,
+        help="Key that --fleet asks of whoever resumes or ends the run; made where there is none yet.",
+    ),
     dry_run: bool = typer.Option(
         False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
     ),
@@ -188,7 +197,7 @@ def run(
         feed = (
             None
             if fast or dry_run
-            else stack.enter_context(closing(begin_listening(listener, seed, calm, zenoh, runs_on)))
+            else stack.enter_context(closing(begin_listening(listener, seed, calm, zenoh, runs_on, insecure)))
         )
         from sfms_robot.app import session
         from sfms_robot.app.listen.panel import live_panel
@@ -197,7 +206,7 @@ def run(
         options = session.RunOptions(
             head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
             tuple(intensity), tuple(style), tuple(without), halt_on, status, calm, play, fleet, zenoh, runs_on,
-            packages=tuple(packages),
+            packages=tuple(packages), insecure=insecure, fleet_key=fleet_key,
         )  # fmt: skip
         panel = None if json else live_panel
         if page is None:

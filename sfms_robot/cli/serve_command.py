@@ -21,6 +21,9 @@ def serve(
     zenoh: Path | None = typer.Option(
         None, metavar="FILE", help="zenoh's configuration (JSON5: endpoints, TLS). Default: tcp/127.0.0.1:7447."
     ),
+    insecure: bool = typer.Option(
+        False, "--insecure", help="Allow endpoints beyond loopback without TLS: anyone on that network may listen in."
+    ),
     metrics: str | None = typer.Option(
         None, metavar="[HOST:]PORT", help="Serve figures for Prometheus at /metrics, on loopback (0: any free port)."
     ),
@@ -43,7 +46,8 @@ def serve(
     over = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
-    figures = serve_until(ServeOptions(listener, name, zenoh, metrics, hop, processes, everybody, runs_on), over, _say)
+    options = ServeOptions(listener, name, zenoh, metrics, hop, processes, everybody, runs_on, insecure)
+    figures = serve_until(options, over, _say)
     if json:
         print_json(figures)
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from sfms_robot.config.joint import Joint
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
-from sfms_robot.config.named_bus import Bus, highest_rate_hz
+from sfms_robot.config.named_bus import Bus, highest_rate_hz, most_joints
 from sfms_robot.frames import CHANNEL_INDEX
 
 MOST_NODES: Final = 2000
@@ -31,11 +31,16 @@ def wiring(joints: Mapping[str, Joint | None], buses: Collection[str], limits: C
 
 
 def rates(joints: Mapping[str, Joint | None], buses: Mapping[str, Bus | None]) -> list[str]:
-    """Every bus whose wire cannot carry the goals of its joints as often as `rate_hz` says, one line each."""
+    """Return a line for every bus whose packets, or whose wire at `rate_hz`, cannot carry the goals of its joints."""
     found: list[str] = []
     for name, bus in buses.items():
         count = sum(joint is not None and joint.bus == name for joint in joints.values())
-        if bus is not None and bus.rate_hz > (highest := highest_rate_hz(bus.family, bus.baud, count)):
+        most = None if bus is None else most_joints(bus.family)
+        if bus is not None and most is not None and count > most:
+            found.append(
+                f"buses.{name}: expected at most {most} joints (one packet of goals, {bus.family}), got {count}"
+            )
+        elif bus is not None and bus.rate_hz > (highest := highest_rate_hz(bus.family, bus.baud, count)):
             problem = f"is more than {bus.baud} baud carry for {count} joints (at most {highest:g})"
             found.append(f"buses.{name}.rate_hz = {bus.rate_hz:g} {problem}")
     return found

@@ -1,7 +1,7 @@
 """The kinds of listeners that a folder may hold: what its config.yaml says, and what loads the folder.
 
 Imported when a listener of that kind is asked for. Listeners of other packages are not folders of ours: see
-`listeners.plugins`.
+`plugins`.
 """
 
 from __future__ import annotations

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema
 
 from sfms_robot.config.base import Model, Positive
+from sfms_robot.plugins import plugins
 
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
 BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
@@ -18,6 +18,9 @@ HIGHEST_RATE_HZ: Final = 1000.0
 # Bytes of one sync write of goal positions: around it, and per servo with its id. A board of hobby servos is not here:
 # it sends what changed, when its wire is free.
 _GOAL_BYTES: Final[Mapping[str, tuple[int, int]]] = {"dynamixel2": (14, 5), "dynamixel1": (8, 3), "feetech": (8, 3)}
+# Bytes of the longest packet: the vendor's SDK of both Dynamixel protocols builds no longer one; a Feetech packet has a
+# length of one byte.
+_PACKET_BYTES: Final[Mapping[str, int]] = {"dynamixel2": 1024, "dynamixel1": 250, "feetech": 259}
 _BITS: Final = 10  # of a byte on the wire: start, eight, stop
 
 
@@ -25,7 +28,7 @@ def _family(name: str) -> str:
     name = FORMER_FAMILIES.get(name, name)
     if name in BUS_FAMILIES:
         return name
-    known = [*BUS_FAMILIES, *(entry.name for entry in entry_points(group=BUS_GROUP))]
+    known = [*BUS_FAMILIES, *plugins(BUS_GROUP)]
     if name not in known:
         raise ValueError(f"is not a family of buses ({', '.join(known)})")
     return name
@@ -65,3 +68,11 @@ def highest_rate_hz(family: str, baud: int, joints: int) -> float:
         return HIGHEST_RATE_HZ
     around, each = _GOAL_BYTES[family]
     return min(HIGHEST_RATE_HZ, max(1.0, float(baud // (_BITS * (around + each * joints)))))
+
+
+def most_joints(family: str) -> int | None:
+    """Return how many servos the goals of one packet can name; None for a board, or for a family of another package."""
+    if family not in _GOAL_BYTES:
+        return None
+    around, each = _GOAL_BYTES[family]
+    return (_PACKET_BYTES[family] - around) // each

@@ -156,10 +156,14 @@ class Layered:
     notes: tuple[str, ...] = ()
 
 
+def config_folder() -> Path:
+    """Return the folder of this user's files: overlays of heads, the key of a fleet."""
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "sfms-robot"
+
+
 def overlay_file(head: str, practice: bool = False) -> Path:
     """Where the overlay of a head lies; what is practised on emulated servos lies beside it and is never used."""
-    root = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    return root / "sfms-robot" / "heads" / (f"{head}.practice.yaml" if practice else f"{head}.yaml")
+    return config_folder() / "heads" / (f"{head}.practice.yaml" if practice else f"{head}.yaml")
 
 
 def head_hash(name: str) -> str:

@@ -13,7 +13,8 @@ from typing import Any, Final
 
 import yaml
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.endpoint import whole_number
+from sfms_robot.errors import ConfigError, InputError
 
 DEEPEST: Final = 100  # levels; libyaml's composer recurses, and ends the process at some 10,000
 _LEADING_ZERO: Final = "!leading-zero"
@@ -48,12 +49,20 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
     return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
 
 
+def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
+    try:
+        return whole_number(node.value)
+    except InputError as error:
+        raise yaml.constructor.ConstructorError(None, None, str(error), node.start_mark) from error
+
+
 def _leading_zero(loader: _Loader, node: yaml.ScalarNode) -> None:
-    problem = f"{node.value} has a leading zero: write {int(node.value)}, or '{node.value}' for a text"
+    problem = f"{node.value} has a leading zero: write {_whole(loader, node)}, or '{node.value}' for a text"
     raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
 _Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 _Loader.add_constructor(_LEADING_ZERO, _leading_zero)
 
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from sfms_robot.emulator.device import Reply
+from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
 
 
@@ -118,7 +119,7 @@ def parse_ids(text: str) -> frozenset[int]:
     out: set[int] = set()
     for part in text.split(","):
         first, _, last = part.partition("-")
-        ids = range(int(first), int(last or first) + 1)
+        ids = range(whole_number(first), whole_number(last or first) + 1)
         if not ids or ids[-1] > 255:
             raise ValueError(f"{part!r} is no range of ids")
         out.update(ids)

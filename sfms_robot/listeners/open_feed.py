@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.plugins import REMOTE
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote import RemoteListener
+from sfms_robot.network import LOCAL, Router
+from sfms_robot.plugins import REMOTE
 
 NamedFeed = ListenerProcess | RemoteListener
 
 
 def open_feed(
-    name: str, seed: int, calmness: Calmness | None = None, zenoh: Path | None = None, engine: EngineName = "auto"
+    name: str, seed: int, calmness: Calmness | None = None, router: Router = LOCAL, engine: EngineName = "auto"
 ) -> NamedFeed:
-    """Loads or connects from now on; `wait_loaded` waits. `zenoh`: its configuration, for one on another machine,
-    which chooses its engine itself.
+    """Return a feed that loads or connects from now on; `wait_loaded` waits.
+
+    `router`: to a listener on another machine, which chooses its engine itself.
 
     Raises ConfigError, MissingExtra.
     """
@@ -25,4 +25,4 @@ def open_feed(
         return ListenerProcess(name, seed, calmness, engine)
     from sfms_robot.listeners.zenoh_link import connect_listener  # zenoh: only for who has its extra
 
-    return connect_listener(name, seed, calmness, zenoh)
+    return connect_listener(name, seed, calmness, router)

@@ -14,7 +14,7 @@ from sfms_robot.listeners.eventful import EventfulListener, MotionModel
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.idle_motion import FILE as IDLE_FILE
 from sfms_robot.listeners.idle_motion import IdleMotion
-from sfms_robot.listeners.plugins import listener_folder, load_plugin
+from sfms_robot.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
 

@@ -26,7 +26,6 @@ from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import FRAME_HZ, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.clock_offset import ClockOffset
 from sfms_robot.listeners.jitter_buffer import JitterBuffer
-from sfms_robot.listeners.plugins import REMOTE as PREFIX
 from sfms_robot.listeners.remote_messages import (
     Interface,
     Join,
@@ -39,6 +38,7 @@ from sfms_robot.listeners.remote_messages import (
     parse_words,
     words_message,
 )
+from sfms_robot.plugins import REMOTE as PREFIX
 from sfms_robot.signals.quantiles import Quantiles
 
 HUNG_S: Final = 1.0

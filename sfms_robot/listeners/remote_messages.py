@@ -42,6 +42,7 @@ import numpy as np
 import orjson
 
 from sfms_robot import __version__
+from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import (
     AUDIO_HZ,
@@ -271,7 +272,7 @@ def parse_words(data: bytes) -> Join | Welcome | Refusal | Notice:
     if len(data) > LONGEST_JSON:
         raise PacketError(f"JSON of more than {LONGEST_JSON} bytes")
     try:
-        told = json.loads(data)
+        told = json.loads(data, parse_int=whole_number)
         kind = told.pop("type")
         if "interface" in told:
             told["interface"] = _interface(told["interface"])
@@ -303,6 +304,8 @@ def _check_words(said: Join | Welcome | Refusal | Notice) -> None:
         kinds = ((said.kind, str), (said.frames, int))
     if not all(isinstance(value, kind) for value, kind in kinds):
         raise PacketError(f"a {type(said).__name__.lower()} with a value of another type")
+    if isinstance(said, Join) and said.seed < 0:
+        raise PacketError(f"join: seed: expected 0 or more, got {said.seed}")
     calmness = getattr(said, "calmness", None)
     if calmness is not None and not isinstance(calmness, dict):
         raise PacketError("a calmness that is no mapping")

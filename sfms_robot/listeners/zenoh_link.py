@@ -13,13 +13,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.config.calmness import Calmness
-from sfms_robot.listeners.plugins import REMOTE as PREFIX
 from sfms_robot.listeners.remote import RemoteListener
-from sfms_robot.network import LOOPBACK, Connection, check_name, session_config
+from sfms_robot.network import LOCAL, Connection, Router, check_name, session_config
+from sfms_robot.plugins import REMOTE as PREFIX
 
 if TYPE_CHECKING:
     import zenoh
@@ -42,23 +41,23 @@ def down_key(name: str, stream: str) -> str:
 
 
 def connect_listener(
-    listener: str, seed: int, calmness: Calmness | None = None, file: Path | None = None
+    listener: str, seed: int, calmness: Calmness | None = None, router: Router = LOCAL
 ) -> RemoteListener:
-    """The feed of zenoh/NAME, which connects from now on. `file`: zenoh's configuration, None for loopback.
+    """Return the feed of zenoh/NAME, which connects from now on.
 
     Raises ConfigError, MissingExtra.
     """
     name = check_name(listener.removeprefix(PREFIX), "listener")
-    return RemoteListener(name, ZenohLink(name, file), seed, calmness)
+    return RemoteListener(name, ZenohLink(name, router), seed, calmness)
 
 
 class ZenohLink:
     """`remote.Link` to the listener that is served as `name`."""
 
-    def __init__(self, name: str, file: Path | None = None) -> None:
+    def __init__(self, name: str, router: Router = LOCAL) -> None:
         self._name = name
-        self._where = f"{LOOPBACK}" if file is None else f"the endpoints of {file}"
-        self._connection = Connection(session_config("call", file))
+        self._where = str(router)
+        self._connection = Connection(session_config("call", router))
         self._received: deque[tuple[float, bytes]] = deque(maxlen=MOST_RECEIVED)
         self._lock = threading.Lock()
         self._publisher: zenoh.Publisher | None = None

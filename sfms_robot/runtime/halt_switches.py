@@ -36,7 +36,7 @@ _ACTIVE_LOW, _INPUT, _EDGES, _PULL_UP = 1 << 1, 1 << 2, 3 << 4, 1 << 8  # edges:
 _REQUEST: Final = struct.Struct("=I252x 32s Q260x4x I4x20x i")
 _VALUES: Final = struct.Struct("=QQ")  # bits, mask
 _EVENT: Final = struct.Struct("=QI36x")  # time stamp, 1: became active, 2: became inactive
-_LINE: Final = re.compile(r"(?P<chip>/dev/gpiochip\d+):(?P<line>\d+)(?P<high>,active-high)?")
+_LINE: Final = re.compile(r"(?P<chip>/dev/gpiochip\d+):(?P<line>\d{1,9})(?P<high>,active-high)?")
 
 Ioctl = Callable[[int, int, bytearray], Any]
 

@@ -1,20 +1,23 @@
 """The table of bus families: what drives each, and what the tools call it. Classes are named, and imported on use.
 
-Another package adds a family by an entry point of the group `sfms_robot.buses`: its name is the family's, its value
-loads a `BusFamily`.
+Another package adds a family by an entry point of the group `sfms_robot.buses` (`plugins`): its name is the family's,
+its value loads a `BusFamily`.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint
 from typing import Any, Final
 
 from sfms_robot.config.named_bus import BUS_GROUP, FORMER_FAMILIES
 from sfms_robot.errors import ConfigError
+from sfms_robot.plugins import plug_in, plugin_error, plugins
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -55,15 +58,16 @@ class BusFamily:
             raise ConfigError(f"{self.title}: a board speaks no servo protocol")
         return self.maps[1]
 
-    def bus_class(self) -> Any:
-        return _resolved(self.bus)
+    def build(self, *arguments: Any, **more: Any) -> Any:
+        """Return its bus, made of these arguments; the class itself without any. Raises ConfigError (`plug_in`)."""
+        return plug_in(EntryPoint(self.title, self.bus, BUS_GROUP), *arguments, **more)
 
     def link_class(self) -> Any:
         """Raises ConfigError for a board, and for a family without tools."""
         if self.link is None:
             why = "a board has no registers to read or write" if self.board else "the servo tools do not speak to it"
             raise ConfigError(f"{self.title}: {why}")
-        return _resolved(self.link)
+        return plug_in(EntryPoint(self.title, self.link, BUS_GROUP))
 
 
 _CHAIN: Final = "sfms_robot.servo.chain"
@@ -104,16 +108,24 @@ _OWN: Final = {
 
 @cache
 def families() -> Mapping[str, BusFamily]:
-    """All of them by name: our own, then those of other packages. Raises ConfigError for an entry that is none."""
+    """Return all families by name: our own, then those of other packages. One that fails is logged and left out."""
     found = dict(_OWN)
-    for entry in entry_points(group=BUS_GROUP):
-        family = entry.load()
-        if not isinstance(family, BusFamily):
-            raise ConfigError(f"entry point {BUS_GROUP}: {entry.name} = {entry.value} is not a BusFamily")
-        if entry.name in found:
-            raise ConfigError(f"entry point {BUS_GROUP}: {entry.name} = {entry.value}: there is a family of that name")
-        found[entry.name] = family
+    for name, entry in plugins(BUS_GROUP).items():
+        try:
+            found[name] = _family_of(entry)
+        except ConfigError as error:
+            log.warning("%s; it is left out", error)
     return found
+
+
+def _family_of(entry: EntryPoint) -> BusFamily:
+    """Return the family that a plug-in brings. Raises ConfigError."""
+    if entry.name in _OWN:
+        raise plugin_error(entry, "expected a name that no family of sfms-robot has")
+    family = plug_in(entry)
+    if not isinstance(family, BusFamily):
+        raise plugin_error(entry, f"expected a BusFamily, got {type(family).__name__}")
+    return family
 
 
 def servo_families() -> Mapping[str, BusFamily]:
@@ -122,10 +134,15 @@ def servo_families() -> Mapping[str, BusFamily]:
 
 
 def family_named(name: str) -> BusFamily:
-    """A family by its name, or by that of version 0.1.0. Raises ConfigError naming those there are."""
+    """Return a family by its name, or by that of version 0.1.0.
+
+    Raises ConfigError with the choices, or with the error of the plug-in that brings it.
+    """
     known = families()
     name = current_name(name)
     if name not in known:
+        if entry := plugins(BUS_GROUP).get(name):
+            return _family_of(entry)
         raise ConfigError.at("buses", "family", name, "is unknown", known)
     return known[name]
 
@@ -133,8 +150,3 @@ def family_named(name: str) -> BusFamily:
 def current_name(name: str) -> str:
     """The name as it is said now."""
     return FORMER_FAMILIES.get(name, name)
-
-
-def _resolved(path: str) -> Any:
-    module, _, name = path.partition(":")
-    return getattr(import_module(module), name)

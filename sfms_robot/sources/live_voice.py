@@ -9,6 +9,9 @@ cases:
    is placed anew.
 2. A stretch of less than `SETTLE_S`, of which little is known yet, is placed again where it is `UNSETTLED_S` off.
 3. The place is off by more than `GAP_S`: pieces that were held up came all at once.
+
+soxr 1.0, which some packages pin, has no variable rate: a stream keeps the true rate known when it was placed, and is
+placed again where it is `UNSETTLED_S` off.
 """
 
 from __future__ import annotations
@@ -53,6 +56,8 @@ class LiveVoice:
         self._received = 0  # samples of the stretch
         self._settled_s = 0.0  # when enough is known of the stretch
         self._stream: Any = None  # None: the next piece is placed
+        self._ratio = 1.0  # samples of the card to one of the loop
+        self._varies = True  # soxr follows the ratio, from 1.1 on
         self._position = 0.0  # samples of the stretch that went into what came out of the stream
         self._next = 0  # sample of the loop, at 16 kHz, that the stream gives next
         self._frames: dict[int, Floats] = {}
@@ -135,18 +140,20 @@ class LiveVoice:
     def _resample(self, samples: Floats, captured_s: float, arrived_s: float) -> None:
         first = self._received - len(samples)
         settled = captured_s > self._settled_s
-        if self._stream is not None and abs(self._behind()) > (GAP_S if settled else UNSETTLED_S) * self._rate_hz:
+        most_s = GAP_S if settled and self._varies else UNSETTLED_S
+        if self._stream is not None and abs(self._behind()) > most_s * self._rate_hz:
             self._end_stream()
         if self._stream is None:
             samples = self._place(samples, first)
             if not len(samples):
                 return
         assert self._clock is not None
-        pull = min(max(self._behind() / (PULL_S * self._rate_hz), -LARGEST_PULL), LARGEST_PULL)
-        ratio = self._clock.rate_hz / AUDIO_HZ * (1.0 + pull)
-        self._stream.set_io_ratio(ratio, 1.0)
+        if self._varies:
+            pull = min(max(self._behind() / (PULL_S * self._rate_hz), -LARGEST_PULL), LARGEST_PULL)
+            self._ratio = self._clock.rate_hz / AUDIO_HZ * (1.0 + pull)
+            self._stream.set_io_ratio(self._ratio, 1.0)
         out = self._stream.resample_chunk(samples)
-        self._position += ratio * len(out)
+        self._position += self._ratio * len(out)
         self._write(out, arrived_s)
 
     def _behind(self) -> float:
@@ -165,8 +172,11 @@ class LiveVoice:
         if past < len(samples):
             self._next = max(self._next, round(at + past * AUDIO_HZ / self._rate_hz))
             self._position = first + past
-            highest_hz = self._rate_hz * (1.0 + 2 * LARGEST_PULL)
-            self._stream = soxr.ResampleStream(highest_hz, AUDIO_HZ, 1, dtype="float32", quality="HQ", vr=True)
+            self._ratio = self._clock.rate_hz / AUDIO_HZ
+            self._varies = hasattr(soxr.ResampleStream, "set_io_ratio")
+            highest_hz = self._rate_hz * (1.0 + 2 * LARGEST_PULL) if self._varies else self._clock.rate_hz
+            more = {"vr": True} if self._varies else {}
+            self._stream = soxr.ResampleStream(highest_hz, AUDIO_HZ, 1, dtype="float32", quality="HQ", **more)
         return samples[past:]
 
     def _end_stretch(self) -> None:

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError
+from sfms_robot.plugins import plug_in, plugins
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, voice_file
 
 if TYPE_CHECKING:
@@ -56,8 +57,8 @@ class SourceKinds:
 
 
 def source_kinds(others: Iterable[EntryPoint] | None = None) -> SourceKinds:
-    """`others`: None for what is installed."""
-    found = {each.name: each for each in (entry_points(group=GROUP) if others is None else others)}
+    """Return every kind of source; `others`: those of other packages, None for what is installed."""
+    found = plugins(GROUP) if others is None else {each.name: each for each in others}
     return SourceKinds({**found, **VOICES}, {**found, **SIGHTS}, AGENT_VOICES)
 
 
@@ -155,11 +156,7 @@ def _opened(
     if name not in kinds:
         return None
     kind = kinds[name]
-    try:
-        build = kind.load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{flag} {name}: {kind.value} cannot be imported: {error}") from error
-    part = build(argument, visitor) if name == BROWSER else build(argument)
+    part = plug_in(kind, argument, visitor) if name == BROWSER else plug_in(kind, argument)
     failed.callback(part.close)
     if not any(hasattr(part, _METHODS[each]) for each in wanted):
         raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {' or '.join(wanted)}")

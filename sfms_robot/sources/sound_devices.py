@@ -162,7 +162,7 @@ def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
     if not wanted:
         return [device for device in devices if device.default] or list(devices[:1])
     if wanted.isdigit():
-        return [device for device in devices if not device.server and device.number == int(wanted)]
+        return [device for device in devices if not device.server and str(device.number) == wanted]
     looks = (
         lambda name: name == wanted,
         lambda name: _HARDWARE.sub("", name) == _HARDWARE.sub("", wanted),

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
+from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
 from sfms_robot.sources.face_choice import Choice, choose
 from sfms_robot.sources.mediapipe_face import SeenFace, seen_face
@@ -101,7 +102,7 @@ def watch(argument: str) -> Generator[Opened | Seen | None, float | None, None]:
     """
     need_extra()
     video = None if argument.isdigit() else argument
-    capture = open_video(argument) if video else open_camera(int(argument))
+    capture = open_video(argument) if video else open_camera(whole_number(argument))
     taken = None if video else live(capture, argument)
     with closing(Landmarker()) as landmarker:
         begins_s = yield Opened(_duration_s(capture) if video else None)

@@ -83,9 +83,17 @@ def test_shipped_names_go_first(installed):
     assert sr.load_listener("sfms-small").horizon == 8
 
 
-def test_one_that_cannot_be_imported_says_which(installed):
-    with pytest.raises(sr.ConfigError, match="'broken': somebodys_nods:Missing cannot be imported"):
-        sr.load_listener("broken")
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("broken", "broken .package somebodys-nods, somebodys_nods:Missing.: AttributeError: .*'Missing'"),
+        ("nodder:large", "nodder .package somebodys-nods, somebodys_nods:Nodder.: ValueError: could not convert"),
+    ],
+)
+def test_one_that_fails_at_import_or_when_it_is_made_says_which(installed, name, problem):
+    with pytest.raises(sr.ConfigError, match=f"^plug-in {problem}.*$") as raised:
+        sr.load_listener(name)
+    assert "\n" not in str(raised.value)
 
 
 def test_an_unknown_name_is_refused_with_the_shipped_ones(installed):
@@ -105,7 +113,7 @@ def test_a_run_listens_with_it_in_its_own_process(installed):
 def test_a_bus_family_of_another_package_is_in_the_table(installed):
     code = (
         "from sfms_robot.servo.families import family_named\n"
-        "family = family_named('somebodys'); print(family.title, family.bus_class())"
+        "family = family_named('somebodys'); print(family.title, family.build())"
     )
     here = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
@@ -146,6 +154,17 @@ def their_head(installed):
     assert "family: dynamixel2" in text
     (folder / "head.yaml").write_text(text.replace("family: dynamixel2", "family: somebodys"))
     return folder
+
+
+def test_a_broken_plug_in_ends_no_command_but_the_one_that_names_it(installed, their_head):
+    (installed / "somebodys_servos.py").write_text("raise RuntimeError('not for this computer')")
+    here = {**os.environ, "XDG_CONFIG_HOME": str(installed), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    for words, code in ((["doctor", "--port", "/dev/null", "--baud", "5"], 2), (["run", "--head", str(their_head)], 2)):
+        command = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
+        warned, said = done.stderr.splitlines()
+        assert done.returncode == code and "somebodys" in warned and warned.endswith("it is left out")
+        assert ("--baud 5" if words[0] == "doctor" else "not for this computer") in said
 
 
 def test_a_head_on_a_bus_of_another_package_runs_on_emulated_servos(installed, their_head):

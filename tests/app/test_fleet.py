@@ -5,7 +5,7 @@ import json
 import pytest
 
 from sfms_robot.app.fleet.fleet_client import GONE_S, FleetBoard, tile
-from sfms_robot.app.fleet.fleet_head import FleetControls, fleet_name
+from sfms_robot.app.fleet.fleet_head import FleetControls, fleet_key, fleet_name, proof
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
@@ -47,6 +47,53 @@ def test_end_asks_the_run_to_end(run):
     assert run.interrupt()
 
 
+KEY = b"k" * 64
+
+
+@pytest.mark.parametrize("command", ["resume", "end"])
+def test_resume_and_end_need_a_proof_of_the_key_which_counts_once(run, command):
+    controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
+    run.halt.close("kitchen")
+
+    def sent(**more):
+        return controls.obey(json.dumps({"command": command, **more}).encode(), "hall", KEY)
+
+    nonce = controls.nonce
+    other = "end" if command == "resume" else "resume"
+    wrong = [
+        proof(b"x" * 64, "hall", command, nonce),
+        proof(KEY, "attic", command, nonce),
+        proof(KEY, "hall", other, nonce),
+    ]
+    for each in ({}, {"proof": 3}, {"proof": "\ud800"}, *({"proof": one} for one in wrong)):
+        assert "error" in sent(**each) and "\n" not in sent(**each)["error"]
+    assert run.halt.by == "kitchen" and not run.interrupt() and controls.nonce == nonce
+    signed = proof(KEY, "hall", command, nonce)
+    assert sent(proof=signed) == {"done": command}
+    assert (run.halt.by is None) if command == "resume" else run.interrupt()
+    assert "--fleet-key" in sent(proof=signed)["error"]  # overheard, and sent again
+
+
+def test_halt_needs_no_key(run):
+    controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
+    assert controls.obey(b'{"command": "halt"}', "hall", KEY) == {"done": "halt"}
+
+
+def test_a_key_is_made_for_its_owner_alone_and_one_that_others_can_read_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    file = tmp_path / "of" / "fleet.key"
+    key = fleet_key(file)
+    assert len(key) == 64 and file.stat().st_mode & 0o777 == 0o600 and fleet_key(file) == key
+    assert fleet_key(None) != key and (tmp_path / "config" / "sfms-robot" / "fleet.key").is_file()
+    file.chmod(0o640)
+    with pytest.raises(ConfigError, match=f"^--fleet-key {file}: expected mode 600, got 640: chmod 600 {file}$"):
+        fleet_key(file)
+    file.chmod(0o600)
+    file.write_text("short")
+    with pytest.raises(ConfigError, match="expected a key of 32 characters or more, got 5"):
+        fleet_key(file)
+
+
 def test_calm_and_knobs_are_turned(run):
     assert run.obey(command="calm", rates={"nod": 3.0}) == {"done": "calm"}
     assert run.calmed[0].nod == 3.0
@@ -72,7 +119,11 @@ def test_what_cannot_be_obeyed_is_one_line(run, command, said):
     assert said in answer["error"] and "\n" not in answer["error"]
 
 
-@pytest.mark.parametrize("message", [b"", b"\xff\xfe", b"[]", b"{" * 10_000, b'{"command": ["halt"]}'])
+@pytest.mark.parametrize(
+    "message",
+    [b"", b"\xff\xfe", b"[]", b"{" * 10_000, b'{"command": ["halt"]}',
+     b'{"command": "knobs", "intensity": {"neck": 1' + 400 * b"0" + b"}}"],
+)  # fmt: skip
 def test_nonsense_is_answered_and_does_nothing(run, message):
     controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
     assert "error" in controls.obey(message)

@@ -38,6 +38,9 @@ def listener(folder: Path, weights: bytes) -> Path:
         (["--port", "/dev/ttyNowhere", "--duration", 1], 3, ["/dev/ttyNowhere", "no such device"]),
         (["--port", "socket://nohost"], 3, ["--port socket://nohost", "socket://HOST:PORT"]),
         (["--port", "main=ftp://host:1"], 3, ["--port ftp://host:1", "/dev/ttyUSB0", "socket://HOST:PORT"]),
+        (["--status", "1" * 5000], 2, ["is no TCP port"]),
+        (["--view", "1" * 5000], 2, ["--view"]),
+        (["--face", "webcam:" + "1" * 200, "--duration", 1], 2, ["expected a whole number of up to 20 digits"]),
         (["--addressed", "perhaps"], 2, ["--addressed perhaps", "sense, assume, never"]),
         (["--calmness", "addressed=1"], 2, ["--calmness addressed", "nod, shake"]),
         *(([option, "x" * 300], 2, ["x" * 300]) for option in ("--audio", "--face", "--head", "--listener")),
@@ -52,6 +55,23 @@ def test_what_is_not_there(fails, words, code, said):
 def test_a_flag_of_the_wrong_kind_or_size(command_line, option, value):
     ended = command_line("run", "--fast", option, value)
     assert ended.code == 2 and option in ended.err
+
+
+@pytest.mark.parametrize("digits", [21, 400, 5000])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("emulate", "--servo", "xl330-m288:{}"),
+        ("emulate", "--servo", "xl330-m288:1", "--start", "1={}"),
+        ("servo", "write", "--port", "sim", "1", "goal_position", "{}"),
+        ("servo", "move", "--port", "sim", "1", "--to", "{}"),
+        ("servo", "read", "--port", "sim", "{}", "all"),
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_a_number_that_is_too_long_is_one_line(fails, words, digits):
+    code, told = fails(*(word.format("1" * digits) for word in words))
+    assert code == 2 and "111" in told
 
 
 @pytest.mark.parametrize("option", ["--plot", "--sheet"])

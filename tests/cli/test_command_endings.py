@@ -62,6 +62,21 @@ def test_an_interruption_is_130_without_a_word(command):
     assert (ended, err) == (130, "") and json.loads(out)["exit"] == "interrupted"
 
 
+@pytest.mark.parametrize("module", ["logging", "typer", "sfms_robot.cli.run_command", "pathlib", "numpy"])
+def test_ctrl_c_while_modules_are_imported_is_130_without_a_traceback(module):
+    """Python tells of each module that it has imported: that is when the signal is sent."""
+    command = [sys.executable, "-X", "importtime", "-c", "from sfms_robot.cli import start; start()"]
+    words = ["head", "solve", "reachy_mini", "--poses", "/dev/stdin"]  # waits where it is not interrupted before
+    with subprocess.Popen([*command, *words], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stderr:
+            if line.split("|")[-1].strip() == module:
+                process.send_signal(signal.SIGINT)
+                break
+        _, error = process.communicate(timeout=60)
+    said = [line for line in error.splitlines() if not line.startswith("import time:")]
+    assert process.returncode == 130 and said == []
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_that_would_kill_is_an_interruption_and_its_handler_is_put_back(monkeypatch, capsys, name):
     number = getattr(signal, name, None)

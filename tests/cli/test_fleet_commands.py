@@ -5,11 +5,17 @@ import signal
 import socket
 import subprocess
 import sys
+from contextlib import closing
 from urllib.request import urlopen
 
 import pytest
 
-from sfms_robot.network import close_session, serve_session, session_config
+from sfms_robot.app.fleet.fleet_client import Fleet
+from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key
+from sfms_robot.errors import ConfigError
+from sfms_robot.network import Router, close_session, serve_session, session_config
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt
 
 COMMAND = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", "fleet"]
 
@@ -26,7 +32,7 @@ def zenoh(tmp_path):
             {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
         )
     )
-    router = serve_session(session_config("serve", None, endpoint))
+    router = serve_session(session_config("serve", endpoint=endpoint))
     yield file
     close_session(router)
 
@@ -44,7 +50,90 @@ def test_a_page_says_where_it_is_as_json_and_serves_until_it_is_told_to_stop(zen
     assert (process.returncode, rest, error) == (0, "", "")
 
 
-@pytest.mark.parametrize("words", [("--zenoh", "file.json5"), ("--json",)])
+def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(zenoh, tmp_path, command_line, caplog):
+    mine, other = tmp_path / "mine.key", tmp_path / "other.key"
+    latch, interrupt = HaltLatch(), Interrupt()
+    controls = FleetControls(latch, interrupt, None, None)
+    head = FleetHead("hall", lambda: {"state": "halted"}, controls, Router(zenoh), fleet_key(mine))
+    with closing(head), Fleet(zenoh) as fleet:
+        while not fleet.states():
+            pass  # until it is connected
+        assert command_line("fleet", "halt", "--zenoh", zenoh).out == "hall: halt\n" and latch.by is not None
+        for words in (["--fleet-key", other], []):  # that of another fleet, and one that is made on first use
+            ended = command_line("fleet", "resume", "hall", "--zenoh", zenoh, *words)
+            assert "resume: proof: expected the fleet's key (--fleet-key)" in ended.out and latch.by is not None
+        for command in ("resume", "end"):
+            (answer,) = fleet.command(["hall"], {"command": command})
+            assert "--fleet-key" in answer["error"] and not interrupt()
+        (document,) = fleet.states()
+        assert document["malformed"] == 4 and [each.levelname for each in caplog.records] == ["WARNING"]
+        assert command_line("fleet", "resume", "--zenoh", zenoh, "--fleet-key", mine).out == "hall: resume\n"
+        assert latch.by is None
+
+
+def test_documents_that_are_none_are_counted_and_the_first_is_logged(zenoh, command_line, caplog):
+    session = serve_session(session_config("call", Router(zenoh)))
+    for number, document in enumerate([b"\xff", b"[1]", b"1" * 5000, b'{"person": "loud"}', b'{"name": "hall"}']):
+        key = f"sfms/{number}/state"
+        session.declare_queryable(key, lambda query, key=key, document=document: query.reply(key, document))
+    ended = command_line("fleet", "--zenoh", zenoh, "--json")
+    close_session(session)
+    assert [each["name"] for each in ended.told["heads"]] == ["hall"] and ended.told["malformed"] == 4
+    (line,) = [each.getMessage() for each in caplog.records]
+    assert "sfms/" in line and "only counted" in line
+
+
+OPEN = {"scouting": {"multicast": {"enabled": False}}}
+
+
+@pytest.mark.parametrize(
+    ("words", "mode", "key", "endpoints"),
+    [
+        (["serve"], "router", "listen", ["tcp/192.0.2.1:7447"]),
+        (["serve"], "router", "listen", ["tls/192.0.2.1:7447", "udp/[2001:db8::1]:7447?rel=1"]),
+        (["run", "--listener", "zenoh/x"], "client", "connect", {"client": ["ws/robot.example:7447#iface=eth0"]}),
+        (["run", "--fleet", "hall"], "client", "connect", ["tcp/10.0.0.1:7447"]),
+        *(
+            (["fleet", *more], "client", "connect", ["tcp/10.0.0.1:7447"])
+            for more in ([], ["halt"], ["resume"], ["page"])
+        ),
+    ],
+    ids=lambda each: " ".join(each) if isinstance(each, list) else None,
+)
+def test_a_router_beyond_loopback_without_tls_needs_to_be_asked_for(
+    words, mode, key, endpoints, tmp_path, command_line
+):
+    file = tmp_path / "open.json5"
+    file.write_text(json.dumps({"mode": mode, key: {"endpoints": endpoints}, **OPEN}))
+    ended = command_line(*words, "--zenoh", file)
+    wrong = list(endpoints.values())[0][-1] if isinstance(endpoints, dict) else endpoints[-1]
+    assert ended.code == 2 and f"{file}: {key}.endpoints: expected loopback or TLS, got {wrong}" in ended.complaint
+    assert "TLS in docs/remote.md" in ended.complaint and "--insecure" in ended.complaint
+    assert session_config("call", Router(file, insecure=True)) is not None
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong"),
+    [
+        ({"mode": "router", **OPEN}, "listen.endpoints"),  # of itself a router listens on every address
+        ({"mode": "client"}, "scouting.multicast.enabled"),
+        ({"mode": "client", "connect": {"endpoints": ["tls/192.0.2.1:7447"]}}, None),
+        ({"mode": "client", "connect": {"endpoints": ["tcp/localhost:1", "tcp/[::1]:1", "tcp/127.0.0.9:1"]}}, None),
+        ({"mode": "peer", "listen": {"endpoints": ["quic/192.0.2.1:1"]}, **OPEN}, None),
+    ],
+)  # fmt: skip
+def test_what_zenoh_would_do_unasked_counts_too(settings, wrong, tmp_path):
+    pytest.importorskip("zenoh", reason="needs the extra [remote]")
+    file = tmp_path / "given.json5"
+    file.write_text(json.dumps(settings))
+    if wrong is None:
+        session_config("call", Router(file))
+    else:
+        with pytest.raises(ConfigError, match=wrong):
+            session_config("call", Router(file))
+
+
+@pytest.mark.parametrize("words", [("--zenoh", "file.json5"), ("--json",), ("--insecure",)])
 def test_an_option_before_the_command_is_not_dropped(command_line, words):
     ended = command_line("fleet", *words, "halt")
     assert ended.code == 2 and f"fleet halt {words[0]}" in ended.complaint

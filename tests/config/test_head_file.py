@@ -1,6 +1,7 @@
 """Values of a head's file that would hurt, older words, and what a run may write into a servo."""
 
 import logging
+import re
 
 import pytest
 
@@ -69,6 +70,24 @@ def test_a_rate_that_the_wire_cannot_carry_is_refused_with_the_highest_it_can(tm
     assert load_head(with_rate(tmp_path, 240)).buses["main"].rate_hz == 240
     with pytest.raises(ConfigError, match="rate_hz = 1000000.*less than or equal to 1000"):
         load_head(with_rate(tmp_path, 1_000_000))
+
+
+@pytest.mark.parametrize(
+    ("family", "model", "most"),
+    [("dynamixel2", "xl330-m288", 202), ("dynamixel1", "ax-12a", 80), ("feetech", "sts3215", 83)],
+)
+def test_more_servos_than_one_packet_of_goals_holds_are_refused(tmp_path, family, model, most):
+    for count in (most, most + 1):
+        text = HEAD.format(more="", bus="", joint="").replace("dynamixel2, baud: 57600", f"{family}, baud: 4000000")
+        text = text.replace("rate_hz: 50", "rate_hz: 20").replace("xl330-m288", model)
+        joints = "".join(f"  j{servo}: {{id: {servo}}}\n" for servo in range(3, count + 1))
+        (tmp_path / "head.yaml").write_text(text + joints)
+        if count == most:
+            assert len(load_head(str(tmp_path)).joints) == most and check_head(str(tmp_path)) == []
+    problem = rf"head.yaml: buses.main: expected at most {most} joints .*{family}.*, got {most + 1}"
+    with pytest.raises(ConfigError, match=problem):
+        load_head(str(tmp_path))
+    assert re.search(problem, check_head(str(tmp_path))[0])
 
 
 @pytest.mark.parametrize("family", ["dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"])

@@ -37,6 +37,12 @@ def test_a_leading_zero_is_refused_with_its_line(tmp_path, number):
         of(tmp_path, f"name: a\nid: {number}\n")
 
 
+@pytest.mark.parametrize("number", ["1" * 21, "-" + "1" * 4000, "1" * 5000, "0" + "1" * 5000])
+def test_a_number_that_is_too_long_is_refused_with_its_line(tmp_path, number):
+    with pytest.raises(ConfigError, match="^.*head.yaml:2: expected a whole number of up to 20 digits, got [-01]{8}"):
+        of(tmp_path, f"name: a\nid: {number}\n")
+
+
 @pytest.mark.parametrize("text", ["[" * 5000 + "]" * 5000, "[" * 30_000, "- " * 5000, "{a: " * 5000])
 def test_what_is_nested_too_deeply_is_one_line(tmp_path, text):
     with pytest.raises(ConfigError, match=f"head.yaml:1: (nested more than {DEEPEST} levels deep|.*)") as caught:
@@ -52,7 +58,11 @@ def test_shipped_files_mean_what_they_meant_to_yaml_1_1(file):
 NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]*", fullmatch=True)  # what keys and texts of our files are
 
 
-@given(st.dictionaries(NAMES, st.one_of(st.integers(), st.booleans(), st.none(), NAMES, st.floats(width=32))))
+@given(
+    st.dictionaries(
+        NAMES, st.one_of(st.integers(-(10**20) + 1, 10**20 - 1), st.booleans(), st.none(), NAMES, st.floats(width=32))
+    )
+)
 def test_what_we_write_is_what_we_read(tmp_path_factory, value):
     text = yaml.safe_dump(value, allow_unicode=False)
     assert repr(of(tmp_path_factory.mktemp("yaml"), text)) == repr(yaml.safe_load(text))

@@ -129,7 +129,7 @@ class Robot:
         self.recording, self._log, self._out = folder / f"run-{host}", folder / f"{host}.log", folder / f"{host}.json"
         with self._log.open("w") as log, self._out.open("w") as out:
             self.process = hosts.start(
-                host, *START, "run", "--head", HEAD, "--audio", DEFAULT_SPEAKER, "--duration", 600, "--zenoh", file,
+                host, *START, "run", "--head", HEAD, "--audio", DEFAULT_SPEAKER, "--duration", 600, "--zenoh", file, "--insecure",
                 "--listener", "zenoh/sfms-small", "--record", self.recording, "--json",
                 stdin=subprocess.DEVNULL, stdout=out, stderr=log,
             )  # fmt: skip
@@ -183,7 +183,7 @@ def test_50_ms_with_jitter_and_loss_leave_no_gap_and_an_outage_is_over_in_a_seco
         file = zenoh_file(
             tmp_path, "server", mode="router", listen={"endpoints": [f"tcp/{hosts.ends['server']}.2:{PORT}"]}
         )
-        words = ["serve", "--listener", "sfms-small", "--hop", "3", "--everybody", "--zenoh", file]
+        words = ["serve", "--listener", "sfms-small", "--hop", "3", "--everybody", "--zenoh", file, "--insecure"]
         server = hosts.start("server", *START, *words, stderr=subprocess.PIPE, text=True)
         stack.enter_context(ending(server))
         while "up to" not in (line := server.stderr.readline()):

@@ -159,6 +159,7 @@ def test_words_of_a_later_protocol_are_still_read_as_far_as_they_are_named():
 @pytest.mark.parametrize(
     "told",
     ["{", "{}", '{"type": "join"}', '{"type": "join", "client": 3, "seed": 0}', '{"type": "robot"}',
+     '{"type": "join", "client": "a", "seed": -1}', '{"type": "join", "client": "a", "seed": 1' + 99 * "0" + "}",
      '{"type": "notice", "kind": "calm", "calmness": 3}', "{" + " " * 20_000 + "}"],
 )  # fmt: skip
 def test_words_that_are_none_are_refused(told):

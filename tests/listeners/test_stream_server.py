@@ -21,6 +21,7 @@ from sfms_robot.listeners.remote_messages import (
     words_message,
 )
 from sfms_robot.listeners.serving.capacity import Capacity, measure_capacity
+from sfms_robot.listeners.serving.figures import report
 from sfms_robot.listeners.serving.stream_server import DEADLINE_S, SILENT_S, StreamServer
 
 
@@ -173,12 +174,15 @@ def test_calmness_that_cannot_be_is_refused_with_its_key():
     assert refusal.final and "nod" in refusal.reason
 
 
-def test_random_bytes_to_a_stream_are_not_stepped():
+def test_random_bytes_to_a_stream_are_not_stepped_but_counted_and_the_first_is_logged(caplog):
     server = StreamServer(Counting(), "counting")
-    stream = joined(server)
+    stream = joined(server, "robot-7")
     for message in (b"", b"\x01", b"{", frame(0)[:-1]):
         assert server.receive(stream, message, 0.0) == []
-    assert server.batch() is None
+    server.join(b"nonsense", 0.0)
+    assert server.batch() is None and report([server.figures(), server.figures()])["malformed"] == 10
+    (line,) = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+    assert f"stream {stream} of 'robot-7'" in line and "only counted" in line
 
 
 # --- admission -------------------------------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ class Bench:
 
         config = Bus(family=firmware_map.family, baud=baud, crc=crc[0])
         conversion, more = Straight(firmware_map, limit_rad), {"confirmed": True, "config": config} | more
-        self.bus = family_named(firmware_map.family).bus_class()("face", servos, conversion, open_port, baud, **more)
+        self.bus = family_named(firmware_map.family).build("face", servos, conversion, open_port, baud, **more)
 
     def new_port(self, *rest):
         return EmulatedPort(*rest)

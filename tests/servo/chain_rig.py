@@ -39,7 +39,7 @@ def bus_of(
     conversion = conversion or Straight(maps[0], limit_rad)
     options = Bus(family=name, baud=baud, **config)
     more = {"confirmed": True} if family.board else {"faults": faults}  # hobby servos jump to their first pose
-    return family.bus_class()("face", servos, conversion, open_port, baud, read_deadline_s, config=options, **more)
+    return family.build("face", servos, conversion, open_port, baud, read_deadline_s, config=options, **more)
 
 
 @dataclass

@@ -1,11 +1,12 @@
 """The one table of bus families: names, what they drive, and families of other packages."""
 
 import importlib
+import re
 
 import pytest
 
 from sfms_robot.config import load_head
-from sfms_robot.config.named_bus import BUS_GROUP
+from sfms_robot.config.named_bus import BUS_FAMILIES, BUS_GROUP
 from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.families import BusFamily, families, family_named, servo_families
@@ -14,7 +15,7 @@ from sfms_robot.servo.families import BusFamily, families, family_named, servo_f
 def test_every_family_names_classes_that_there_are():
     assert set(families()) >= {"dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"}
     for family in families().values():
-        assert isinstance(family.bus_class(), type)
+        assert isinstance(family.build(), type)
     for family in servo_families().values():
         assert isinstance(family.link_class(), type) and family.bauds and family.protocol in (1, 2)
 
@@ -68,8 +69,29 @@ def test_family_of_another_package_is_there_by_its_name(installed):
     assert family_named("herkulex") == HERKULEX
 
 
-@pytest.mark.parametrize("line", ["feetech = sfms_herkulex:FAMILY", "other = sfms_herkulex:BusFamily"])
-def test_entry_point_that_is_no_family_or_takes_a_name_is_refused(installed, line):
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("feetech = sfms_herkulex:FAMILY", "expected a name that no family of sfms-robot has"),
+        ("other = sfms_herkulex:BusFamily", "expected a BusFamily, got type"),
+        ("other = sfms_herkulex:Missing", "AttributeError: .*no attribute 'Missing'"),
+        ("other = sfms_raises:FAMILY", "RuntimeError: two"),
+        ("other = sfms_exits:FAMILY", "SystemExit: 3"),
+    ],
+)
+def test_a_plug_in_that_fails_is_named_once_and_left_out(installed, tmp_path, caplog, line, problem):
+    (tmp_path / "sfms_raises.py").write_text("raise RuntimeError('two\\nlines')")
+    (tmp_path / "sfms_exits.py").write_text("raise SystemExit(3)")
     installed(line)
-    with pytest.raises(ConfigError, match="entry point sfms_robot.buses"):
-        families()
+    assert families() is families() and set(families()) == set(BUS_FAMILIES)
+    (warning,) = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+    assert re.fullmatch(f"plug-in .*package sfms-herkulex, .*: {problem}; it is left out", warning)
+    if line.startswith("other"):  # for the user who names it, its error is the error
+        with pytest.raises(ConfigError, match=f"^plug-in other .*{problem}$"):
+            family_named("other")
+
+
+def test_a_bus_of_a_plug_in_that_cannot_be_made_says_so():
+    for bus in ("sfms_nowhere:Bus", "math:sqrt"):
+        with pytest.raises(ConfigError, match=f"plug-in Theirs .*{bus}.*Error: "):
+            BusFamily("Theirs", bus, ("theirs", None)).build("not a number")

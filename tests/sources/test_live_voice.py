@@ -4,6 +4,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import soxr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -105,6 +106,22 @@ def test_a_tone_stays_a_tone(rate_hz):
     at = np.fft.rfftfreq(len(sound), 1 / 16000)
     near = np.abs(at - 1000.0) < 20.0  # a correction of a percent for a moment is 10 Hz
     assert spectrum[~near].sum() < 1e-6 * spectrum[near].sum()
+
+
+class FixedRate:
+    """`soxr.ResampleStream` of soxr 1.0, whose rate cannot be changed."""
+
+    def __init__(self, rate_hz, *args, dtype, quality, made=soxr.ResampleStream):
+        self.resample_chunk = made(rate_hz, *args, dtype=dtype, quality=quality).resample_chunk
+
+
+@pytest.mark.parametrize("ppm", [-200, 200])
+def test_with_soxr_1_0_a_frame_is_at_most_10_ms_off_and_none_is_lost(ppm, monkeypatch):
+    monkeypatch.setattr(soxr, "ResampleStream", FixedRate)
+    voice, frames = played(Card(48000, ppm, 0.01), pieces(480), 120)
+    assert not any(frame is None for frame in frames[3:])
+    assert np.abs(offsets_s(frames, 100)).max() < 0.0105
+    assert voice.statistics()["gaps"] == 0
 
 
 def test_what_16_khz_cannot_hold_is_filtered_out():

@@ -21,7 +21,7 @@ class Entry:
     """The part of importlib's EntryPoint that is used."""
 
     def __init__(self, name, value, loaded=None):
-        self.name, self.value, self.loaded = name, value, loaded
+        self.name, self.value, self.loaded, self.dist = name, value, loaded, None
 
     def load(self):
         if self.loaded is None:
@@ -100,7 +100,7 @@ def test_what_was_opened_is_closed_when_the_next_cannot_be():
             self.closed = True
 
     ear = Ear(np.zeros(640, dtype=np.float32))
-    with pytest.raises(ConfigError, match="--face broken: theirs:broken cannot be imported"):
+    with pytest.raises(ConfigError, match="plug-in broken .*theirs:broken.: ImportError"):
         open_source("ear", "broken", kinds=kinds(ear=lambda argument: ear, broken=None))
     assert ear.closed
 
@@ -109,8 +109,17 @@ def test_kinds_of_other_packages_are_imported_when_opened_and_never_replace_ours
     theirs = kinds(push=Own, broken=None)
     assert theirs.voices["push"] is VOICES["push"] and theirs.sights["push"] is SIGHTS["push"]
     check_source("broken", kinds=theirs)
-    with pytest.raises(ConfigError, match="--audio broken: theirs:broken cannot be imported: no module named so"):
+    with pytest.raises(ConfigError, match="plug-in broken .*theirs:broken.: ImportError: no module named so"):
         open_source("broken", kinds=theirs)
+
+
+@pytest.mark.parametrize("fault", [KeyError("ear"), OSError(19, "No such device"), SystemExit(1)])
+def test_a_kind_that_raises_when_it_is_made_is_one_line(fault):
+    def made(argument):
+        raise fault
+
+    with pytest.raises(ConfigError, match=f"^plug-in ear .*theirs:ear.: {type(fault).__name__}: .+$"):
+        open_source("ear", kinds=kinds(ear=made))
 
 
 def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():

@@ -8,9 +8,9 @@ import pytest
 from chromium import Page, missing
 
 from sfms_robot.app.fleet.fleet_client import Fleet
-from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead
+from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key
 from sfms_robot.app.fleet.fleet_page import FleetPage
-from sfms_robot.network import close_session, serve_session, session_config
+from sfms_robot.network import Router, close_session, serve_session, session_config
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
@@ -30,7 +30,8 @@ class Head:
 
     def __init__(self, name, file):
         self.halt = HaltLatch()
-        self.head = FleetHead(name, self.document, FleetControls(self.halt, Interrupt(), None, None), file)
+        controls = FleetControls(self.halt, Interrupt(), None, None)
+        self.head = FleetHead(name, self.document, controls, Router(file), fleet_key(None))
 
     def document(self):
         by = self.halt.by
@@ -48,7 +49,7 @@ def fleet(tmp_path):
     quiet = {"scouting": {"multicast": {"enabled": False}}}
     file = tmp_path / "robot.json5"
     file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}, **quiet}))
-    router = serve_session(session_config("serve", None, endpoint))
+    router = serve_session(session_config("serve", endpoint=endpoint))
     heads = {name: Head(name, file) for name in NAMES}
     try:
         with Fleet(file) as asked, closing(FleetPage(asked, 0)) as page, Page(tmp_path / "chromium") as browser:

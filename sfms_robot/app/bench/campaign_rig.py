@@ -223,7 +223,7 @@ def _bus_on(head: Head, chains: Mapping[str, Chain], clock: VirtualClock, wrap: 
     servos = [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad) for key, j in head.joints.items()]
     open_port, family = port_of(chains[name], config, clock), family_named(config.family)
     more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
-    bus: Bus = family.bus_class()(
+    bus: Bus = family.build(
         name, servos, calibration_of(head.joints), lambda: wrap(open_port()), config.baud, _DEADLINE_S,
         config=config, **more,
     )  # fmt: skip

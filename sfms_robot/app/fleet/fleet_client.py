@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -10,34 +11,41 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from sfms_robot.app.fleet.fleet_head import ROOT, fleet_name
+from sfms_robot.app.fleet.fleet_head import ROOT, fleet_key, fleet_name, proof
 from sfms_robot.errors import PortError
-from sfms_robot.network import AWAY_S, LOOPBACK, Connection, session_config
+from sfms_robot.network import AWAY_S, Connection, Router, session_config
 
 ASK_S: Final = 2.0  # that heads have to answer
 GONE_S: Final = 3.0  # a head that has told nothing for so long is away
 
 Document = Mapping[str, Any]
 
+log = logging.getLogger(__name__)
+
 
 class Fleet:
-    """A connection to whatever joins the heads. Opens in `__enter__`, which waits for `AWAY_S` at most.
+    """A connection to the router that joins the heads. Opens in `__enter__`, which waits for `AWAY_S` at most.
 
-    Raises PortError when nobody answers there, ConfigError, MissingExtra.
+    Attributes:
+        malformed: count of messages that hold no document.
+
+    Raises PortError when no router answers, ConfigError, MissingExtra.
     """
 
-    def __init__(self, file: Path | None = None) -> None:
-        self._file = file
+    def __init__(self, zenoh: Path | None = None, insecure: bool = False, key: Path | None = None) -> None:
+        self._router, self._key = Router(zenoh, insecure), key
+        self.malformed = 0
         self._connection: Connection | None = None
         self._session: Any = None
 
     def __enter__(self) -> Self:
-        self._connection = Connection(session_config("call", self._file))
+        self._connection = Connection(session_config("call", self._router))
         self._session = self._connection.wait(AWAY_S)
         if self._session is None:
-            where = LOOPBACK if self._file is None else f"the endpoints of {self._file}"
             self._connection.close()
-            raise PortError(f"nobody answers at {where}: is `sfms-robot serve`, or another zenoh router, running?")
+            raise PortError(
+                f"nobody answers at {self._router}: is `sfms-robot serve`, or another zenoh router, running?"
+            )
         return self
 
     def __exit__(
@@ -56,6 +64,17 @@ class Fleet:
         keys = [f"{ROOT}/{fleet_name(head)}/command" for head in heads] or [f"{ROOT}/*/command"]
         return [answer for key in keys for answer in self._ask(key, json.dumps(dict(command)).encode())]
 
+    def resume(self, heads: Sequence[str]) -> list[Document]:
+        """Resume `heads`, or all, by the fleet's key. Raises ConfigError for a key that cannot be used."""
+        key = fleet_key(self._key)
+        answers: list[Document] = []
+        for each in self.states():
+            name = str(each.get("name"))
+            if not heads or name in heads:
+                signed = proof(key, name, "resume", str(each.get("nonce")))
+                answers += self.command([name], {"command": "resume", "proof": signed})
+        return answers
+
     def halt(self, heads: Sequence[str], by: str) -> list[Document]:
         """Halt `heads`, or all; said twice: on the keys for halting, which ask for no answer, and as a command."""
         for key in [f"{ROOT}/{fleet_name(head)}/halt" for head in heads] or [f"{ROOT}/*/halt"]:
@@ -64,23 +83,26 @@ class Fleet:
 
     def follow(self, tell: Callable[[Document], None]) -> None:
         """`tell` of every document from now on, in a thread of zenoh's."""
-        self._session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._tell(sample.payload.to_bytes(), tell))
+        self._session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._tell(sample, tell))
 
     def _ask(self, key: str, payload: bytes) -> list[Document]:
         answers: list[Document] = []
         for reply in self._session.get(key, payload=payload, timeout=ASK_S):
             if reply.ok is not None:
-                self._tell(reply.ok.payload.to_bytes(), answers.append)
+                self._tell(reply.ok, answers.append)
         return answers
 
-    @staticmethod
-    def _tell(message: bytes, tell: Callable[[Document], None]) -> None:
+    def _tell(self, sample: Any, tell: Callable[[Document], None]) -> None:
         try:
-            told = json.loads(message)
-        except ValueError:
-            return
-        if isinstance(told, dict):
+            told = json.loads(sample.payload.to_bytes())
+        except (ValueError, RecursionError):
+            told = None
+        if isinstance(told, dict) and isinstance(told.get("person") or {}, dict):
             tell(told)
+            return
+        self.malformed += 1
+        if self.malformed == 1:
+            log.warning("fleet: %s: expected a JSON document of a head (more are only counted)", sample.key_expr)
 
 
 class FleetBoard:

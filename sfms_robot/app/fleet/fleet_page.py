@@ -69,7 +69,7 @@ class _Answer(Answer):
         fleet = self.server.fleet
         orders: Mapping[str, Callable[[list[str]], Any]] = {
             "/halt": lambda heads: fleet.halt(heads, "the fleet's page"),
-            "/resume": lambda heads: fleet.command(heads, {"command": "resume"}),
+            "/resume": fleet.resume,
         }
         order = orders.get(self.path)
         if order is None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from sfms_robot.config import load_listener
-from sfms_robot.listeners.plugins import listener_folder
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.plugins import listener_folder
 
 
 def limitation(listener: str) -> str | None:

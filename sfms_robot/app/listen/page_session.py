@@ -145,7 +145,12 @@ class PageSession:
 
     def _listener(self, stack: ExitStack) -> NamedFeed:
         feed = begin_listening(
-            self.options.listener, self.options.seed, self.options.calmness, self.options.zenoh, self.options.engine
+            self.options.listener,
+            self.options.seed,
+            self.options.calmness,
+            self.options.zenoh,
+            self.options.engine,
+            self.options.insecure,
         )
         stack.callback(feed.close)
         return feed

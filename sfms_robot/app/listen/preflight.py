@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.listeners.plugins import listener_folder
+from sfms_robot.plugins import listener_folder
 from sfms_robot.servo.discovery import access_problem, is_address
 from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 
@@ -58,12 +58,18 @@ def engine_named(name: str) -> EngineName:
 
 
 def begin_listening(
-    listener: str, seed: int, calmness: Calmness | None = None, zenoh: Path | None = None, engine: EngineName = "auto"
+    listener: str,
+    seed: int,
+    calmness: Calmness | None = None,
+    zenoh: Path | None = None,
+    engine: EngineName = "auto",
+    insecure: bool = False,
 ) -> NamedFeed:
-    """The listener, which loads or is connected to from now on. For `session.run(feed=...)`; closed by the caller."""
+    """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. Closed by the caller."""
     from sfms_robot.listeners.open_feed import open_feed  # numpy: not for who only mistyped a name
+    from sfms_robot.network import Router
 
-    return open_feed(listener, seed, calmness, zenoh, engine)
+    return open_feed(listener, seed, calmness, Router(zenoh, insecure), engine)
 
 
 def begin_page(

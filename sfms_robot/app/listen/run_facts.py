@@ -14,7 +14,7 @@ import yaml
 from sfms_robot import __version__
 from sfms_robot.config import Head
 from sfms_robot.errors import ConfigError
-from sfms_robot.listeners.plugins import listener_folder
+from sfms_robot.plugins import listener_folder
 
 LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
 

@@ -20,6 +20,7 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from sfms_robot.app.listen.run_facts import LONG
+from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
 from sfms_robot.runtime.loop import AWAY_S
@@ -150,7 +151,7 @@ def summary(recording: RunRecording) -> dict[str, Any]:
     """What is in a recording, for the command line."""
     told: dict[str, Any] = {key: value for key, value in recording.about.items() if key not in LONG}
     if told.get("seed", "").isdecimal():  # what a run writes about itself is text
-        told["seed"] = int(told["seed"])
+        told["seed"] = whole_number(told["seed"])
     return {
         **told,
         "duration_s": round(recording.listened_s, 3),

@@ -27,6 +27,7 @@ _FIGURES: Final[tuple[tuple[str, str, str, tuple[str, ...], float], ...]] = (
     ("frames_skipped", "counter", "Frames left out, since too many were waiting", ("skipped_frames",), 1.0),
     ("frames_lost", "counter", "Frames that never came", ("lost_frames",), 1.0),
     ("refused", "counter", "Robots that were refused", ("refused",), 1.0),
+    ("malformed", "counter", "Messages that could not be read", ("malformed",), 1.0),
     ("cost_scale", "gauge", "How much longer batches take than measured at the start", ("cost_scale",), 1.0),
 )
 

@@ -19,7 +19,7 @@ from sfms_robot.app.serve.worker_pool import WorkerPool
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.serving.stream_server import DEADLINE_S
 from sfms_robot.listeners.zenoh_link import ROOT, down_key, join_key
-from sfms_robot.network import check_name, check_zenoh, close_session, serve_session, session_config
+from sfms_robot.network import Router, check_name, check_zenoh, close_session, serve_session, session_config
 
 if TYPE_CHECKING:
     import zenoh
@@ -38,6 +38,7 @@ class ServeOptions:
         processes: that step; None: one for each core.
         everybody: admit without asking what it costs.
         engine: what the listener's networks are computed by.
+        insecure: allow endpoints beyond loopback without TLS.
     """
 
     listener: str = "sfms-small"
@@ -48,6 +49,7 @@ class ServeOptions:
     processes: int | None = None
     everybody: bool = False
     engine: EngineName = "auto"
+    insecure: bool = False
 
 
 class ZenohService:
@@ -102,7 +104,7 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
 
     check_zenoh()
     name = check_name(options.name or Path(options.listener).name, "listener")
-    config = session_config("serve", options.zenoh)
+    config = session_config("serve", Router(options.zenoh, options.insecure))
     service_manager = ServiceManager()
     with ExitStack() as stack:
         metrics = stack.enter_context(MetricsServer(options.metrics)) if options.metrics is not None else None

@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 from sfms_robot.config import FirmwareMap, load_firmware_map, load_head
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch, wait
+from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import BusError, ConfigError
 
 USUAL_BAUD: Final = 1_000_000
@@ -119,12 +120,12 @@ def _servos(options: EmulateOptions) -> dict[str, list[EmulatedServo]]:
         for servos in out.values():
             for i, servo in enumerate(servos):
                 if servo.id in ids:
-                    registers = {**servo.registers, found["register"]: int(found["value"])}
+                    registers = {**servo.registers, found["register"]: whole_number(found["value"])}
                     servos[i] = replace(servo, registers=registers)
     for text in options.starts:
         ids, found = _of_ids("start", text, _START, "IDS=TICKS, as in 3=4150", out)
         for servos in out.values():
-            servos[:] = [replace(s, start_ticks=int(found["value"])) if s.id in ids else s for s in servos]
+            servos[:] = [replace(s, start_ticks=whole_number(found["value"])) if s.id in ids else s for s in servos]
     return out
 
 

@@ -80,7 +80,7 @@ def _target(seen: FoundServo, table: Table, limits: tuple[int, int], start: int,
 
 
 def _parsed(table: Table, text: str) -> int:
-    match = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*(deg)?\s*", text)
+    match = re.fullmatch(r"\s*([-+]?\d{1,20}(?:\.\d+)?)\s*(deg)?\s*", text)
     if match is None or (match[2] is None and "." in match[1]):
         raise ConfigError.at("servo move", "goal", text, "is no place", ["ticks: 2048", "degrees: 12.5deg"])
     return round(_ticks(table, float(match[1]))) if match[2] else int(match[1])

@@ -138,7 +138,7 @@ def write_register(wire: Wire, seen: FoundServo, name: str, text: str, confirm: 
 
 def parse_value(model: str, field: Field, text: str) -> int:
     """A raw value, or a number with the register's unit. Raises ConfigError outside the register's range."""
-    match = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*([A-Za-z_]\w*)?\s*", text)
+    match = re.fullmatch(r"\s*([-+]?\d{1,20}(?:\.\d+)?)\s*([A-Za-z_]\w*)?\s*", text)
     if match is None or (match[2] is None and "." in match[1]) or match[2] not in (None, field.unit):
         forms = ["a raw number", *([f"a number with unit {field.unit}"] if field.unit else [])]
         raise ConfigError.at(model, field.name, text, "is not a value of this register", forms)

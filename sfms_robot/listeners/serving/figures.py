@@ -17,7 +17,8 @@ class Figures:
         server, listener: names.
         hop: frames between plans; deadline_s: promised from a frame to its plan.
         heads: streams at this moment; most_heads: that could be answered in time, None where nobody asks.
-        plans, misses, batches, steps, skipped, lost, refused: counts; `misses` are plans later than the deadline.
+        plans, misses, batches, steps, skipped, lost, refused, malformed: counts; `misses` are plans later than the
+            deadline.
         delays_s, batch_sizes: of the last plans, and of the last batches.
         cost_scale: how much longer batches take than measured at the start; None where that was not measured.
         cpu_s: time of a core that its process has used.
@@ -36,6 +37,7 @@ class Figures:
     skipped: int
     lost: int
     refused: int
+    malformed: int
     delays_s: Sequence[float]
     batch_sizes: Sequence[int]
     cost_scale: float | None
@@ -67,6 +69,7 @@ def report(parts: Sequence[Figures]) -> Mapping[str, Any]:
         "skipped_frames": total("skipped"),
         "lost_frames": total("lost"),
         "refused": total("refused"),
+        "malformed": total("malformed"),
         "cost_scale": round(max(scales), 3) if scales else None,
         "cpu_s": round(sum(each.cpu_s for each in parts), 3),
     }

@@ -113,7 +113,7 @@ class StreamServer:
         deadline_s: what is promised to each head.
 
     Attributes:
-        plans, batches, misses, skipped, lost, refused: counts; `misses` are plans later than the deadline.
+        plans, batches, misses, skipped, lost, refused, malformed: counts; `misses` are plans later than the deadline.
     """
 
     def __init__(
@@ -131,7 +131,9 @@ class StreamServer:
         self._recent_s: deque[float] = deque(maxlen=RECENT)
         self._most = self._batch_limit()
         self._batch_sizes: deque[int] = deque(maxlen=RECENT)
-        self.plans = self.batches = self.misses = self.skipped = self.lost = self.refused = self.stepped = 0
+        self.plans = self.batches = self.misses = self.skipped = self.lost = self.refused = self.stepped = (
+            self.malformed
+        ) = 0
 
     @property
     def heads(self) -> int:
@@ -158,6 +160,7 @@ class StreamServer:
                 raise PacketError("something else than Join")
             answer = self._admit(said, now_s)
         except RobotError as error:
+            self._count_malformed("join", error)
             answer = Refusal(f"server {self._server} cannot take that: {error}", final=True)
         if isinstance(answer, Refusal):
             self.refused += 1
@@ -213,8 +216,13 @@ class StreamServer:
                 return []
             return self._enqueue(stream, parse_frame(message), now_s)
         except RobotError as error:
-            log.warning("stream %s: %s", name, error)
+            self._count_malformed(f"stream {name} of {stream.client!r}", error)
             return []
+
+    def _count_malformed(self, origin: str, error: RobotError) -> None:
+        self.malformed += 1
+        if self.malformed == 1:
+            log.warning("%s: %s (more malformed messages are only counted)", origin, error)
 
     def _heed(self, stream: _Stream, message: bytes) -> None:
         said = parse_words(message)
@@ -336,6 +344,7 @@ class StreamServer:
             skipped=self.skipped,
             lost=self.lost,
             refused=self.refused,
+            malformed=self.malformed,
             delays_s=[*self._recent_s],
             batch_sizes=[*self._batch_sizes],
             cost_scale=None if self._capacity is None else self._capacity.scale,

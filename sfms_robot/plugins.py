@@ -1,0 +1,83 @@
+"""Plug-ins of other packages: entry points of the groups `sfms_robot.listeners`, `.sources` and `.buses`.
+
+An entry of the first two names a callable that takes the text behind the colon of NAME:ARGUMENT ("" without one) and
+returns a `ports.Listener` or a source; an entry of the third names a `servo.families.BusFamily`. They are imported only
+where they are used. Shipped names and folders go first.
+
+A plug-in that fails is a ConfigError of one line for the user who named it. For all others it is left out.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sfms_robot.data import find
+from sfms_robot.errors import ConfigError, RobotError
+
+if TYPE_CHECKING:  # numpy, which a look at a name does not need
+    from sfms_robot.ports import Listener
+
+GROUP: Final = "sfms_robot.listeners"
+REMOTE: Final = "zenoh/"  # begins the name of a listener on another machine (`remote`)
+
+log = logging.getLogger(__name__)
+
+
+def plugins(group: str) -> Mapping[str, EntryPoint]:
+    """Return the installed entry points of a group by name, not yet imported."""
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+def plug_in(entry: EntryPoint, *arguments: Any, **more: Any) -> Any:
+    """Import what an entry names and return it, or what it returns where there are `arguments`.
+
+    Raises a ConfigError of one line for any error of another package, but RobotErrors that its callable raises on
+    purpose. Errors of this package's own kinds pass unchanged.
+    """
+    try:
+        found = entry.load()
+        return found(*arguments, **more) if arguments else found
+    except (Exception, SystemExit) as error:
+        if entry.value.startswith("sfms_robot.") or (arguments and isinstance(error, RobotError)):
+            raise
+        log.info("traceback of plug-in %s", entry.name, exc_info=True)
+        text = (str(error).splitlines() or [""])[0]
+        raise plugin_error(entry, f"{type(error).__name__}: {text}") from error
+
+
+def plugin_error(entry: EntryPoint, problem: str) -> ConfigError:
+    """Return the error that names the plug-in, its package and what is wrong with it."""
+    package = entry.dist.name if entry.dist else "unknown"
+    return ConfigError(f"plug-in {entry.name} (package {package}, {entry.value}): {problem}")
+
+
+def listener_folder(name: str) -> Path | None:
+    """Return the folder of a listener by shipped name or path; None for a plug-in, or one on another machine.
+
+    Raises ConfigError with the choices.
+    """
+    if name.startswith(REMOTE):
+        return None
+    try:
+        return find("listeners", name, "config.yaml")
+    except ConfigError:
+        if _entry(name) is None:
+            raise
+        return None
+
+
+def load_plugin(name: str) -> Listener:
+    """Return the listener that another package registers for `name`, NAME or NAME:ARGUMENT. Raises ConfigError."""
+    entry = _entry(name)
+    if entry is None:
+        raise ConfigError(f"listener {name!r} is registered by no package")
+    listener: Listener = plug_in(entry, name.partition(":")[2])
+    return listener
+
+
+def _entry(name: str) -> EntryPoint | None:
+    return plugins(GROUP).get(name.partition(":")[0])
