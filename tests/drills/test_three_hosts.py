@@ -129,8 +129,8 @@ class Robot:
         self.recording, self._log, self._out = folder / f"run-{host}", folder / f"{host}.log", folder / f"{host}.json"
         with self._log.open("w") as log, self._out.open("w") as out:
             self.process = hosts.start(
-                host, *START, "run", "--head", HEAD, "--audio", DEFAULT_SPEAKER, "--duration", 600, "--zenoh", file, "--insecure",
-                "--listener", "zenoh/sfms-small", "--record", self.recording, "--json",
+                host, *START, "run", "--head", HEAD, "--audio", DEFAULT_SPEAKER, "--duration", 600, "--zenoh", file,
+                "--insecure", "--listener", "zenoh/sfms-small", "--record", self.recording, "--json",
                 stdin=subprocess.DEVNULL, stdout=out, stderr=log,
             )  # fmt: skip
 
