@@ -184,6 +184,7 @@ class ChainBus(WireBus[L], Generic[L]):
     def _attach(self, link: L) -> None:
         self._now_s = link.port.now_s
         startup = self._begin(link, tries=1)
+        startup.others = lambda: [member.index for member in self._members if member.comes_back]
         self._settings.attach(startup)
         for member in self._members:
             member.attach(startup)
