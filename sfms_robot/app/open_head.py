@@ -175,7 +175,7 @@ def build_bus(head: Head, opened: Opened, clock: Clock, *, confirmed: bool = Fal
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name and key not in without}
         if joints:
-            buses[name] = _build_one(head, name, joints, where, clock, confirmed)
+            buses[name] = build_one(head, name, joints, where, clock, confirmed)
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
     if without:
@@ -189,9 +189,10 @@ def _bus_servos(head: Head, joints: Mapping[str, Joint]) -> list[BusServo]:
     return [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key)) for key, j in joints.items()]
 
 
-def _build_one(
+def build_one(
     head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool
-) -> Bus:
+) -> Any:
+    """Return the bus `name` with `joints`, of the class of its family, not yet connected."""
     config = head.buses[name]
     check_safety(head, joints, firmware_maps(joints))
     servos = _bus_servos(head, joints)
@@ -204,7 +205,7 @@ def _build_one(
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, where.read_deadline_s)
-    bus: Bus = family.bus_class()(
+    return family.bus_class()(
         name,
         servos,
         calibration_of(joints),
@@ -214,4 +215,3 @@ def _build_one(
         config=config,
         **more,
     )
-    return bus
