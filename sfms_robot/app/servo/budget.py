@@ -10,33 +10,9 @@ latency again: that is what makes factory settings slow. Boards for hobby servos
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any
 
-Way = Literal["together", "fast", "one by one"]
-
-
-class Framing(NamedTuple):
-    """Bytes of a family's packets beside the data and the ids."""
-
-    write: int  # sync write, plus 1 + data per servo
-    ask: int  # sync read, plus 1 per servo
-    answer: int  # status packet, plus data
-    fast_head: int | None = None  # fast sync status, plus `fast_each` + data per servo
-    fast_each: int = 0
-    single: int = 8  # read request to one servo
-
-
-FRAMINGS: Final = {
-    "dynamixel2": Framing(write=14, ask=14, answer=11, fast_head=8, fast_each=4, single=14),
-    "dynamixel1": Framing(write=8, ask=0, answer=6),
-    "feetech": Framing(write=8, ask=8, answer=6),
-}
-
-
-BOARDS: Final = {  # bytes of one tick of n channels
-    "maestro": lambda channels: 4 * channels,  # 84 channel low high, each; its "multiple targets" needs neighbours
-    "ssc32": lambda channels: 9 * channels + 1,  # "#12P1500 ", at the end a carriage return
-}
+from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 
 
 @dataclass(frozen=True)
@@ -108,26 +84,22 @@ def wire_budget(
         read_bytes, write_bytes: data per servo and tick.
     """
     framing = FRAMINGS[family]
-    write = framing.write + servos * (1 + write_bytes)
+    goals = framing.goals(servos, write_bytes)
+    way: Way = "together" if together and family != "dynamixel1" else "one by one"  # AX cannot be read together
 
     def tick(size: int, answers: int, waits: int) -> Tick:
-        ms = size * 10e3 / baud + answers * return_delay_us / 1e3 + waits * latency_ms
+        ms = size * 1e3 * BITS / baud + answers * return_delay_us / 1e3 + waits * latency_ms
         return Tick(size, ms, 1e3 / ms)
 
-    if together and framing.ask:
-        size = write + framing.ask + servos + servos * (framing.answer + read_bytes)
-        plain = tick(size, servos, 1)
-    else:
-        plain = tick(write + servos * (framing.single + framing.answer + read_bytes), servos, servos)
+    plain = tick(goals + framing.reads(servos, read_bytes, way), servos, 1 if way == "together" else servos)
     fast = None
-    if together and framing.fast_head is not None:
-        size = write + framing.ask + servos + framing.fast_head + servos * (framing.fast_each + read_bytes)
-        fast = tick(size, 1, 1)
-    return Budget(servos, baud, return_delay_us, latency_ms, write_bytes, read_bytes, tick(write, 0, 0), plain, fast)
+    if together and framing.fast:
+        fast = tick(goals + framing.reads(servos, read_bytes, "fast"), 1, 1)
+    return Budget(servos, baud, return_delay_us, latency_ms, write_bytes, read_bytes, tick(goals, 0, 0), plain, fast)
 
 
 def board_budget(family: str, channels: int, baud: int) -> Budget:
-    """The budget of a board of hobby servos, every channel written every tick."""
-    size = BOARDS[family](channels)
-    ms = size * 10e3 / baud
+    """Return the budget of a board of hobby servos, every channel written every tick."""
+    size = FRAMINGS[family].goals(channels)
+    ms = size * 1e3 * BITS / baud
     return Budget(channels, baud, 0.0, 0.0, size // channels, 0, Tick(size, ms, 1e3 / ms), None, None)

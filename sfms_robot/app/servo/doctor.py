@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, cast
 
-from sfms_robot.app.servo.budget import BOARDS, Budget, board_budget, wire_budget
+from sfms_robot.app.servo.budget import Budget, board_budget, wire_budget
 from sfms_robot.app.servo.diagnosis import (
     Command,
     Finding,
@@ -42,7 +42,7 @@ from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
-from sfms_robot.servo.families import servo_families
+from sfms_robot.servo.families import family_named, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds
@@ -133,7 +133,7 @@ def examine_line(
             try:
                 adapter = describe(path)  # after opening, which may have set the latency
                 findings += judge_adapter(adapter, held_by)
-                if line.family in BOARDS:
+                if family_named(line.family).board:
                     found, facts = _look_at_board(line, port, adapter)
                 else:
                     found, facts = _look(line, port, clock, adapter, progress, fix)
