@@ -37,6 +37,7 @@ from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port
 
 
 @dataclass(frozen=True)
@@ -127,16 +128,23 @@ def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
 def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     """Connect to every servo of a head. Blocks for as long as identifying takes. Raises RobotError."""
     prepare_head(options)
-    head = calibrated_head(options.head, options.port)
-    rate_hz = max(bus.rate_hz for bus in head.buses.values())
-    motion = build_motion(head, rate_hz)
     clock: Clock = VirtualClock() if options.fast else RealClock()
+    kept: dict[str, Port] = {}
     with ExitStack() as stack:
+        stack.callback(_close, kept)
+        head = calibrated_head(options.head, options.port, clock, kept)
+        rate_hz = max(bus.rate_hz for bus in head.buses.values())
+        motion = build_motion(head, rate_hz)
         opened = stack.enter_context(open_wires(head, options))
-        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without)
+        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without, kept=kept)
         stack.callback(bus.close)
         bus.connect()
         yield OpenHead(options, head, motion, bus, clock, rate_hz, opened)
+
+
+def _close(kept: dict[str, Port]) -> None:
+    for port in kept.values():
+        port.close()
 
 
 def build_motion(head: Head, rate_hz: float) -> Motion:
@@ -166,16 +174,25 @@ def on_boards(head: Head) -> list[str]:
     return [name for name, joint in head.joints.items() if family_named(head.buses[joint.bus].family).board]
 
 
-def build_bus(head: Head, opened: Opened, clock: Clock, *, confirmed: bool = False, without: Sequence[str] = ()) -> Bus:
-    """The head's bus, not yet connected.
+def build_bus(
+    head: Head,
+    opened: Opened,
+    clock: Clock,
+    *,
+    confirmed: bool = False,
+    without: Sequence[str] = (),
+    kept: dict[str, Port] | None = None,
+) -> Bus:
+    """Return the head's bus, not yet connected.
 
-    `confirmed`: hobby servos may jump when their pulses come on. `without`: joints whose servos are left alone.
+    `confirmed`: hobby servos may jump when their pulses come on. `without`: joints whose servos are left alone. `kept`:
+    ports that are open already, by bus; the first connection takes them out.
     """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name and key not in without}
         if joints:
-            buses[name] = build_one(head, name, joints, where, clock, confirmed)
+            buses[name] = build_one(head, name, joints, where, clock, confirmed, {} if kept is None else kept)
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
     if without:
@@ -190,7 +207,13 @@ def _bus_servos(head: Head, joints: Mapping[str, Joint]) -> list[BusServo]:
 
 
 def build_one(
-    head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool
+    head: Head,
+    name: str,
+    joints: dict[str, Joint],
+    where: Chain | str,
+    clock: Clock,
+    confirmed: bool,
+    kept: dict[str, Port],
 ) -> Any:
     """Return the bus `name` with `joints`, of the class of its family, not yet connected."""
     config = head.buses[name]
@@ -209,7 +232,7 @@ def build_one(
         name,
         servos,
         calibration_of(joints),
-        port_of(where, config, clock),
+        lambda: kept.pop(name, None) or port_of(where, config, clock)(),
         config.baud,
         deadline_s,
         config=config,

@@ -1,8 +1,8 @@
 """How many bytes a request and its answers put on the wire, in every family, and how long bytes take.
 
-Whatever reckons with bytes asks here: the highest rate of a bus, what a poll has time for, the doctor's budget. Tests
-compare the counts with what real buses send to emulated servos. Of boards, whose bytes depend on what is sent (channels
-side by side, digits of a pulse), it is the most that there can be.
+The highest rate of a bus, the time of a poll and the doctor's budget use these counts. Tests compare them with the
+bytes between the buses and emulated servos. The bytes of a board depend on the goals (channels side by side, digits of
+a pulse); for boards the counts are upper bounds.
 """
 
 from __future__ import annotations

@@ -9,24 +9,29 @@ latency again: that is what makes factory settings slow. Boards for hobby servos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, Self
 
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 
 
 @dataclass(frozen=True)
 class Tick:
-    """What one tick costs. `ms` holds wire, servos and adapter; `hz` is how often that fits into a second."""
+    """Cost of one tick, rounded. `ms` holds wire, servos and adapter; `hz` is how often that fits into a second."""
 
     bytes: int
     ms: float
     hz: float
 
+    @classmethod
+    def of(cls, size: int, ms: float) -> Self:
+        """Return the tick of so many bytes."""
+        return cls(size, round(ms, 3), round(1e3 / ms, 1))
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Budget:
-    """A bus's wire budget at one baud.
+    """Wire budget of a bus at one baud; data per servo and tick in bytes.
 
     Attributes:
         write_only: goals alone.
@@ -38,8 +43,8 @@ class Budget:
     baud: int
     return_delay_us: float
     latency_ms: float
-    write_bytes: int
-    read_bytes: int
+    write_bytes_per_servo: int
+    read_bytes_per_servo: int
     write_only: Tick
     plain: Tick | None
     fast: Tick | None
@@ -50,20 +55,8 @@ class Budget:
         return self.plain or self.write_only
 
     def plain_data(self) -> dict[str, Any]:
-        """For a report; figures rounded to what they mean."""
-        ticks = {"write_only": self.write_only, "plain": self.plain, "fast": self.fast}
-        return {
-            "servos": self.servos,
-            "baud": self.baud,
-            "return_delay_us": self.return_delay_us,
-            "latency_ms": self.latency_ms,
-            "write_bytes_per_servo": self.write_bytes,
-            "read_bytes_per_servo": self.read_bytes,
-            **{
-                name: None if each is None else {"bytes": each.bytes, "ms": round(each.ms, 3), "hz": round(each.hz, 1)}
-                for name, each in ticks.items()
-            },
-        }
+        """Return it for a report."""
+        return asdict(self)
 
 
 def wire_budget(
@@ -88,18 +81,32 @@ def wire_budget(
     way: Way = "together" if together and family != "dynamixel1" else "one by one"  # AX cannot be read together
 
     def tick(size: int, answers: int, waits: int) -> Tick:
-        ms = size * 1e3 * BITS / baud + answers * return_delay_us / 1e3 + waits * latency_ms
-        return Tick(size, ms, 1e3 / ms)
+        return Tick.of(size, size * 1e3 * BITS / baud + answers * return_delay_us / 1e3 + waits * latency_ms)
 
-    plain = tick(goals + framing.reads(servos, read_bytes, way), servos, 1 if way == "together" else servos)
-    fast = None
-    if together and framing.fast:
-        fast = tick(goals + framing.reads(servos, read_bytes, "fast"), 1, 1)
-    return Budget(servos, baud, return_delay_us, latency_ms, write_bytes, read_bytes, tick(goals, 0, 0), plain, fast)
+    return Budget(
+        servos=servos,
+        baud=baud,
+        return_delay_us=return_delay_us,
+        latency_ms=latency_ms,
+        write_bytes_per_servo=write_bytes,
+        read_bytes_per_servo=read_bytes,
+        write_only=tick(goals, 0, 0),
+        plain=tick(goals + framing.reads(servos, read_bytes, way), servos, 1 if way == "together" else servos),
+        fast=tick(goals + framing.reads(servos, read_bytes, "fast"), 1, 1) if together and framing.fast else None,
+    )
 
 
 def board_budget(family: str, channels: int, baud: int) -> Budget:
     """Return the budget of a board of hobby servos, every channel written every tick."""
     size = FRAMINGS[family].goals(channels)
-    ms = size * 1e3 * BITS / baud
-    return Budget(channels, baud, 0.0, 0.0, size // channels, 0, Tick(size, ms, 1e3 / ms), None, None)
+    return Budget(
+        servos=channels,
+        baud=baud,
+        return_delay_us=0.0,
+        latency_ms=0.0,
+        write_bytes_per_servo=size // channels,
+        read_bytes_per_servo=0,
+        write_only=Tick.of(size, size * 1e3 * BITS / baud),
+        plain=None,
+        fast=None,
+    )

@@ -39,6 +39,7 @@ from sfms_robot.config.overlay import head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
+from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
@@ -266,22 +267,17 @@ def _clear_turns(wire: Wire, seen: FoundServo) -> None:
         raise ServoError(f"id {seen.id} does not forget its turns: {refusal if answer else 'no answer'}")
 
 
-def _board_answers(family: str, port: Port) -> bool | None:
-    """Whether the board answers the one question that it has; None where nothing can be asked."""
+def _board_answers(family: str, port: Port, baud: int) -> bool:
+    """Return whether the board answers the one question that it has."""
     question, size = (maestro.addressed(maestro.get_errors()), 2) if family == "maestro" else (ssc32.query_moving(), 1)
-    port.discard_input()
-    port.write(question)
-    end_s, data = port.now_s() + _BOARD_S, bytearray()
-    while len(data) < size and (part := port.read(size, end_s)):
-        data += part
-    return len(data) >= size
+    return RateLimitedPort(port, baud, _BOARD_S).exchange(question, size) is not None
 
 
 def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], dict[str, Any]]:
     """What can be said of a board of hobby servos, whose port could be opened."""
     budget = board_budget(line.family, max(1, len(line.wanted)), _first_baud(line))
     command = Command(line.shown, line.family)
-    answers = _board_answers(line.family, port)
+    answers = _board_answers(line.family, port, _first_baud(line))
     found = judge_board(line.family, len(line.wanted), answers, adapter)
     findings = [*found, *judge_rate(budget, line.rate_hz, None, command)]
     facts = {"baud": budget.baud, "rate_hz": line.rate_hz, "servos": [], "fixed": [], "fast_sync_read": None}

@@ -227,16 +227,16 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
     failures: list[PortError | BusError] = []
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
+        names = {joint.id: key for key, joint in joints.items()}
         try:
             off = _release_bus(head, name, joints, where, clock, everything)
         except (PortError, BusError) as error:
             failures.append(error)
-            off = {joint.id: str(error) for joint in joints.values()}
-        names = {joint.id: key for key, joint in joints.items()}
-        for servo, why in sorted(off.items()):
+            off = dict.fromkeys(names, str(error))
+        for servo, why in off.items():
             torque = "unconfirmed" if why else "off"
             rows.append({"bus": name, "joint": names.get(servo), "id": servo, "torque": torque, "note": why})
-    if failures and len(failures) == len(opened):
+    if len(failures) == len(opened):
         raise failures[0]
     return rows
 
@@ -246,9 +246,8 @@ def _release_bus(
 ) -> Unconfirmed:
     bus, tables = head.buses[name], {j.id: Table.of(load_firmware_map(j.model)) for j in joints.values()}
     if family_named(bus.family).board:
-        most = max((table.channels or 0 for table in tables.values()), default=0)
-        channels = range(most) if everything else list(tables)
-        confirmed = not channels or build_one(head, name, joints, where, clock, True).end_pulses(channels)
+        channels = range(max(table.channels or 0 for table in tables.values())) if everything else list(tables)
+        confirmed = build_one(head, name, joints, where, clock, True, {}).end_pulses(channels)
         return dict.fromkeys(channels, "" if confirmed else SILENT)
     port = port_of(where, bus, clock)()
     try:
@@ -261,37 +260,26 @@ def release_chain(wire: Wire, tables: Mapping[int, Table], everything: bool = Fa
     """Write torque off to the servos of `tables`, by id, until they confirm it. Raises BusError when the port fails.
 
     A servo that answers a ping is written where the model that it names keeps its torque, a silent one where the head
-    says: it may still obey.
+    says: it may still obey. Models of Protocol 1.0 all keep it in one place.
     """
     seen = {each.id: each for each in (scan(wire) if everything else ())}
     why = dict.fromkeys((*tables, *seen), SILENT)
     for _ in range(TRIES):
-        rest = [servo for servo in why if why[servo]]
-        for servo in rest:
-            if servo not in seen and (found := wire.ping(servo, tries=1)) is not None:
+        packets: dict[Field, dict[int, bytes]] = {}
+        for servo in [servo for servo in why if why[servo]]:
+            if (found := seen.get(servo) or wire.ping(servo, tries=1)) is not None:
                 seen[servo] = found
-        fields = {servo: _torque_field(wire, seen.get(servo), servo, tables) for servo in rest}
-        for field in {field for field in fields.values() if field is not None}:
-            off = {servo: field.to_bytes(0) for servo, each in fields.items() if each == field}
+            table = found.table if found and (found.table or wire.kind.protocol == 2) else tables.get(servo)
+            if table is None:
+                why[servo] = "its model has no firmware map; nothing was written"
+            else:
+                field = table["torque_enable"]
+                packets.setdefault(field, {})[servo] = field.to_bytes(0)
+        for field, off in packets.items():
             wire.link.sync_write(field.address, off)
-        why.update({servo: _torque_left(wire, seen[servo], fields[servo]) for servo in rest if servo in seen})
+        for field, off in packets.items():
+            for servo in off.keys() & seen.keys():
+                answer = wire.link.read(servo, field.address, field.size)
+                confirmed = answer is not None and answer.data == off[servo]
+                why[servo] = "" if confirmed else "answers, but does not report torque off (status return level?)"
     return why
-
-
-def _torque_field(wire: Wire, seen: FoundServo | None, servo: int, tables: Mapping[int, Table]) -> Field | None:
-    """Return the torque register of a servo; None if nothing tells where it is."""
-    table = seen.table if seen is not None else tables.get(servo)
-    if table is None and wire.kind.protocol == 1:  # all models of these families have it at one address
-        table = next(iter(tables.values()), None)
-    if table is None and servo in tables and tables[servo].model_number is None:
-        table = tables[servo]
-    return table.role("torque_enable") if table is not None else None
-
-
-def _torque_left(wire: Wire, seen: FoundServo, field: Field | None) -> str:
-    if field is None:
-        return f"model number {seen.model_number} has no firmware map: nothing was written"
-    answer = wire.link.read(seen.id, field.address, field.size)
-    if answer is None or len(answer.data) != field.size:
-        return "answers a ping but does not give its registers (status return level?); torque off was sent"
-    return "still has torque" if field.from_bytes(answer.data) else ""

@@ -148,7 +148,7 @@ class StatusPoll:
         return "one by one" if self._group is None else "together"
 
     def _bytes(self, servos: int, length: int) -> int:
-        """Return what reading `length` bytes of each takes, by one request where the wire has one."""
+        """Return the bytes of reading `length` bytes of each, by one request where the wire has one."""
         return self._framing.reads(servos, length, self._way)
 
     def measure(self, link: RegisterLink, now_s: float) -> None:
@@ -430,15 +430,12 @@ def blocks_per_tick(servos: int, spare_s: float, positions_s: float, blocks_s: C
     """Return how many servos' blocks fit in `spare_s` beside all positions; all where one read does for both.
 
     Args:
-        positions_s: what reading all positions takes.
-        blocks_s: what reading so many blocks takes.
+        positions_s: time of reading all positions.
+        blocks_s: returns the time of reading so many blocks.
     """
     if blocks_s(servos) <= spare_s:
         return servos
-    count = 1
-    while count < servos and blocks_s(count + 1) <= spare_s - positions_s:
-        count += 1
-    return count
+    return max((count for count in range(2, servos + 1) if positions_s + blocks_s(count) <= spare_s), default=1)
 
 
 class Rotation:
