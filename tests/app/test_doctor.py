@@ -315,7 +315,7 @@ def test_a_board_that_answers_is_fit_and_one_that_does_not_comes_with_its_serial
 def test_a_board_of_hobby_servos_is_opened_and_reckoned_with():
     report = board("ssc-32", "ssc32", 9_600, 50.0)
     assert report["exit_code"] == 0 and report["budget"]["write_only"]["ms"] == pytest.approx(205, abs=2)
-    assert "reaches 4 Hz of 50" in told(report, "warning")[0] and "24 servos" in told(report, "note")[0]
+    assert "reaches 5 Hz of 50" in told(report, "warning")[0] and "24 servos" in told(report, "note")[0]
 
 
 # --- ports ------------------------------------------------------------------------------------------------------
