@@ -246,8 +246,9 @@ def _release_bus(
 ) -> Unconfirmed:
     bus, tables = head.buses[name], {j.id: Table.of(load_firmware_map(j.model)) for j in joints.values()}
     if family_named(bus.family).board:
-        channels = range(max(table.channels or 0 for table in tables.values())) if everything else list(tables)
-        confirmed = build_one(head, name, joints, where, clock, True, {}).end_pulses(channels)
+        most = max((table.channels or 0 for table in tables.values()), default=0)
+        channels = range(most) if everything else list(tables)
+        confirmed = not joints or build_one(head, name, joints, where, clock, True, {}).end_pulses(channels)
         return dict.fromkeys(channels, "" if confirmed else SILENT)
     port = port_of(where, bus, clock)()
     try:
