@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from typing import Final
 
 from sfms_robot.app.servo.serial_line import FoundServo, Wire
+from sfms_robot.app.servo.single_servo import read
 from sfms_robot.app.wiring import SIM, devices, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import Chain
+from sfms_robot.errors import ServoError
 from sfms_robot.ports import Clock
-from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
@@ -26,12 +28,14 @@ log = logging.getLogger(__name__)
 _REVERSED: Final = 1  # bit of the drive mode: which way ticks run
 
 
-def calibrated_head(name: str, port: str) -> Head:
+def calibrated_head(name: str, port: str, clock: Clock, kept: dict[str, Port]) -> Head:
     """Return the head as it may move on this port.
 
-    On emulated servos every head counts as calibrated. On real ones each measured servo is asked who it is first; a
-    joint whose measurement does not hold, and an unmeasured one of a head to be calibrated first, holds back. Raises
-    ConfigError, PortError.
+    On emulated servos every head counts as calibrated. On real ones each measured servo is identified first; a joint
+    whose measurement does not hold, and an unmeasured one of a head to be calibrated first, holds back. The ports that
+    are opened for this stay open, by bus, in `kept`: some adapters reset their servos at every opening.
+
+    Raises ConfigError, PortError.
     """
     head = load_head(name)
     overlay, sha256 = load_overlay(head), head_hash(name)
@@ -41,7 +45,7 @@ def calibrated_head(name: str, port: str) -> Head:
         return layers.head
     where = devices(head, port)
     measured = overlay.calibrate.joints if overlay.calibrate is not None else {}
-    servos = identify(head, measured, where, RealClock())
+    servos = identify(head, measured, where, clock, kept)
     layers = layered(head, overlay, sha256, servos)
     _tell(head.name, layers.refused, layers.notes)
     return ready(layers.head, real=True, calibrated=layers.calibrated, refused=layers.refused)
@@ -60,9 +64,16 @@ def ready(head: Head, *, real: bool, calibrated: Collection[str] = (), refused: 
 
 
 def identify(
-    head: Head, joints: Collection[str], where: Mapping[str, Chain | str], clock: Clock
+    head: Head,
+    joints: Collection[str],
+    where: Mapping[str, Chain | str],
+    clock: Clock,
+    kept: dict[str, Port] | None = None,
 ) -> dict[str, Identity | None]:
-    """Who answers at each of `joints`; None for nobody. Writes nothing. Raises PortError."""
+    """Return which servo answers for each of `joints`, None if none does. Writes nothing. Raises PortError.
+
+    Ports are closed again, or stay open in `kept`, by bus.
+    """
     servos: dict[str, Identity | None] = {}
     for name, bus in head.buses.items():
         mine = [joint for joint in joints if head.joints[joint].bus == name]
@@ -74,7 +85,10 @@ def identify(
                 for joint in mine:
                     servos[joint] = _identity(port, bus.family, bus.baud, head.joints[joint], clock)
             finally:
-                port.close()
+                if kept is None:
+                    port.close()
+                else:
+                    kept[name] = port
     return servos
 
 
@@ -97,13 +111,8 @@ def _identity(port: Port, family: str, baud: int, joint: Joint, clock: Clock) ->
 
 
 def _register(wire: Wire, seen: FoundServo, table: Table, name: str) -> int | None:
-    field = table.fields.get(name)
-    if field is None:
-        return None
-    for _ in range(3):
-        answer = wire.link.read(seen.id, field.address, field.size)
-        if answer is not None and len(answer.data) == field.size:
-            return field.from_bytes(answer.data)
+    with suppress(ServoError):
+        return read(wire, seen, table.fields[name]) if name in table.fields else None
     return None
 
 

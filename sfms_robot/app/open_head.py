@@ -39,6 +39,7 @@ from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port
 
 log = logging.getLogger(__name__)
 
@@ -131,19 +132,26 @@ def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
 def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     """Connect to every servo of a head. Blocks for as long as identifying takes. Raises RobotError."""
     prepare_head(options)
-    head = calibrated_head(options.head, options.port)
-    rate_hz = max(bus.rate_hz for bus in head.buses.values())
-    motion = build_motion(head, rate_hz)
     clock: Clock = VirtualClock() if options.fast else RealClock()
+    kept: dict[str, Port] = {}
     with ExitStack() as stack:
+        stack.callback(_close, kept)
+        head = calibrated_head(options.head, options.port, clock, kept)
+        rate_hz = max(bus.rate_hz for bus in head.buses.values())
+        motion = build_motion(head, rate_hz)
         opened = stack.enter_context(open_wires(head, options))
         doctor = f"sfms-robot doctor --port {options.port} --head {quote(options.head)} --fix"
-        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without, doctor=doctor)
+        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without, doctor=doctor, kept=kept)
         stack.callback(bus.close)
         bus.connect()
         if weak := bus.statistics().get("stored_warnings"):
             log.warning("servos protect themselves less than usual: %s; mend it: %s", "; ".join(weak), doctor)
         yield OpenHead(options, head, motion, bus, clock, rate_hz, opened)
+
+
+def _close(kept: dict[str, Port]) -> None:
+    for port in kept.values():
+        port.close()
 
 
 def build_motion(head: Head, rate_hz: float) -> Motion:
@@ -181,17 +189,20 @@ def build_bus(
     confirmed: bool = False,
     without: Sequence[str] = (),
     doctor: str = BusServo.doctor,
+    kept: dict[str, Port] | None = None,
 ) -> Bus:
     """Return the head's bus, not yet connected.
 
     `confirmed`: hobby servos may jump when their pulses come on. `without`: joints whose servos are left alone.
-    `doctor`: see `BusServo`.
+    `doctor`: see `BusServo`. `kept`: ports that are open already, by bus; the first connection takes them out.
     """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name and key not in without}
         if joints:
-            buses[name] = _build_one(head, name, joints, where, clock, confirmed, doctor)
+            buses[name] = build_one(
+                head, name, joints, where, clock, confirmed=confirmed, doctor=doctor, kept={} if kept is None else kept
+            )
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
     if without:
@@ -208,9 +219,18 @@ def _bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str) -> list[Bu
     ]
 
 
-def _build_one(
-    head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, confirmed: bool, doctor: str
-) -> Bus:
+def build_one(
+    head: Head,
+    name: str,
+    joints: dict[str, Joint],
+    where: Chain | str,
+    clock: Clock,
+    *,
+    confirmed: bool,
+    kept: dict[str, Port],
+    doctor: str = BusServo.doctor,
+) -> Any:
+    """Return the bus `name` with `joints`, of the class of its family, not yet connected."""
     config = head.buses[name]
     check_safety(head, joints, firmware_maps(joints))
     servos = _bus_servos(head, joints, doctor)
@@ -223,14 +243,13 @@ def _build_one(
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, where.read_deadline_s)
-    bus: Bus = family.build(
+    return family.build(
         name,
         servos,
         calibration_of(joints),
-        port_of(where, config, clock),
+        lambda: kept.pop(name, None) or port_of(where, config, clock)(),
         config.baud,
         deadline_s,
         config=config,
         **more,
     )
-    return bus

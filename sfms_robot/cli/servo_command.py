@@ -123,6 +123,39 @@ def move(
 
 
 @app.command()
+def release(
+    head: Annotated[str, typer.Option("--head", help="Head whose servos are released.")] = "face28",
+    port: Annotated[
+        str, typer.Option("--port", help="As of run: DEVICE, BUS=DEVICE[,BUS=DEVICE], auto or sim.")
+    ] = "auto",
+    everything: Annotated[bool, typer.Option("--all", help="Every id on the wires, at the rates of the head.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before --all.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object, last line of stdout.")] = False,
+) -> None:
+    """Take torque off a head's servos, whatever state they are in; the head may fall."""
+    from sfms_robot.app.open_head import HeadOptions, open_wires
+    from sfms_robot.app.servo.move import release as let_go
+    from sfms_robot.app.servo.serial_line import real_clock
+    from sfms_robot.config import load_head
+
+    if everything and not confirmation(yes)(f"--all takes torque off every servo on {port}"):
+        raise ConfigError("--all: not confirmed, nothing was written")
+    found = load_head(head)
+    with open_wires(found, HeadOptions(head, port)) as opened:
+        rows = let_go(found, opened, real_clock(), everything)
+    left = [row["joint"] or f"id {row['id']}" for row in rows if row["torque"] != "off"]
+    _show(
+        rows,
+        {"released": rows, "torque_unconfirmed": left},
+        json,
+        f"torque off: {len(rows) - len(left)} of {len(rows)}",
+    )
+    if left:
+        print(f"torque is not confirmed off: {', '.join(left)}; switch off their supply", file=sys.stderr)
+        sys.exit(BusError.exit_code)
+
+
+@app.command()
 @on_wire
 def dump(
     on: Wiring,

@@ -8,20 +8,13 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema
 
 from sfms_robot.config.base import Model, Positive
+from sfms_robot.config.wire_time import BITS, FRAMINGS
 from sfms_robot.plugins import plugins
 
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
 BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
 FORMER_FAMILIES: Final[Mapping[str, str]] = {"dynamixel": "dynamixel2"}  # as 0.1.0 called them
 HIGHEST_RATE_HZ: Final = 1000.0
-
-# Bytes of one sync write of goal positions: around it, and per servo with its id. A board of hobby servos is not here:
-# it sends what changed, when its wire is free.
-_GOAL_BYTES: Final[Mapping[str, tuple[int, int]]] = {"dynamixel2": (14, 5), "dynamixel1": (8, 3), "feetech": (8, 3)}
-# Bytes of the longest packet: the vendor's SDK of both Dynamixel protocols builds no longer one; a Feetech packet has a
-# length of one byte.
-_PACKET_BYTES: Final[Mapping[str, int]] = {"dynamixel2": 1024, "dynamixel1": 250, "feetech": 259}
-_BITS: Final = 10  # of a byte on the wire: start, eight, stop
 
 
 def _family(name: str) -> str:
@@ -63,16 +56,19 @@ class Bus(Model):
 
 
 def highest_rate_hz(family: str, baud: int, joints: int) -> float:
-    """How often a second goals for `joints` servos fit on a wire of `baud`, answers left out; at most 1000, whole."""
-    if family not in _GOAL_BYTES:
+    """Return how often a second goals for `joints` servos fit on a wire of `baud`, answers left out.
+
+    At most 1000, and whole. A board sends what changed when its wire is free, so its wire sets no limit.
+    """
+    framing = FRAMINGS.get(family)
+    if framing is None or not framing.answer:
         return HIGHEST_RATE_HZ
-    around, each = _GOAL_BYTES[family]
-    return min(HIGHEST_RATE_HZ, max(1.0, float(baud // (_BITS * (around + each * joints)))))
+    return min(HIGHEST_RATE_HZ, max(1.0, float(baud // (BITS * framing.goals(joints)))))
 
 
 def most_joints(family: str) -> int | None:
     """Return how many servos the goals of one packet can name; None for a board, or for a family of another package."""
-    if family not in _GOAL_BYTES:
+    framing = FRAMINGS.get(family)
+    if framing is None or not framing.longest:
         return None
-    around, each = _GOAL_BYTES[family]
-    return (_PACKET_BYTES[family] - around) // each
+    return (framing.longest - framing.write) // (framing.write_each + framing.goal)

@@ -290,7 +290,7 @@ def _claim(port: serial.Serial, device: str) -> None:
     make_exclusive(port)
     others = holders(device)
     if others:
-        raise PortError(f"{device}: is held by another program ({_named(others)})")
+        raise PortError(f"{device}: {_held(others)}")
 
 
 def _check_baud(port: serial.Serial, device: str) -> None:
@@ -314,12 +314,12 @@ def _reason(device: str, error: Exception) -> str:
         if os.path.isdir(device):
             return "is a directory, not a serial port"
         if getattr(error, "errno", None) in (errno.EAGAIN, errno.EBUSY):
-            others = holders(device)
-            return "is held by another program" + (f" ({_named(others)})" if others else "")
+            return _held(holders(device))
         if not os.access(device, os.R_OK | os.W_OK):
             return "no permission to open it (on Debian and Ubuntu: sudo usermod -aG dialout $USER, then log in again)"
     return f"cannot be opened as a serial port: {error}"
 
 
-def _named(others: Sequence[Holder]) -> str:
-    return ", ".join(f"pid {each.pid}: {each.command}" for each in others)
+def _held(others: Sequence[Holder]) -> str:
+    named = ", ".join(f"pid {each.pid}: {each.command}" for each in others)
+    return "is held by another program" + (f" ({named})" if named else "") + "; stop that first"

@@ -3,6 +3,9 @@
 import re
 import shlex
 import shutil
+import socketserver
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,11 +14,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from emulated_devices import device_of, servos_of
 
 from sfms_robot.app.calibrated_head import calibrated_head, identify
 from sfms_robot.app.head.calibrate import Outcome, calibrate, calibrate_on
+from sfms_robot.app.open_head import HeadOptions, open_head
 from sfms_robot.app.wiring import emulated
-from sfms_robot.config import load_head
+from sfms_robot.config import Head, load_head
 from sfms_robot.config.calibrate_first import held_back
 from sfms_robot.config.overlay import (
     Overlay,
@@ -30,6 +35,7 @@ from sfms_robot.data import find
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
+from sfms_robot.servo.port import Port
 
 DAY = date(2026, 5, 17)
 LIMIT = {"speed_deg_s": 90, "acceleration_deg_s2": 900, "jerk_deg_s3": 9000}
@@ -243,6 +249,40 @@ def test_practice_on_emulated_servos_is_kept_apart(name):
 # --- what a run makes of it -------------------------------------------------------------------------------------
 
 
+def ready_on(name: str, port: str) -> Head:
+    kept: dict[str, Port] = {}
+    ready = calibrated_head(name, port, RealClock(), kept)
+    for each in kept.values():
+        each.close()
+    return ready
+
+
+class Adapter(socketserver.ThreadingTCPServer):
+    """Servos 1 and 2 behind a network adapter, which counts how often its port is opened."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Connection)
+        self.servos, self.opened = device_of(*servos_of("xl330-m288", 1, 2)), 0
+
+
+class Connection(socketserver.BaseRequestHandler):
+    def handle(self) -> None:
+        self.server.opened += 1
+        while data := self.request.recv(4096):
+            self.request.sendall(self.server.servos.receive(data, 1_000_000, time.monotonic()))
+
+
+def test_a_start_opens_the_port_of_a_calibrated_head_once(name):
+    with head_on_emulated_servos(name) as chain:
+        led(name, chain, Person(*by_hand(chain)))
+    with Adapter() as adapter:
+        threading.Thread(target=adapter.serve_forever, daemon=True).start()
+        with open_head(HeadOptions(name, f"socket://127.0.0.1:{adapter.server_address[1]}")) as opened:
+            opened.bus.poll(opened.clock.now_s())
+        adapter.shutdown()
+    assert adapter.opened == 1
+
+
 def test_a_run_takes_measured_joints_as_they_are_and_holds_the_others_back(name, caplog):
     head = load_head(name)
     with head_on_emulated_servos(name) as chain:
@@ -250,10 +290,10 @@ def test_a_run_takes_measured_joints_as_they_are_and_holds_the_others_back(name,
     found = load_overlay(head).calibrate
     assert found is not None
     with launch(emulated(head)["main"]) as chain:
-        ready = calibrated_head(name, chain.device)
+        ready = ready_on(name, chain.device)
     assert ready.joints["jaw"] == calibrated(head.joints["jaw"], found.joints["jaw"])
     assert ready.joints["brow"] == held_back(head).joints["brow"]
-    assert calibrated_head(name, "sim") == head
+    assert ready_on(name, "sim") == head
     assert "not calibrated in brow" in caplog.text
 
 
@@ -263,7 +303,7 @@ def test_a_run_holds_a_joint_back_whose_servo_is_another(name, caplog):
         led(name, chain, Person(*by_hand(chain)))
     servos = [EmulatedServo(1, registers={"homing_offset": 100}), EmulatedServo(2)]
     with launch(servos) as chain:
-        ready = calibrated_head(name, chain.device)
+        ready = ready_on(name, chain.device)
     assert ready.joints["jaw"] == held_back(head).joints["jaw"]
     assert ready.joints["brow"].limits == "slow"
     assert "the calibration of jaw does not hold: homing_offset was 0 and is 100" in caplog.text

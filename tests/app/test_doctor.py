@@ -327,8 +327,8 @@ def test_a_maestro_answers_where_its_crc_setting_is_that_of_the_heads_file(store
 
 def test_a_board_of_hobby_servos_is_opened_and_reckoned_with():
     report = board("ssc-32", "ssc32", 9_600, 50.0)
-    assert report["exit_code"] == 0 and report["budget"]["write_only"]["ms"] == pytest.approx(225, abs=2)
-    assert "reaches 4 Hz of 50" in told(report, "warning")[0] and "24 servos" in told(report, "note")[0]
+    assert report["exit_code"] == 0 and report["budget"]["write_only"]["ms"] == pytest.approx(205, abs=2)
+    assert "reaches 5 Hz of 50" in told(report, "warning")[0] and "24 servos" in told(report, "note")[0]
 
 
 # --- ports ------------------------------------------------------------------------------------------------------

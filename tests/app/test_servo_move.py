@@ -1,13 +1,17 @@
-"""`servo move`: slowly there, and the servo left as it was found, whatever happens on the way."""
+"""`servo move`: slowly there, and the servo left as it was found; `servo release`: torque off, whatever its state."""
 
 import pytest
 from test_single_servo import put, wire_on
 
-from sfms_robot.app.servo.move import BEHIND_DEG, SPEED_DEG_S, move
-from sfms_robot.app.servo.single_servo import field_named, read
+from sfms_robot.app.bench.campaign_rig import FAMILIES, head_of
+from sfms_robot.app.open_head import build_bus
+from sfms_robot.app.servo.move import BEHIND_DEG, SILENT, SPEED_DEG_S, move, release, release_chain
+from sfms_robot.app.servo.single_servo import field_named, read, read_registers
+from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.errors import ConfigError, ServoError
+from sfms_robot.emulator.launch import EmulatedServo, launch
+from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
+from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import limit_names
 
@@ -167,3 +171,108 @@ def test_another_mode_is_refused_with_what_to_type():
     with wire_on(at("xl330-m288", registers={"operating_mode": 1})) as (wire, _):
         with pytest.raises(ServoError, match="sfms-robot servo write 1 operating_mode 3"):
             move(wire, wire.find(1), "2050", None)
+
+
+# --- release ----------------------------------------------------------------------------------------------------
+
+
+def left_by_a_killed_run(head, chains, clock):
+    """Torque on, ports closed, nothing switched off."""
+    bus = build_bus(head, chains, clock, confirmed=True)
+    bus.connect()
+    bus.write(bus.enable(list(head.joints)), clock.now_s())
+    bus.poll(clock.now_s())
+    bus.close()
+    assert all(chains[joint.bus].state(joint.id)["torque"] for joint in head.joints.values())
+
+
+def off(rows):
+    return {row["joint"] or row["id"]: row["torque"] == "off" for row in rows}
+
+
+@pytest.mark.parametrize("everything", [False, True])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_family_is_released_and_confirms_it(family, everything):
+    head, clock = head_of(family), VirtualClock()
+    servos = emulated(head)["main"]
+    other = [EmulatedServo(9, servos[0].model, servos[0].baud)] if load_firmware_map(servos[0].model).protocol else []
+    with launch([*servos, *other], virtual=True) as chain:
+        left_by_a_killed_run(head, {"main": chain}, clock)
+        rows = release(head, {"main": chain}, clock, everything)
+        chain.time_is(clock.now_s())
+        assert not any(chain.state(joint.id)["torque"] for joint in head.joints.values())
+    ours = {name: row for row in rows if (name := row["joint"])}
+    assert off(ours.values()) == dict.fromkeys(head.joints, True)
+    more = {9} if other else set(range(24 if family == "maestro" else 32)) - {0, 1, 2, 5}
+    assert {row["id"] for row in rows if row["joint"] is None} == (more if everything else set())
+
+
+def test_every_bus_of_a_head_is_released_though_the_port_of_one_fails():
+    head, clock = head_of("sts", reconnect_s=1.0), VirtualClock()
+    servos = emulated(head)
+    with launch(servos["main"], virtual=True) as chain:
+        with launch(servos["other"], virtual=True) as other:
+            left_by_a_killed_run(head, {"main": chain, "other": other}, clock)
+        rows = release(head, {"main": chain, "other": other}, clock)
+        assert off(rows) == {"joint1": True, "joint2": True, "joint3": False, "joint4": False}
+        assert "no emulator" in rows[2]["note"] and not chain.state(1)["torque"]
+        with pytest.raises(PortError, match="no emulator"):
+            release(head, {"other": other}, clock)
+
+
+@pytest.mark.parametrize(
+    ("fault", "notes"),
+    [
+        ("overload:2", {2: ""}),
+        ("silent:3", {3: SILENT}),
+        ("mute:3", {3: SILENT}),
+        ("silent", dict.fromkeys((1, 2, 3, 4), SILENT)),
+    ],
+)
+@pytest.mark.parametrize("family", ["dynamixel2", "dynamixel1", "sts", "scs"])
+def test_a_servo_in_an_error_is_released_and_a_silent_one_is_named(family, fault, notes):
+    head, clock = head_of(family), VirtualClock()
+    with launch(emulated(head)["main"], virtual=True, behind_silent="skip") as chain:
+        left_by_a_killed_run(head, {"main": chain}, clock)
+        chain.inject(fault)
+        rows = release(head, {"main": chain}, clock)
+        assert {row["id"]: row["note"] for row in rows} == {1: "", 2: "", 3: "", 4: ""} | notes
+        chain.time_is(clock.now_s())
+        still = [i for i in (1, 2, 3, 4) if chain.state(i)["torque"]]
+        assert still == ([i for i in notes if notes[i]] if fault.startswith("silent") else [])  # a mute one obeys
+
+
+@pytest.mark.parametrize("named", ["xl330-m288", "xl-320"])
+@pytest.mark.parametrize("model", ["xl330-m288", "xl-320"])
+def test_nothing_but_torque_is_written_whatever_model_the_head_names(model, named):
+    with wire_on(at(model), EmulatedServo(2, model), baud=1_000_000) as (wire, chain):
+        for servo in (1, 2):
+            put(wire, servo, "torque_enable", 1)
+        if model == "xl330-m288":  # a host that died: its watchdog trips and refuses goals
+            put(wire, 1, "bus_watchdog", 5)
+            wire.clock.wait_until(wire.clock.now_s() + 1.0)
+        live = ("present", "moving", "realtime", "torque_enable", "velocity_trajectory", "position_trajectory")
+
+        def settings(servo):
+            values = read_registers(wire, wire.find(servo), ["all"])
+            return {value.field.name: value.raw for value in values if not value.field.name.startswith(live)}
+
+        before = settings(1)
+        assert release_chain(wire, dict.fromkeys((1, 2), Table.of(load_firmware_map(named)))) == {1: "", 2: ""}
+        assert settings(1) == before and not chain.state(1)["torque"] and not chain.state(2)["torque"]
+
+
+def test_a_servo_that_gives_no_registers_is_released_and_not_confirmed():
+    with wire_on(at("xl330-m288"), baud=1_000_000) as (wire, chain):
+        put(wire, 1, "torque_enable", 1)
+        wire.link.write(1, 68, b"\0")  # status return level: pings only
+        note = release_chain(wire, {1: Table.of(load_firmware_map("xl330-m288"))})[1]
+        assert "status return level" in note and not chain.state(1)["torque"]
+
+
+def test_a_bus_that_is_gone_is_an_error():
+    head, clock = head_of("dynamixel2"), VirtualClock()
+    with launch(emulated(head)["main"], virtual=True) as chain:
+        chain.hang_up()
+        with pytest.raises((BusError, PortError)):
+            release(head, {"main": chain}, clock)

@@ -98,6 +98,19 @@ def test_a_directory_is_no_port(run, tmp_path):
     assert code == 3 and "directory" in told["findings"][0]["problem"]
 
 
+def test_release_says_of_every_joint_whether_its_torque_is_off(command_line):
+    ended = command_line("servo", "release", "--port", "sim", "--json")
+    assert ended.code == 0 and ended.told["torque_unconfirmed"] == []
+    assert ended.told["released"][0] == {"bus": "main", "joint": "eye_pan_left", "id": 1, "torque": "off", "note": ""}
+    assert {row["torque"] for row in ended.told["released"]} == {"off"} and len(ended.told["released"]) == 28
+    assert command_line("servo", "release", "--port", "sim", "--all", "--json").code == 2
+    ended = command_line("servo", "release", "--port", "sim", "--all", "--yes", "--head", "reachy_mini")
+    assert ended.code == 0 and "torque off: 9 of 9" in ended.out
+    with launch([EmulatedServo(10, "xc330-m288")]) as chain:
+        ended = command_line("servo", "release", "--port", chain.device, "--head", "reachy_mini", "--json")
+    assert ended.code == 4 and len(ended.told["torque_unconfirmed"]) == 8 and "stewart_1" in ended.err
+
+
 def test_the_tables_for_people_hold_what_json_holds(command_line, device):
     for words in (("servo", "ping", "1"), ("servo", "read", "1", "all"), ("servo", "monitor", "1", "--samples", "1")):
         out = command_line(*words, "--port", device, "--baud", 1_000_000).out

@@ -44,15 +44,21 @@ def test_after_a_kill_the_watchdog_of_each_servo_has_tripped(device, chain):
     assert code == 0, err
     told = json.loads(out.splitlines()[-1])
     assert [(row["id"], row["raw"]) for row in told["registers"]] == [(PAN, -1), (TILT, -1)]
-    assert stand(chain)
+    assert stand(chain) and chain.state(PAN)["torque"] and chain.state(TILT)["torque"]
+    code, out, err = command("servo", "release", "--head", HEAD, "--port", device, "--json")
+    assert code == 0, err
+    told = json.loads(out.splitlines()[-1])
+    assert [row["torque"] for row in told["released"]] == ["off", "off"] and told["torque_unconfirmed"] == []
+    assert not chain.state(PAN)["torque"] and not chain.state(TILT)["torque"]
 
 
 def test_the_second_run_on_a_port_is_refused_and_names_the_first(device, chain):
     with run(HEAD, device) as first:
         listening(first, chain)
-        code, out, err = command("run", "--head", HEAD, "--port", device, "--audio", "none", "--duration", 1, "--json")
-        assert code == 3 and f"pid {first.pid}" in err and len(err.splitlines()) == 1
-        assert json.loads(out.splitlines()[-1])["exit_code"] == 3
+        for words in (("run", "--audio", "none", "--duration", 1), ("servo", "release")):
+            code, out, err = command(*words, "--head", HEAD, "--port", device, "--json")
+            assert code == 3 and f"pid {first.pid}" in err and "stop that first" in err and len(err.splitlines()) == 1
+            assert json.loads(out.splitlines()[-1])["exit_code"] == 3
         listening(first, chain)  # it goes on
         first.signal(signal.SIGINT)
         assert first.ended().code == 130

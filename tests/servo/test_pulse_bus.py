@@ -7,6 +7,7 @@ from board_rig import LIMIT_RAD, Bench
 from emulated_port import EmulatedPort, Says, Straight
 
 from sfms_robot.config import load_firmware_map
+from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.servo.boards.maestro_bus import MaestroBus
 from sfms_robot.servo.codecs import maestro, ssc32
@@ -247,3 +248,27 @@ def test_noise_that_comes_back_is_no_answer():
     bench.board = Says(b"?")
     with pytest.raises(BusError, match="no ssc-32 answers"):
         bench.bus.connect()
+
+
+@pytest.mark.parametrize(
+    ("model", "family"), [("maestro-24", "maestro"), ("maestro-6", "maestro"), ("ssc-32", "ssc32")]
+)
+def test_goals_take_the_bytes_that_are_counted(model, family):
+    channels = (0, 2, 4) if family == "maestro" else (10, 12, 14)  # none beside another, and of two digits
+    bench = Bench(model, channels)
+    bench.ticks(bench.hold(), 2)
+    bench.port.sent.clear()
+    bench.ticks(np.full(3, 0.1), 1)
+    assert len(bench.port.sent[0]) == FRAMINGS[family].goals(3)
+
+
+@pytest.mark.parametrize("silent", [False, True])
+@pytest.mark.parametrize("model", ["maestro-24", "ssc-32"])
+def test_pulses_that_a_killed_run_left_on_end_and_the_board_confirms_it(model, silent):
+    left = Bench(model)
+    left.hold()
+    bench = Bench(model)
+    bench.board, bench.clock = left.board, left.clock
+    (bench.kill if silent else bench.revive)()
+    assert bench.bus.end_pulses(range(24)) is not silent
+    assert bench.on() == (left.on() if silent else []) and bench.port.closed

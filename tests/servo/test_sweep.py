@@ -13,7 +13,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.chain.protocol1_link import Protocol1Link
-from sfms_robot.servo.chain.schedule import Rotation, blocks_per_tick, read_s, write_s
+from sfms_robot.servo.chain.status_poll import Rotation, blocks_per_tick
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.protocol1 import encode
 from sfms_robot.servo.port import WrappedPort
@@ -58,12 +58,12 @@ def test_slow_wire_brings_positions_every_tick_and_the_rest_in_turn(make_rig):
         assert 0 < seen[0] < 14 and seen[-1] == 28
 
 
-@given(st.integers(1, 60), st.sampled_from([57600, 1_000_000, 4_000_000]), st.floats(20, 200), st.booleans())
-def test_blocks_fit_in_what_goals_and_positions_leave(count, baud, rate_hz, fast):
-    blocks = blocks_per_tick(count, 4, 21, 4, baud, rate_hz, fast)
+@given(st.integers(1, 60), st.floats(1e-5, 1e-3), st.floats(0.001, 0.05))
+def test_blocks_fit_in_what_goals_and_positions_leave(count, block_s, spare_s):
+    positions_s = count * block_s / 4
+    blocks = blocks_per_tick(count, spare_s, positions_s, lambda servos: servos * block_s)
     assert 1 <= blocks <= count
-    spent_s = write_s(count, 4, baud) + read_s(count, 4, baud, fast) + read_s(blocks, 21, baud, fast)
-    assert blocks == 1 or blocks == count or spent_s <= 1 / rate_hz
+    assert blocks == 1 or positions_s * (blocks < count) + blocks * block_s <= spare_s
 
 
 @given(st.integers(1, 30), st.integers(1, 30))
@@ -92,10 +92,13 @@ def test_fast_answer_of_another_length_is_none():
 
 
 @pytest.mark.parametrize(
-    ("kind", "more", "answer"),
-    [(Dynamixel2Link, (), dxl2.encode_status(1, 0, bytes(4))), (Protocol1Link, ("feetech",), encode(1, 0, bytes(4)))],
+    ("kind", "more", "answer", "held"),
+    [
+        (Dynamixel2Link, (), dxl2.encode_status(1, 0, bytes(4)), "15.7 ms, so a silent servo costs 19.6 ms"),
+        (Protocol1Link, ("feetech",), encode(1, 0, bytes(4)), "15.8 ms, so a silent servo costs 19.8 ms"),
+    ],
 )
-def test_adapter_that_holds_answers_back_is_waited_for(kind, more, answer, caplog):
+def test_adapter_that_holds_answers_back_is_waited_for(kind, more, answer, held, caplog):
     class Slow(EmulatedPort):
         """An FTDI adapter as it comes: answers lie in it for 16 ms."""
 
@@ -115,5 +118,5 @@ def test_adapter_that_holds_answers_back_is_waited_for(kind, more, answer, caplo
     link = kind(slow(), 1_000_000, 0.003, *more)
     with caplog.at_level(logging.WARNING):
         assert link.adapt(1, 132, 4) == pytest.approx(0.02, abs=0.001)
-    assert "slow: an answer is held back for 15.7 ms, so a silent servo costs 19.6 ms" in caplog.text
+    assert f"slow: an answer is held back for {held}" in caplog.text
     assert link.read(1, 132, 4) is not None

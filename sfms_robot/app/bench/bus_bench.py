@@ -26,6 +26,7 @@ from sfms_robot.app.bench.measure import HEAD, Row, row, times
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
+from sfms_robot.config.wire_time import BITS
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.runtime.clock import RealClock, tick_times
 
@@ -37,8 +38,7 @@ _WINDOW: Final = 25  # ticks over which a rate is taken
 _POSITION: Final = (132, 4)
 _BLOCK: Final = (126, 21)  # load to temperature, of X servos
 _GOAL: Final = (116, 4)
-_MIDDLE: Final = bytes([0, 8, 0, 0])
-_BITS: Final = 10
+_MIDDLE: Final = b"\x00\x08\x00\x00"
 _SERVOS: Final = 12  # of the heads that each protocol is measured with
 
 
@@ -157,7 +157,7 @@ def _shares(chain: Chain, host: Host, baud: int, ticks: int = 100) -> list[float
         count = after["bytes_in"] + after["bytes_out"] - before["bytes_in"] - before["bytes_out"]
         last = chain.stamps()[-1]
         late_s = max(0.0, last["sent_s"] - last["due_s"])
-        seen.append((count, count * _BITS / baud / (spent_s - late_s)))
+        seen.append((count, count * BITS / baud / (spent_s - late_s)))
     usual, _ = Counter(count for count, _ in seen).most_common(1)[0]
     return [share for count, share in seen if count == usual]
 

@@ -9,48 +9,29 @@ latency again: that is what makes factory settings slow. Boards for hobby servos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import Any, Self
 
-Way = Literal["together", "fast", "one by one"]
-
-
-class Framing(NamedTuple):
-    """Bytes of a family's packets beside the data and the ids."""
-
-    write: int  # sync write, plus 1 + data per servo
-    ask: int  # sync read, plus 1 per servo
-    answer: int  # status packet, plus data
-    fast_head: int | None = None  # fast sync status, plus `fast_each` + data per servo
-    fast_each: int = 0
-    single: int = 8  # read request to one servo
-
-
-FRAMINGS: Final = {
-    "dynamixel2": Framing(write=14, ask=14, answer=11, fast_head=8, fast_each=4, single=14),
-    "dynamixel1": Framing(write=8, ask=0, answer=6),
-    "feetech": Framing(write=8, ask=8, answer=6),
-}
-
-
-BOARDS: Final = {  # bytes of one tick of n channels
-    "maestro": lambda channels: 4 * channels,  # 84 channel low high, each; its "multiple targets" needs neighbours
-    "ssc32": lambda channels: 9 * channels + 1,  # "#12P1500 ", at the end a carriage return
-}
+from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 
 
 @dataclass(frozen=True)
 class Tick:
-    """What one tick costs. `ms` holds wire, servos and adapter; `hz` is how often that fits into a second."""
+    """Cost of one tick, rounded. `ms` holds wire, servos and adapter; `hz` is how often that fits into a second."""
 
     bytes: int
     ms: float
     hz: float
 
+    @classmethod
+    def of(cls, size: int, ms: float) -> Self:
+        """Return the tick of so many bytes."""
+        return cls(size, round(ms, 3), round(1e3 / ms, 1))
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Budget:
-    """A bus's wire budget at one baud.
+    """Wire budget of a bus at one baud; data per servo and tick in bytes.
 
     Attributes:
         write_only: goals alone.
@@ -62,8 +43,8 @@ class Budget:
     baud: int
     return_delay_us: float
     latency_ms: float
-    write_bytes: int
-    read_bytes: int
+    write_bytes_per_servo: int
+    read_bytes_per_servo: int
     write_only: Tick
     plain: Tick | None
     fast: Tick | None
@@ -74,20 +55,8 @@ class Budget:
         return self.plain or self.write_only
 
     def plain_data(self) -> dict[str, Any]:
-        """For a report; figures rounded to what they mean."""
-        ticks = {"write_only": self.write_only, "plain": self.plain, "fast": self.fast}
-        return {
-            "servos": self.servos,
-            "baud": self.baud,
-            "return_delay_us": self.return_delay_us,
-            "latency_ms": self.latency_ms,
-            "write_bytes_per_servo": self.write_bytes,
-            "read_bytes_per_servo": self.read_bytes,
-            **{
-                name: None if each is None else {"bytes": each.bytes, "ms": round(each.ms, 3), "hz": round(each.hz, 1)}
-                for name, each in ticks.items()
-            },
-        }
+        """Return it for a report."""
+        return asdict(self)
 
 
 def wire_budget(
@@ -108,26 +77,36 @@ def wire_budget(
         read_bytes, write_bytes: data per servo and tick.
     """
     framing = FRAMINGS[family]
-    write = framing.write + servos * (1 + write_bytes)
+    goals = framing.goals(servos, write_bytes)
+    way: Way = "together" if together and family != "dynamixel1" else "one by one"  # AX cannot be read together
 
     def tick(size: int, answers: int, waits: int) -> Tick:
-        ms = size * 10e3 / baud + answers * return_delay_us / 1e3 + waits * latency_ms
-        return Tick(size, ms, 1e3 / ms)
+        return Tick.of(size, size * 1e3 * BITS / baud + answers * return_delay_us / 1e3 + waits * latency_ms)
 
-    if together and framing.ask:
-        size = write + framing.ask + servos + servos * (framing.answer + read_bytes)
-        plain = tick(size, servos, 1)
-    else:
-        plain = tick(write + servos * (framing.single + framing.answer + read_bytes), servos, servos)
-    fast = None
-    if together and framing.fast_head is not None:
-        size = write + framing.ask + servos + framing.fast_head + servos * (framing.fast_each + read_bytes)
-        fast = tick(size, 1, 1)
-    return Budget(servos, baud, return_delay_us, latency_ms, write_bytes, read_bytes, tick(write, 0, 0), plain, fast)
+    return Budget(
+        servos=servos,
+        baud=baud,
+        return_delay_us=return_delay_us,
+        latency_ms=latency_ms,
+        write_bytes_per_servo=write_bytes,
+        read_bytes_per_servo=read_bytes,
+        write_only=tick(goals, 0, 0),
+        plain=tick(goals + framing.reads(servos, read_bytes, way), servos, 1 if way == "together" else servos),
+        fast=tick(goals + framing.reads(servos, read_bytes, "fast"), 1, 1) if together and framing.fast else None,
+    )
 
 
-def board_budget(family: str, channels: int, baud: int) -> Budget:
-    """The budget of a board of hobby servos, every channel written every tick."""
-    size = BOARDS[family](channels)
-    ms = size * 10e3 / baud
-    return Budget(channels, baud, 0.0, 0.0, size // channels, 0, Tick(size, ms, 1e3 / ms), None, None)
+def board_budget(family: str, channels: int, baud: int, crc: bool = False) -> Budget:
+    """Return the budget of a board of hobby servos, every channel written every tick, with a CRC each or without."""
+    size = FRAMINGS[family].goals(channels) + crc * channels
+    return Budget(
+        servos=channels,
+        baud=baud,
+        return_delay_us=0.0,
+        latency_ms=0.0,
+        write_bytes_per_servo=size // channels,
+        read_bytes_per_servo=0,
+        write_only=Tick.of(size, size * 1e3 * BITS / baud),
+        plain=None,
+        fast=None,
+    )

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, cast
 
-from sfms_robot.app.servo.budget import BOARDS, Budget, board_budget, wire_budget
+from sfms_robot.app.servo.budget import Budget, board_budget, wire_budget
 from sfms_robot.app.servo.diagnosis import (
     Command,
     Finding,
@@ -43,7 +43,7 @@ from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
-from sfms_robot.servo.families import servo_families
+from sfms_robot.servo.families import family_named, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds
@@ -136,7 +136,7 @@ def examine_line(
             try:
                 adapter = describe(path)  # after opening, which may have set the latency
                 findings += judge_adapter(adapter, held_by)
-                if line.family in BOARDS:
+                if family_named(line.family).board:
                     found, facts = _look_at_board(line, port, adapter)
                 else:
                     found, facts = _look(line, port, clock, adapter, progress, fix)
@@ -292,7 +292,7 @@ def _board_answers(line: Line, port: Port) -> bool:
 
 def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], dict[str, Any]]:
     """What can be said of a board of hobby servos, whose port could be opened."""
-    budget = board_budget(line.family, max(1, len(line.wanted)), _first_baud(line))
+    budget = board_budget(line.family, max(1, len(line.wanted)), _first_baud(line), line.crc)
     command = Command(line.shown, line.family)
     answers = _board_answers(line, port)
     found = judge_board(line.family, len(line.wanted), answers, adapter)

@@ -1,18 +1,24 @@
-"""`sfms-robot servo move`: one servo, gently, and left as it was found."""
+"""`servo move`: one servo, gently, and left as it was found. `servo release`: torque off, whatever they do."""
 
 from __future__ import annotations
 
 import logging
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
 
-from sfms_robot.app.servo.serial_line import FoundServo, Wire
-from sfms_robot.app.servo.single_servo import field_named, put, read
-from sfms_robot.errors import ConfigError, ServoError
+from sfms_robot.app.open_head import build_one
+from sfms_robot.app.servo.serial_line import TRIES, FoundServo, Wire
+from sfms_robot.app.servo.single_servo import field_named, put, read, scan
+from sfms_robot.app.wiring import Opened, port_of
+from sfms_robot.config import Head, Joint, load_firmware_map
+from sfms_robot.emulator.launch import Chain
+from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
+from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.slow_profile import WayInside, slow_profile, way_inside
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.registers import Field, Table
 from sfms_robot.servo.stored_settings import limit_names
 
@@ -202,3 +208,81 @@ def _settled(wire: Wire, seen: FoundServo, present: Field, target: int) -> int:
 
 def _ticks(table: Table, degrees: float) -> float:
     return degrees * table.ticks_per_revolution / 360.0
+
+
+# --- release ----------------------------------------------------------------------------------------------------
+
+Unconfirmed = dict[int, str]  # by id: why it is not known that its torque is off; empty if it is off
+
+SILENT: Final = "does not answer; torque off was sent"
+
+
+def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) -> list[dict[str, Any]]:
+    """Take torque off the servos of a head, and write nothing else; return a row per joint.
+
+    The servos need not be those that the head's file names. `everything`: also servos and channels of other ids.
+    Joints on a bus whose port fails are unconfirmed. Raises PortError and BusError if no bus could be used.
+    """
+    rows: list[dict[str, Any]] = []
+    failures: list[PortError | BusError] = []
+    for name, where in opened.items():
+        joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
+        names = {joint.id: key for key, joint in joints.items()}
+        try:
+            off = _release_bus(head, name, joints, where, clock, everything)
+        except (PortError, BusError) as error:
+            failures.append(error)
+            off = dict.fromkeys(names, str(error))
+        for servo, why in off.items():
+            torque = "unconfirmed" if why else "off"
+            rows.append({"bus": name, "joint": names.get(servo), "id": servo, "torque": torque, "note": why})
+    if len(failures) == len(opened):
+        raise failures[0]
+    return rows
+
+
+def _release_bus(
+    head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, everything: bool
+) -> Unconfirmed:
+    bus, tables = head.buses[name], {j.id: Table.of(load_firmware_map(j.model)) for j in joints.values()}
+    if family_named(bus.family).board:
+        most = max((table.channels or 0 for table in tables.values()), default=0)
+        channels = range(most) if everything else list(tables)
+        confirmed = not joints or build_one(head, name, joints, where, clock, confirmed=True, kept={}).end_pulses(
+            channels
+        )
+        return dict.fromkeys(channels, "" if confirmed else SILENT)
+    port = port_of(where, bus, clock)()
+    try:
+        return release_chain(Wire(port, bus.family, clock, bus.baud, fixed=True), tables, everything)
+    finally:
+        port.close()
+
+
+def release_chain(wire: Wire, tables: Mapping[int, Table], everything: bool = False) -> Unconfirmed:
+    """Write torque off to the servos of `tables`, by id, until they confirm it. Raises BusError when the port fails.
+
+    A servo that answers a ping is written where the model that it names keeps its torque, a silent one where the head
+    says: it may still obey. Models of Protocol 1.0 all keep it in one place.
+    """
+    seen = {each.id: each for each in (scan(wire) if everything else ())}
+    why = dict.fromkeys((*tables, *seen), SILENT)
+    for _ in range(TRIES):
+        packets: dict[Field, dict[int, bytes]] = {}
+        for servo in [servo for servo in why if why[servo]]:
+            if (found := seen.get(servo) or wire.ping(servo, tries=1)) is not None:
+                seen[servo] = found
+            table = found.table if found and (found.table or wire.kind.protocol == 2) else tables.get(servo)
+            if table is None:
+                why[servo] = "its model has no firmware map; nothing was written"
+            else:
+                field = table["torque_enable"]
+                packets.setdefault(field, {})[servo] = field.to_bytes(0)
+        for field, off in packets.items():
+            wire.link.sync_write(field.address, off)
+        for field, off in packets.items():
+            for servo in off.keys() & seen.keys():
+                answer = wire.link.read(servo, field.address, field.size)
+                confirmed = answer is not None and answer.data == off[servo]
+                why[servo] = "" if confirmed else "answers, but does not report torque off (status return level?)"
+    return why

@@ -324,6 +324,23 @@ class PulseBus(WireBus[RateLimitedPort]):
         pulses = self._protocol.read_pulses(wire.exchange, self._off or ())
         return self._answers(wire, restarted=True) if pulses is None else not any(pulses.values())
 
+    def end_pulses(self, channels: Sequence[int]) -> bool:
+        """Open the port, end the pulses of `channels` and close it; return whether the board confirmed it.
+
+        For a bus that is not connected, whatever the board does. Raises PortError, BusError.
+        """
+        self._off = tuple(channels)
+        wire = self._open()
+        try:
+            for attempt in range(_TRIES):
+                wire.send(self._protocol.encode_off(self._off, restarted=attempt > 0))
+                wire.wait(wire.busy_until_s)
+                if self._is_off(wire):
+                    return True
+            return False
+        finally:
+            wire.port.close()
+
     def close(self) -> None:
         """Give the port back. Idempotent."""
         self._enabled = []

@@ -6,6 +6,7 @@ that only fills a buffer; so the port says until when it is busy.
 
 from __future__ import annotations
 
+from sfms_robot.config.wire_time import BITS
 from sfms_robot.servo.port import Port
 
 _CHUNK = 4096
@@ -26,7 +27,7 @@ class RateLimitedPort:
         self.port = port
         self.busy_until_s = port.now_s()
         self.awaiting = False
-        self._byte_s = 10.0 / baud
+        self._byte_s = BITS / baud
         self._patience_s = patience_s
         self._answer = bytearray()
         self._length = 0

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import Faults
+from sfms_robot.config.wire_time import Framing
 from sfms_robot.errors import BusError, PacketError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
@@ -38,10 +39,9 @@ from sfms_robot.servo.chain.fault_reporter import FaultReporter
 from sfms_robot.servo.chain.link import AWAY_LATE_S, RegisterLink
 from sfms_robot.servo.chain.member import ONLINE, REDUCED, REJOINING, Member, members_of
 from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
-from sfms_robot.servo.chain.schedule import TURN_S, read_bytes
 from sfms_robot.servo.chain.settings import Settings
 from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup
-from sfms_robot.servo.chain.status_poll import StatusPoll
+from sfms_robot.servo.chain.status_poll import TURN_S, StatusPoll
 from sfms_robot.servo.chain.telemetry import Telemetry
 from sfms_robot.servo.chain.verified_write import finish
 from sfms_robot.servo.policy import BusServo
@@ -54,7 +54,6 @@ READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
 _CONFIRM_S: Final = 0.2  # that `stop` waits for servos to confirm, at most
 _STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
 _EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
-_EXCHANGE_BYTES: Final = LONGEST_READ + 32  # of the longest of them: a part of the control table
 _SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
 BUS_WATCHDOG: Final = "bus_watchdog"
 _NOBODY: Final = np.zeros(0, np.intp)
@@ -77,6 +76,7 @@ class ChainBus(WireBus[L], Generic[L]):
 
     family: ClassVar[str]
     protocol: ClassVar[int]
+    framing: ClassVar[Framing]
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class ChainBus(WireBus[L], Generic[L]):
         self._telemetry = Telemetry(name, self.family, self.protocol, self._tables, conversion)
         self._reporter = FaultReporter()
         self._members = members_of(servos, self._tables, faults or Faults(), self._reporter)
-        self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts)
+        self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.framing)
         self._writes = RepeatedWrites(list(self._index))
         self._settings = Settings(self._members, self._tables, self._writes)
         self._enabled = False
@@ -187,6 +187,7 @@ class ChainBus(WireBus[L], Generic[L]):
     def _attach(self, link: L) -> None:
         self._now_s = link.port.now_s
         startup = self._begin(link, tries=1)
+        startup.others = lambda: [member.index for member in self._members if member.comes_back]
         self._settings.attach(startup)
         for member in self._members:
             member.attach(startup)
@@ -330,7 +331,7 @@ class ChainBus(WireBus[L], Generic[L]):
         """
         rest = list(indices)
         for _ in range(len(indices) + 2):
-            if not rest or not link.affords(read_bytes(1, field.size, False)):
+            if not rest or not link.affords(link.framing.reads(1, field.size)):
                 break
             ids = [self._servos[i].id for i in rest]
             got = self._attempt(partial(self._poll.read_some, link, "stop", (field.address, field.size), ids))
@@ -500,10 +501,10 @@ class ChainBus(WireBus[L], Generic[L]):
 
     def _bring_back(self, link: L, now_s: float) -> None:
         """A poll's share of the jobs of members on their way back; a silence ends it."""
-        left = _EXCHANGES
+        left, longest = _EXCHANGES, link.framing.reads(1, LONGEST_READ)
         for member in [member for member in self._members if member.state is not ONLINE]:
             while left and member.waits and member.due(now_s):
-                if not link.grants("return", _EXCHANGE_BYTES, alone=True, late_s=AWAY_LATE_S):
+                if not link.grants("return", longest, alone=True, late_s=AWAY_LATE_S):
                     return
                 left -= 1
                 member.step(now_s)

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.chain.chain_bus import BUS_WATCHDOG, ChainBus
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
@@ -29,6 +30,7 @@ class Dynamixel2Bus(ChainBus[Dynamixel2Link]):
     """One wire of servos, as `ports.Bus`; arguments as of `ChainBus`."""
 
     family = "dynamixel"
+    framing = FRAMINGS["dynamixel2"]
     protocol = 2
 
     def _set_up(self) -> None:

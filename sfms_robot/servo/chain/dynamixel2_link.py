@@ -15,10 +15,11 @@ from typing import Final
 
 import numpy as np
 
+from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
 from sfms_robot.servo.chain.sdk_packets import SdkPackets2
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.codecs.dxl2 import STATUS, STATUS_OVERHEAD, maybe_packet
+from sfms_robot.servo.codecs.dxl2 import STATUS, maybe_packet
 from sfms_robot.servo.port import Port
 
 _REQUESTS_KEPT: Final = 512
@@ -32,6 +33,8 @@ _SYNC_DATA: Final = 12  # where the first id of a sync write stands
 
 class Dynamixel2Link(RegisterLink):
     """One wire of Protocol 2.0 servos."""
+
+    framing = FRAMINGS["dynamixel2"]
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
@@ -112,7 +115,7 @@ class Dynamixel2Link(RegisterLink):
         """As `sync_read`, but all answer in one packet, which stops where somebody is silent."""
         wanted, length = length, length + self._extra
         self._send(self._read_request(address, length, servos, fast=True))
-        size = 8 + len(servos) * (length + 4)
+        size = self.framing.answers(len(servos), length, fast=True)
         buffer, start = bytearray(), -1
         allowance_s = self._allowance_s()
         asked_s = self.port.now_s()
@@ -176,7 +179,7 @@ class Dynamixel2Link(RegisterLink):
         """
         port, buffer, answers = self.port, bytearray(), dict[int, Answer]()
         pending = set(servos)
-        size = STATUS_OVERHEAD + length
+        size = self.framing.answer + length
         allowance_s = self._allowance_s()
         asked_s = port.now_s()
         deadline_s = asked_s + (self._sent + size) * self._byte_s + allowance_s

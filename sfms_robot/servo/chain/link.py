@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Final, NamedTuple
 
+from sfms_robot.config.wire_time import BITS, Framing
 from sfms_robot.servo.port import Port
 
 log = logging.getLogger(__name__)
@@ -28,7 +29,6 @@ _SLACK_S: Final = 0.001  # of a request that is granted, for a busy computer
 _ADAPTER_S: Final = 0.05  # the longest that an adapter may hold an answer back
 _SAMPLES: Final = 3
 _MARGIN: Final = 1.25
-_FRAMES: Final = 25  # bytes of a request and its answer beside the data, at most
 
 
 class Found(NamedTuple):
@@ -54,15 +54,18 @@ class RegisterLink(ABC):
         silence_s: how long to wait for the next byte before the servo counts as silent.
 
     Attributes:
+        framing: bytes of its packets.
         judged: whether the last request waited that long. Inside `within` it may not have, and then who did not answer
             may still be there.
     """
+
+    framing: Framing
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         self.port = port
         self.silence_s = silence_s
         self.judged = True
-        self._byte_s = 10.0 / baud
+        self._byte_s = BITS / baud
         self._end_s = math.inf
         self._left_s = math.inf
         self._refused_s: dict[str, float] = {}  # since when a purpose has found no room
@@ -184,7 +187,8 @@ class RegisterLink(ABC):
             for _ in range(_SAMPLES):
                 asked_s = self.port.now_s()
                 if self.read(servo, address, length) is not None:
-                    held_s = max(held_s, self.port.now_s() - asked_s - (_FRAMES + length) * self._byte_s)
+                    wire_s = self.framing.reads(1, length, "one by one") * self._byte_s
+                    held_s = max(held_s, self.port.now_s() - asked_s - wire_s)
         if held_s > self.silence_s:
             self.silence_s = _MARGIN * held_s
             log.warning(

@@ -351,6 +351,11 @@ class Member:
         """Something is still to come: a job, or the end of being limp."""
         return self.job is not None or self._back_s < math.inf
 
+    @property
+    def comes_back(self) -> bool:
+        """True if it is away or on its way back, and was checked against the head's file earlier in this run."""
+        return self.identified and self.state in _COMING | {State.SILENT}
+
     def step(self, now_s: float) -> None:
         """Take one exchange of its job. Raises BusError when the port fails."""
         if self.job is None:

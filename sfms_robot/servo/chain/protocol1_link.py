@@ -14,11 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Literal
 
+from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import CHUNK, Answer, Found, RegisterLink
 from sfms_robot.servo.chain.sdk_packets import SdkPackets1
 from sfms_robot.servo.codecs import dxl1, feetech, protocol1
-from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, OVERHEAD, Frame, encode, maybe_frame, salvage
+from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, Frame, encode, maybe_frame, salvage
 from sfms_robot.servo.port import Port
 
 Family = Literal["dynamixel", "feetech"]
@@ -34,6 +35,7 @@ class Protocol1Link(RegisterLink):
     def __init__(self, port: Port, baud: int, silence_s: float, family: Family) -> None:
         super().__init__(port, baud, silence_s)
         self.family = family
+        self.framing = FRAMINGS["feetech" if family == "feetech" else "dynamixel1"]
         self._build = SdkPackets1().instruction if family == "dynamixel" else encode
         self._sent = b""
         self._owed: dict[int, dict[int, float]] = {}
@@ -178,8 +180,9 @@ class Protocol1Link(RegisterLink):
         self._echoed = False
         allowance_s = self._allowance_s()
         asked_s = port.now_s()
-        deadline_s = asked_s + (len(echo) + OVERHEAD + length) * self._byte_s + allowance_s
-        last_s = deadline_s + (len(servos) - 1) * (OVERHEAD + length) * self._byte_s + self._rubbish_s()
+        size = self.framing.answer + length
+        deadline_s = asked_s + (len(echo) + size) * self._byte_s + allowance_s
+        last_s = deadline_s + (len(servos) - 1) * size * self._byte_s + self._rubbish_s()
         while pending and port.now_s() < last_s:
             data = port.read(CHUNK, min(deadline_s, last_s))
             if not data:

@@ -20,17 +20,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 from sfms_robot.config import Bus as BusConfig
+from sfms_robot.config.wire_time import BITS, Framing, Way
 from sfms_robot.servo.chain.link import AWAY_LATE_S, Answer, RegisterLink
 from sfms_robot.servo.chain.member import Member
-from sfms_robot.servo.chain.schedule import TURN_S, USE, Rotation, blocks_per_tick, read_bytes, read_s, write_s
 from sfms_robot.servo.chain.telemetry import Block, Telemetry
 from sfms_robot.servo.codecs.dxl2 import ALERT
 
 log = logging.getLogger(__name__)
 
+USE: Final = 0.8  # of a tick; the rest is for probes, retries and a busy computer
+TURN_S: Final = 0.001  # of an adapter at every request: USB hands bytes over every millisecond
 QUIET_POLLS: Final = 3  # polls without any answer before servos are blamed rather than the wire
 _REQUESTS: Final = 3  # for the same thing in one poll at most
 _SILENCES: Final = 2  # single reads in one poll that may stay unanswered
@@ -40,7 +43,6 @@ _HEALTH_POLLS: Final = 5  # between two looks at torque and error status, where 
 _HEALTH_SHARE: Final = 8  # servos in one look
 _ALERTS_READ: Final = 2  # per poll
 _IN_TURN_SHARE: Final = 0.6  # of a tick that reading servos one by one may take
-_SINGLE: Final = 14  # bytes of a single read and its answer beside the data, protocol 1
 _TURNAROUND_S: Final = 0.0005  # host and servo, between a request and its answer
 
 GroupRead = Callable[[int, int, Sequence[int]], Mapping[int, Answer]]
@@ -65,6 +67,7 @@ class StatusPoll:
         telemetry: takes positions and the like.
         config: of the bus.
         counts: of the bus: reads, errors and retries are counted up in place.
+        framing: bytes of the packets on this wire.
 
     Attributes:
         read_deadline_s: silence that makes a servo silent on this wire.
@@ -73,7 +76,13 @@ class StatusPoll:
     """
 
     def __init__(
-        self, bus: str, members: Sequence[Member], telemetry: Telemetry, config: BusConfig, counts: dict[str, int]
+        self,
+        bus: str,
+        members: Sequence[Member],
+        telemetry: Telemetry,
+        config: BusConfig,
+        counts: dict[str, int],
+        framing: Framing,
     ) -> None:
         self._bus = bus
         self._members = list(members)
@@ -82,6 +91,7 @@ class StatusPoll:
         self._telemetry = telemetry
         self._config = config
         self._counts = counts
+        self._framing = framing
         self.read_deadline_s = config.read_deadline_ms / 1e3
         self._tells = {each.id for each in members if telemetry.currents[each.index] is not None}
         self._error_bits = [ALERT if telemetry.error is not None else _status_bits(member) for member in members]
@@ -118,18 +128,28 @@ class StatusPoll:
     def _plan(self) -> None:
         """How many whole blocks fit into a tick, and the budget of a poll."""
         telemetry, config, count = self._telemetry, self._config, len(self._ids)
-        fast, (_, position), (_, block) = self._fast is not None, telemetry.position, telemetry.block
-        goal = telemetry.goal.size
+        (_, position), (_, block) = telemetry.position, telemetry.block
+        byte_s, way = BITS / config.baud, "fast" if self._fast is not None else self._way
+        spare_s = USE / config.rate_hz - self._framing.goals(count, telemetry.goal.size) * byte_s
+
+        def read_s(servos: int, length: int) -> float:
+            return self._framing.reads(servos, length, way) * byte_s + TURN_S
+
         self._blocks = count
         if telemetry.error is not None:  # the others are always asked for the block
-            self._blocks = blocks_per_tick(count, position, block, goal, config.baud, config.rate_hz, fast)
-        single_s = (_SINGLE + block) * 10.0 / config.baud + _TURNAROUND_S
+            self._blocks = blocks_per_tick(count, spare_s, read_s(count, position), partial(read_s, length=block))
+        single_s = self._framing.reads(1, block, "one by one") * byte_s + _TURNAROUND_S
         self._many = max(1, int(_IN_TURN_SHARE / config.rate_hz / single_s))
-        first = read_s(count, position if self._blocks < count else block, config.baud, fast)
-        if self._group is None:
-            first = read_s(1, block, config.baud, False)
-        spare_s = USE / config.rate_hz - write_s(count, goal, config.baud)
-        self.budget_s = max(spare_s, first + self.read_deadline_s + TURN_S)
+        first_s = read_s(1 if self._group is None else count, position if self._blocks < count else block)
+        self.budget_s = max(spare_s, first_s + self.read_deadline_s + TURN_S)
+
+    @property
+    def _way(self) -> Way:
+        return "one by one" if self._group is None else "together"
+
+    def _bytes(self, servos: int, length: int) -> int:
+        """Return the bytes of reading `length` bytes of each, by one request where the wire has one."""
+        return self._framing.reads(servos, length, self._way)
 
     def measure(self, link: RegisterLink, now_s: float) -> None:
         """Everything of everybody who is listed, once; nobody is blamed."""
@@ -174,10 +194,10 @@ class StatusPoll:
         if most <= 0:
             return 0
         if self._group is None:
-            return int(link.grants(purpose, read_bytes(1, length, False), alone=True))
-        while most > 1 and not link.affords(read_bytes(most, length, False)):
+            return int(link.grants(purpose, self._bytes(1, length), alone=True))
+        while most > 1 and not link.affords(self._bytes(most, length)):
             most -= 1
-        return most if link.grants(purpose, read_bytes(most, length, False)) else 0
+        return most if link.grants(purpose, self._bytes(most, length)) else 0
 
     def read_some(self, link: RegisterLink, purpose: str, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
         """Answers of a few, of as many as there is time for: by one request where the wire has one."""
@@ -190,7 +210,7 @@ class StatusPoll:
             return (fast or self._group)(*where, ids)
         answers: dict[int, Answer] = {}
         for servo in ids:
-            if not link.grants(purpose, read_bytes(1, where[1], False), alone=True):
+            if not link.grants(purpose, self._bytes(1, where[1]), alone=True):
                 break
             self._counts["reads"] += 1
             if (answer := link.read(servo, *where)) is not None:
@@ -207,7 +227,7 @@ class StatusPoll:
             # A wire that was quiet in the last poll as well is asked once: most likely nobody is there.
             if not rest or (attempt > 0 and not out.answers and self.quiet_polls > 0):
                 break
-            if attempt > 0 and not link.affords(read_bytes(len(rest), where[1], False)):
+            if attempt > 0 and not link.affords(self._bytes(len(rest), where[1])):
                 break
             self._counts["retries"] += attempt > 0
             self._counts["reads"] += 1
@@ -252,7 +272,7 @@ class StatusPoll:
         place = {servo: i for i, servo in enumerate(self._ids)}
         order = sorted(ids, key=lambda servo: (place[servo] - self._turn) % len(place))
         for number, servo in enumerate(order[: self._many]):
-            if number and not link.affords(read_bytes(1, where[1], False), alone=True):
+            if number and not link.affords(self._bytes(1, where[1]), alone=True):
                 break
             self._turn = (place[servo] + 1) % len(place)
             self._counts["reads"] += 1
@@ -289,7 +309,7 @@ class StatusPoll:
         answered = False
         absent = [member for member in self._members if not member.liveness.listed]
         waiting = [member for member in absent if member.liveness.probe_s <= now_s]
-        request = read_bytes(1, self._telemetry.block[1], False)
+        request = self._bytes(1, self._telemetry.block[1])
         for _ in range(_PROBES):
             if not waiting or not link.grants("probe", request, alone=True, late_s=AWAY_LATE_S):
                 return answered
@@ -376,7 +396,7 @@ class StatusPoll:
     def _look_at_current(self, link: RegisterLink, servo: int, now_s: float) -> None:
         index = self._by_id[servo].index
         register = self._telemetry.currents[index]
-        if register is None or not link.grants("current", read_bytes(1, register.size, False), alone=True):
+        if register is None or not link.grants("current", self._bytes(1, register.size), alone=True):
             return
         answer = link.read(servo, register.address, register.size)
         if answer is not None and len(answer.data) == register.size:
@@ -404,3 +424,31 @@ class StatusPoll:
 def _status_bits(member: Member) -> int:
     """Bits of a status packet's error byte that are about the servo; the others are about the request."""
     return sum(1 << bit for bit in member.table.status_faults)
+
+
+def blocks_per_tick(servos: int, spare_s: float, positions_s: float, blocks_s: Callable[[int], float]) -> int:
+    """Return how many servos' blocks fit in `spare_s` beside all positions; all where one read does for both.
+
+    Args:
+        positions_s: time of reading all positions.
+        blocks_s: returns the time of reading so many blocks.
+    """
+    if blocks_s(servos) <= spare_s:
+        return servos
+    return max((count for count in range(2, servos + 1) if positions_s + blocks_s(count) <= spare_s), default=1)
+
+
+class Rotation:
+    """Turns of servos, `count` at a time."""
+
+    def __init__(self) -> None:
+        self._next = 0
+
+    def take(self, servos: Sequence[int], count: int) -> list[int]:
+        """Return the next `count` of `servos`, in their own order; one that is missing from the list loses no turn."""
+        if count >= len(servos):
+            return list(servos)
+        start = self._next % len(servos)
+        self._next = start + count
+        chosen = {servos[(start + k) % len(servos)] for k in range(count)}
+        return [servo for servo in servos if servo in chosen]

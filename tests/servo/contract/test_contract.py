@@ -6,6 +6,7 @@ On emulated servos in virtual time; with `--port FAMILY=DEVICE` those that need 
 import itertools
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from emulated_port import EmulatedPort
 from families import FAMILIES, LIMIT_RAD
 from rig import emulated
 
+from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import BusError, ServoError
+from sfms_robot.servo.families import current_name
 
 STATISTICS = {"writes", "reads", "errors", "retries", "reconnects", "silent", "faults"}
 WIRE_FAULTS = ("drop=0.1", "corrupt=0.1", "truncate=0.1", "duplicate=0.3", "noise=0.3", "delay=0.03")
@@ -384,6 +387,37 @@ def test_bus_on_which_nobody_answers_any_more_has_failed(rig, trouble):
         rig.ticks(goals, 330, period_s=0.1)
     assert rig.now_s < 1000
     rig.bus.stop("release")
+
+
+GROUP_READS = {"dynamixel2": "sync_read", "dynamixel1-mx": "bulk_read", "sts": "sync_read"}
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("count", [1, 4])
+def test_bytes_on_the_wire_are_those_that_are_counted(rig, request, count):
+    framing, table = FRAMINGS[current_name(rig.family.bus)], rig.family.table
+    ids, name = rig.ids[:count], request.node.callspec.params["rig"]
+
+    def spent(ask):
+        before, mark = rig.chain.statistics()["bytes_out"], len(rig.sent)
+        ask()
+        return sum(map(len, rig.sent[mark:])) + rig.chain.statistics()["bytes_out"] - before
+
+    goals = rig.hold()
+    rig.ticks(goals, 3)
+    rig.clock.wait_until(rig.now_s + 0.1)
+    written = spent(lambda: rig.bus.write(goals + 0.01, rig.now_s))
+    if table.protocol is None:  # channels side by side, and those below 10, take less
+        assert 0.5 * framing.goals(4) <= written <= framing.goals(4)
+        return
+    assert written == framing.goals(4, table.role("goal_position").size)
+    link, where = rig.bus._link, table.role("present_position")
+    one_by_one = spent(lambda: [link.read(servo, where.address, where.size) for servo in ids])
+    assert one_by_one == framing.reads(count, where.size, "one by one")
+    for way, call in (("together", GROUP_READS.get(name)), ("fast", "fast_sync_read" if table.protocol == 2 else None)):
+        if call:
+            read = partial(getattr(link, call), where.address, where.size, ids)
+            assert spent(read) == framing.reads(count, where.size, way)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

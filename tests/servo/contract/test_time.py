@@ -91,6 +91,24 @@ def test_who_was_away_is_back_however_slow_the_wire_and_its_adapter(family, away
     assert all(reading.fault is None and reading.age_s < 0.5 for reading in readings.values())
 
 
+@pytest.mark.parametrize("family", CHAINS)
+def test_28_servos_that_return_cold_with_the_factory_return_delay_are_back_within_3_s(family):
+    rig = timed(family)
+    held = rig.hold()
+    rig.ticks(held, 20)
+    rig.kill(*rig.ids)
+    rig.ticks_for(0.5, held)
+    for servo in rig.port.device.servos:
+        volts = servo.supply_v
+        servo.set_supply(0.0, rig.clock.t)
+        servo.set_supply(volts, rig.clock.t)
+        rig.set(servo.id, "return_delay", 250)
+    rig.revive(*rig.ids)
+    rig.ticks_for(3.0, held)
+    assert rig.torques() == [1] * 28 and all(member.gets_goals for member in rig.bus.members)
+    assert {rig.register(i, "return_delay") for i in rig.ids} == {0}
+
+
 @pytest.mark.parametrize("held_s", [0.0, 0.016])
 @pytest.mark.parametrize("baud", [1_000_000, 57_600])
 @pytest.mark.parametrize("family", CHAINS)
