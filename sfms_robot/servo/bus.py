@@ -33,6 +33,7 @@ L = TypeVar("L", bound=Link)
 log = logging.getLogger(__name__)
 
 REOPEN_S: Final = 0.2
+TORQUE_UNCONFIRMED: Final = "torque_unconfirmed"
 RECONNECT_S: Final = BusConfig.model_fields["reconnect_s"].default
 
 
@@ -70,6 +71,7 @@ class WireBus(ABC, Generic[L]):
         self._reconnect_s = reconnect_s
         self._counts = {"writes": 0, "reads": 0, "errors": 0, "retries": 0, "reconnects": 0}
         self._link: L | None = None
+        self._powered: frozenset[int] = frozenset()  # places whose torque came on and is not confirmed off
         self._forget_silence()
 
     def _forget_silence(self) -> None:
@@ -132,6 +134,14 @@ class WireBus(ABC, Generic[L]):
             self._link.port.close()
         self._link = None
         self._forget_silence()
+
+    def _unconfirmed(self, off: bool) -> dict[str, list[str]]:
+        """Return the entry of the statistics that lists joints whose torque is not confirmed off.
+
+        `off`: torque off was sent. Joints that hold on purpose, and those whose torque never came on, are left out.
+        """
+        limp = [place for place in sorted(self._powered) if off and self._servos[place].safety.stop == "release"]
+        return {TORQUE_UNCONFIRMED: [self.joints[place] for place in limp]}
 
     def _connected(self) -> L:
         if self._link is None:

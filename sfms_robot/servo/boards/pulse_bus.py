@@ -133,7 +133,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         """Open and find the board. Pulses are left as they are. Raises PortError, or BusError when nobody answers."""
         wire = self._open()
         self._forget()
-        self._off, self._off_unsent = None, False
+        self._off, self._off_unsent, self._powered = None, False, frozenset()
         try:
             if not self._present(wire):
                 raise self._absent(wire)
@@ -196,6 +196,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _switch_on(self, wire: RateLimitedPort, index: int) -> float:
         """Pulses on for one joint; the angle it was sent to, rad. Raises BusError when `torque_off` comes meanwhile."""
         servo = self._servos[index]
+        self._powered |= {index}
         self._resting -= {servo.id}
         self._take_over(index)
         self._send(wire, {servo.id: int(self._ticks[index])})
@@ -293,7 +294,9 @@ class PulseBus(WireBus[RateLimitedPort]):
                 wire.wait(min(wire.busy_until_s, until_s))
                 if wire.port.now_s() >= until_s:
                     break
-                if self._is_off(wire):
+                off = set(self._off) - (on := self._still_on(wire))
+                self._powered = frozenset(i for i in self._powered if self._channels[i] not in off)
+                if not on:
                     return
                 self._send_off()
             except BusError as error:
@@ -301,10 +304,13 @@ class PulseBus(WireBus[RateLimitedPort]):
                 wire = self._open_again()
         log.warning("bus %r: the %s does not confirm that its pulses are off", self.name, self.model)
 
-    def _is_off(self, wire: RateLimitedPort) -> bool:
-        """Whether the board says so; of one that cannot say, whether it answers at all."""
-        pulses = self._protocol.read_pulses(wire.exchange, self._off or ())
-        return self._answers(wire, restarted=True) if pulses is None else not any(pulses.values())
+    def _still_on(self, wire: RateLimitedPort) -> set[int]:
+        """Return the channels whose pulses are not confirmed off: none when a board that cannot report them answers."""
+        channels = self._off or ()
+        pulses = self._protocol.read_pulses(wire.exchange, channels)
+        if pulses is None:
+            return set() if self._answers(wire, restarted=True) else set(channels)
+        return {channel for channel, ticks in pulses.items() if ticks}
 
     def close(self) -> None:
         """Give the port back. Idempotent."""
@@ -363,6 +369,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             **self._counts,
             "silent": sorted(self._channels) if self._silent else [],
             "faults": list(self._fault_log),
+            **self._unconfirmed(self._off is not None),
         }
 
     # --- goals --------------------------------------------------------------------------------------------------
