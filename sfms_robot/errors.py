@@ -6,6 +6,7 @@ RobotError                      base; `exit_code` is what the command line retur
 |   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
 +-- PortError            (3)    a port cannot be opened, or is held by somebody else
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
+|   +-- TorqueError      (4)    torque could not be confirmed off; names the joints
 +-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
 +-- PacketError          (4)    bytes that are no packet (codecs raise it, buses count it)
 +-- ModelError           (5)    weights or model files are missing, corrupt or of another shape
@@ -69,6 +70,16 @@ class BusError(RobotError):
     """A bus failed as a whole. One silent servo is never a BusError."""
 
     exit_code = 4
+
+
+class TorqueError(BusError):
+    """Torque that could not be confirmed off when a head came to rest. `joints` names them."""
+
+    def __init__(self, joints: Iterable[str]) -> None:
+        self.joints = list(joints)
+        super().__init__(
+            f"torque of {', '.join(self.joints)} could not be confirmed off: switch off the supply before you touch it"
+        )
 
 
 class ServoError(RobotError):

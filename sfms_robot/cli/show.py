@@ -44,6 +44,8 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
         ("bus", f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
                 f"silent: {bus['silent'] or 'none'}"),
     ]  # fmt: skip
+    if report["torque_unconfirmed"]:
+        rows.append(("torque", f"NOT confirmed off: {', '.join(report['torque_unconfirmed'])}"))
     for name, text in rows:
         table.add_row(name, text)
     console = screen()

@@ -33,7 +33,6 @@ L = TypeVar("L", bound=Link)
 log = logging.getLogger(__name__)
 
 REOPEN_S: Final = 0.2
-TORQUE_UNCONFIRMED: Final = "torque_unconfirmed"
 RECONNECT_S: Final = BusConfig.model_fields["reconnect_s"].default
 
 
@@ -136,12 +135,12 @@ class WireBus(ABC, Generic[L]):
         self._forget_silence()
 
     def _unconfirmed(self, off: bool) -> dict[str, list[str]]:
-        """Return the entry of the statistics that lists joints whose torque is not confirmed off.
+        """Return the entry of the statistics that lists the joints whose torque is not confirmed off.
 
         `off`: torque off was sent. Joints that hold on purpose, and those whose torque never came on, are left out.
         """
         limp = [place for place in sorted(self._powered) if off and self._servos[place].safety.stop == "release"]
-        return {TORQUE_UNCONFIRMED: [self.joints[place] for place in limp]}
+        return {"torque_unconfirmed": [self.joints[place] for place in limp]}
 
     def _connected(self) -> L:
         if self._link is None:

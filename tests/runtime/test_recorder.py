@@ -153,7 +153,7 @@ def test_a_value_that_cannot_be_written_is_trouble_told_once_and_not_a_crash(tmp
 
 def test_a_folder_that_cannot_be_made_is_a_configuration_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="--record .*file/run: cannot be written to"):
+    with pytest.raises(ConfigError, match="--record .*file/run: Not a directory"):
         Recorder(tmp_path / "file" / "run", JOINTS)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.config import Head, Joint, load_firmware_map
 from sfms_robot.emulator.launch import Chain
-from sfms_robot.errors import ServoError
+from sfms_robot.errors import ServoError, TorqueError
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.servo.families import family_named
 
@@ -59,8 +59,10 @@ class Probe:
         raise ServoError(f"{self.name} (id {self._joint.id}) does not say where it stands")
 
     def limp(self) -> None:
-        """Torque off, for a hand to move it."""
+        """Switch torque off, for a hand to move it. Raises TorqueError where that could not be confirmed."""
         self._bus.stop("release")
+        if unconfirmed := self._bus.statistics()["torque_unconfirmed"]:
+            raise TorqueError(unconfirmed)
         self._goal_rad = None
 
     def go(self, ticks: int) -> int:
@@ -90,8 +92,11 @@ class Probe:
 
 
 @contextmanager
-def probe(head: Head, name: str, where: Chain | str, clock: Clock) -> Iterator[Probe]:
-    """The joint's bus, open; limp again at the end. Raises RobotError for a servo that is not what the head says."""
+def probe(head: Head, name: str, where: Chain | str, clock: Clock, unconfirmed: list[str]) -> Iterator[Probe]:
+    """Open the joint's bus; limp again at the end, or named in `unconfirmed`.
+
+    Raises RobotError for a servo that is not what the head says.
+    """
     joint = head.joints[name]
     if joint.safety is not None or head.safety.stop != "release":
         joint = joint.model_copy(update={"safety": head.safety_of(name).model_copy(update={"stop": "release"})})
@@ -105,6 +110,7 @@ def probe(head: Head, name: str, where: Chain | str, clock: Clock) -> Iterator[P
         yield Probe(name, joint, bus, clock)
     finally:
         bus.stop("release")
+        unconfirmed += bus.statistics()["torque_unconfirmed"]
         bus.close()
 
 
