@@ -187,10 +187,9 @@ def _completed(words: Sequence[str]) -> list[str]:
 
 def _flagged(path: str, words: Sequence[str]) -> str:
     """Return the flag and its value where `path` is that value or lies in it, else `path`."""
-    for flag, value in pairwise(part for word in words for part in word.split("=", 1)):
-        if flag.startswith("--") and Path(value).parts and Path(path).is_relative_to(value):
-            return f"{flag} {value}"
-    return path
+    pairs = pairwise(part for word in words for part in word.split("=", 1))
+    flags = [(flag, value) for flag, value in pairs if flag.startswith("--") and Path(value).parts]
+    return next((f"{flag} {value}" for flag, value in flags if Path(path).is_relative_to(value)), path)
 
 
 def _said(code: int, problem: str) -> tuple[int, str]:

@@ -20,7 +20,7 @@ import math
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -171,12 +171,14 @@ class Recorder:
         """Open the next file and write its head. Raises ConfigError where it cannot be written."""
         self._parts += 1
         self._in_part = 0
-        with _naming(self._folder):
+        with _naming(self._folder), ExitStack() as stack:
             self._file = _open(self._folder, part_name(self._parts))
+            stack.callback(self._file.close)
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
             self._writer.start(profile="", library="sfms-robot")
             self._writer.add_metadata("run", self._about)
             self._file.flush()
+            stack.pop_all()
         self._channels = {}
         for topic, properties in _SCHEMAS.items():
             schema = json.dumps({"type": "object", "properties": properties}).encode()
