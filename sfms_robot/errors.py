@@ -73,12 +73,11 @@ class BusError(RobotError):
 
 
 class TorqueError(BusError):
-    """Torque that could not be confirmed off when a head came to rest. `joints` names them."""
+    """Torque of `joints` that could not be confirmed off at the end."""
 
     def __init__(self, joints: Iterable[str]) -> None:
-        self.joints = list(joints)
         super().__init__(
-            f"torque of {', '.join(self.joints)} could not be confirmed off: switch off the supply before you touch it"
+            f"torque of {', '.join(joints)} could not be confirmed off: switch off the supply before you touch it"
         )
 
 

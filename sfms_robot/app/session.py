@@ -148,7 +148,7 @@ def drive_head(
             if not isinstance(failure, RobotError):
                 logger.exception("the run ends by an error that nobody expected")
         elapsed_s = time.monotonic() - began_s if real else None
-        log.torque_unconfirmed = tuple(opened.bus.statistics()["torque_unconfirmed"])
+        log.torque_unconfirmed = opened.bus.statistics()["torque_unconfirmed"]
         if log.torque_unconfirmed and error is None:
             outcome, error = "failed", TorqueError(log.torque_unconfirmed)
         log.ended(opened.clock.now_s(), error)

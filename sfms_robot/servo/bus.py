@@ -139,8 +139,8 @@ class WireBus(ABC, Generic[L]):
 
         `off`: torque off was sent. Joints that hold on purpose, and those whose torque never came on, are left out.
         """
-        limp = [place for place in sorted(self._powered) if off and self._servos[place].safety.stop == "release"]
-        return {"torque_unconfirmed": [self.joints[place] for place in limp]}
+        powered = [self._servos[place] for place in sorted(self._powered)] if off else []
+        return {"torque_unconfirmed": [servo.joint for servo in powered if servo.safety.stop == "release"]}
 
     def _connected(self) -> L:
         if self._link is None:

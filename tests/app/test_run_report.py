@@ -141,7 +141,7 @@ def drive(how=0, fault=None, bus=lambda bus: bus):
 def test_torque_that_is_not_confirmed_off_overrides_success_and_interruption_and_no_error(how, code, fault):
     drove, torques = drive(how, fault)
     named = {None: [], "silent": ["pan", "tilt"], "silent:2": ["tilt"]}[fault]
-    assert list(drove.log.torque_unconfirmed) == named
+    assert drove.log.torque_unconfirmed == named
     assert torques == [joint in named for joint in ("pan", "tilt")]
     own = code in (0, 130)
     assert drove.exit_code == (4 if named and own else code)

@@ -115,7 +115,7 @@ def pose_head(options: PoseOptions) -> dict[str, Any]:
         "exit": drove.outcome,
         "exit_code": drove.exit_code,
         "error": None if drove.error is None else str(drove.error),
-        "torque_unconfirmed": list(drove.log.torque_unconfirmed),
+        "torque_unconfirmed": drove.log.torque_unconfirmed,
         "joints": furthest.moved(),
         "blind": [name for name in shown if name in motion.retargeter.blind_channels],
     }

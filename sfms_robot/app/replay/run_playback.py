@@ -99,7 +99,7 @@ def play_back(folder: Path, options: PlaybackOptions, panel: Panel | None = None
         "exit": drove.outcome,
         "exit_code": drove.exit_code,
         "error": None if drove.error is None else str(drove.error),
-        "torque_unconfirmed": list(log.torque_unconfirmed),
+        "torque_unconfirmed": log.torque_unconfirmed,
         "ticks": log.ticks,
         "limits": {"violations": log.audited.violations if log.audited else 0},
         "motion": log.motion_report(),

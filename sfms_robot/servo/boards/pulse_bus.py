@@ -294,8 +294,8 @@ class PulseBus(WireBus[RateLimitedPort]):
                 wire.wait(min(wire.busy_until_s, until_s))
                 if wire.port.now_s() >= until_s:
                     break
-                off = set(self._off) - (on := self._still_on(wire))
-                self._powered = frozenset(i for i in self._powered if self._channels[i] not in off)
+                on = self._still_on(wire)
+                self._powered = frozenset(i for i in self._powered if self._channels[i] in on)
                 if not on:
                     return
                 self._send_off()

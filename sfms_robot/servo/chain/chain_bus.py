@@ -331,7 +331,7 @@ class ChainBus(WireBus[L], Generic[L]):
             self._say_off(link, field, rest)
         for index in sorted(rest):
             log.warning("%s (id %d) does not confirm that its %s is off", *self._name(index), field.name)
-        return frozenset(indices) - frozenset(rest)
+        return frozenset(indices).difference(rest)
 
     def _name(self, index: int) -> tuple[str, int]:
         return self._servos[index].joint, self._servos[index].id
