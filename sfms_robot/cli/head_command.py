@@ -126,6 +126,7 @@ def calibrate(
 
     outcome = lead_through(name, port, Terminal(), joint, again)
     if json:
+        print()  # ends the line of the last question
         print_json(outcome.as_dict())
     else:
         print_calibration(outcome)

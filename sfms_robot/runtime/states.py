@@ -7,7 +7,7 @@
     degraded        it goes on without something: `why` says what
     halted          emergency stop, latched: `why` says who asked; ends when a person releases it
     stopping        it comes to rest
-    stopped, fault  torque is off: as asked, or by an error that `why` names
+    stopped, fault  torque is off: as asked, or by an error that `why` names, or could not be confirmed off
 
 One state after the other is a value (`RunState`); what there is to know about an instant is another (`Situation`).
 The table of every arrow, its cause and its longest time is in docs/safety.md; `ARROWS` is the same table, and no other
