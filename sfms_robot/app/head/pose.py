@@ -114,7 +114,7 @@ def pose_head(options: PoseOptions) -> dict[str, Any]:
         "port": options.port,
         "exit": drove.outcome,
         "exit_code": drove.exit_code,
-        "error": None if drove.error is None else str(drove.error),
+        "error": drove.error and str(drove.error),
         "torque_unconfirmed": drove.log.torque_unconfirmed,
         "joints": furthest.moved(),
         "blind": [name for name in shown if name in motion.retargeter.blind_channels],
