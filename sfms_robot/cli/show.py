@@ -45,7 +45,7 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
                 f"silent: {bus['silent'] or 'none'}"),
     ]  # fmt: skip
     if report["torque_unconfirmed"]:
-        rows.append(("torque", f"NOT confirmed off: {', '.join(report['torque_unconfirmed'])}"))
+        rows += [("torque", f"NOT confirmed off: {', '.join(report['torque_unconfirmed'])}")]
     for name, text in rows:
         table.add_row(name, text)
     console = screen()

@@ -48,7 +48,6 @@ _STATUS_EVERY_S: Final = 1.0
 _SILENT_AFTER: Final = 3  # requests without an answer
 _LEAST_PATIENCE_S: Final = 0.02  # an SSC-32 thinks for up to 5 ms, an adapter holds its bytes for up to 16
 _TRIES: Final = 3
-_STOP_TRIES: Final = 12  # each costs a mute board's patience
 _STOP_S: Final = 0.4  # the longest that `stop` waits for the board to say that its pulses are off
 _LEAST_RECONNECT_S: Final = 5.0  # a board that is asked once a second has to have a few chances
 _NO_ANSWER: Final = "no answer"
@@ -288,7 +287,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             return
         wire = self._link or self._open_again()
         until_s = wire.port.now_s() + min(_STOP_S, within_s) if wire is not None else 0.0
-        for _ in range(_STOP_TRIES):
+        for _ in range(4 * _TRIES):  # each costs a mute board's patience
             if wire is None:
                 break
             try:
