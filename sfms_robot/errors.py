@@ -6,6 +6,7 @@ RobotError                      base; `exit_code` is what the command line retur
 |   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
 +-- PortError            (3)    a port cannot be opened, or another program holds it
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
+|   +-- TorqueError      (4)    torque could not be confirmed off; names the joints
 +-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
 +-- PacketError          (4)    bytes that are not a packet (codecs raise it, buses count it)
 +-- ModelError           (5)    weights or model files are missing, corrupt or of another shape
@@ -70,6 +71,16 @@ class BusError(RobotError):
     """A bus failed as a whole. One silent servo is never a BusError."""
 
     exit_code = 4
+
+
+class TorqueError(BusError):
+    """Torque of `joints` that could not be confirmed off at the end."""
+
+    def __init__(self, joints: Iterable[str]) -> None:
+        super().__init__(
+            f"torque of {', '.join(joints)} could not be confirmed off: run sfms-robot servo release, or switch off the "
+            "supply, before you touch it"
+        )
 
 
 class ServoError(RobotError):

@@ -256,14 +256,17 @@ class Bus(Protocol):
         """Torque off on all buses first, then confirmed and repeated, as far as servos answer; joints whose safety or
         `policy` says hold keep theirs. Goals are refused from now on.
 
-        Never raises; takes `within_s` at most, whatever is dead; idempotent.
+        Never raises; takes `within_s` at most, whatever is dead; idempotent. Joints whose torque came on and could
+        not be confirmed off are listed in `statistics` from then on.
         """
 
     def close(self) -> None:
         """Give the ports back. Idempotent."""
 
     def statistics(self) -> Mapping[str, Any]:
-        """Counters for the report: writes, reads, errors, retries, reconnects, silent ids, faults."""
+        """Return counters for the report: writes, reads, errors, retries, reconnects, silent ids, faults; and
+        `torque_unconfirmed`, joints whose torque came on and was not confirmed off by the last `torque_off` or `stop`.
+        """
 
 
 class Observer(Protocol):

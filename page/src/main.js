@@ -24,6 +24,7 @@ class Page {
     this.panels = null;
     this.replay = null;
     this.faults = '';
+    this.unconfirmed = {}; // torque that the end of the run could not confirm off: a fault of each joint
     this.status = {};
     this.newest = null;
     this.shownEvent = null;
@@ -88,7 +89,7 @@ class Page {
     on('event', (event) => { this.timeline.event(event); if (!this.replay) this.shownEvent = event; });
     on('status', ({ status }) => this.#status(status));
     on('controls', (controls) => { this.panels?.held(controls); if (controls.held === 'other') this.panels?.release(); });
-    on('over', () => this.#over());
+    on('over', ({ report }) => this.#over(report.torque_unconfirmed ?? []));
     on('error', ({ error }) => this.notice(error, 6000));
     connection.addEventListener('closed', () => this.#state('no connection', 'trying again'));
   }
@@ -97,6 +98,7 @@ class Page {
     if (hello.version !== VERSION) { this.#wrongVersion(hello.version); return; }
     const same = this.hello?.urdf === hello.urdf && this.hello?.head === hello.head;
     this.hello = hello;
+    this.unconfirmed = {};
     this.notice('');
     this.panels?.release();
     find('halt').hidden = hello.replay;
@@ -109,7 +111,7 @@ class Page {
       find('joint').value = this.timeline.joint = hello.joints.findIndex((joint) => joint.name === name);
     });
     if (!same || !this.stage?.robot) this.#drawRobot(hello);
-    if (hello.over) this.#over();
+    if (hello.over) this.#over(hello.torque_unconfirmed);
   }
 
   #wrongVersion(version) {
@@ -130,8 +132,9 @@ class Page {
   #picture(frame) {
     this.stage?.show(frame.m, frame.u);
     if (frame.s) this.#state(frame.s, (frame.w ?? []).join(', '));
-    const told = JSON.stringify(frame.f ?? {});
-    if (told !== this.faults && this.stage) this.#showFaults(frame.f ?? {}, told);
+    const faults = { ...frame.f, ...this.unconfirmed };
+    const told = JSON.stringify(faults);
+    if (told !== this.faults && this.stage) this.#showFaults(faults, told);
   }
 
   async #showFaults(faults, told) {
@@ -160,8 +163,11 @@ class Page {
     find('latency').textContent = [wire ? `to the wire ${wire < 1000 ? `${wire.toFixed(0)} ms` : `${(wire / 1000).toFixed(1)} s`}` : '', trip ? `page ${trip.toFixed(0)} ms` : ''].filter(Boolean).join(' · ');
   }
 
-  #over() {
-    this.#state('over', 'the run has ended');
+  #over(unconfirmed) {
+    const names = unconfirmed.join(', ');
+    this.unconfirmed = Object.fromEntries(unconfirmed.map((name) => [name, 'not confirmed off']));
+    if (names) this.notice(`Torque is NOT confirmed off: ${names}. Switch off the supply before you touch the head.`);
+    this.#state(names ? 'fault' : 'over', names ? `torque is not confirmed off: ${names}` : 'the run has ended');
     this.#startReplay().catch((error) => this.notice(error.message, 6000));
   }
 

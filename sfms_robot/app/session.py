@@ -29,7 +29,7 @@ from sfms_robot.app.listen.status_server import StatusServer
 from sfms_robot.app.open_head import HeadOptions, OpenHead, open_head, prepare_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head
-from sfms_robot.errors import ConfigError, RobotError
+from sfms_robot.errors import ConfigError, RobotError, TorqueError
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.open_feed import NamedFeed, open_feed
@@ -115,10 +115,11 @@ def run_log(opened: OpenHead) -> RunLog:
 def drive_head(
     opened: OpenHead, programme: Programme, interrupt: Interrupt, *, signals: bool = True, log: RunLog | None = None
 ) -> Drove:
-    """Torque on, the loop, rest, torque off. Blocks until then.
+    """Switch torque on, run the loop, come to rest, switch torque off. Blocks until then.
 
-    An exception on the way is kept, not raised: the head is at rest and the report is still to be made. `signals`:
-    Ctrl-C and the like ask `interrupt`; main thread only. `log`: is filled; for who reads it meanwhile.
+    An exception on the way is kept, not raised: the head is at rest and the report is still to be made. A drive that
+    would end as done or interrupted ends as failed, by TorqueError, where torque could not be confirmed off.
+    `signals`: Ctrl-C and the like ask `interrupt`; main thread only. `log`: is filled; for readers meanwhile.
     """
     motion = opened.motion
     parts = Parts(
@@ -141,11 +142,15 @@ def drive_head(
             )
         except KeyboardInterrupt:
             outcome = "interrupted"
+            opened.bus.stop("release")  # a second Ctrl-C may have cut the first one short
         except Exception as failure:
             error = failure
             if not isinstance(failure, RobotError):
                 logger.exception("the run ends by an error that nobody expected")
         elapsed_s = time.monotonic() - began_s if real else None
+        log.torque_unconfirmed = opened.bus.statistics()["torque_unconfirmed"]
+        if log.torque_unconfirmed and error is None:
+            outcome, error = "failed", TorqueError(log.torque_unconfirmed)
         log.ended(opened.clock.now_s(), error)
     return Drove(outcome, log, elapsed_s, priority, error)
 
@@ -277,6 +282,7 @@ def run(
             observers=[status, *watchers, *observers, *tellers, *([] if recorder is None else [recorder])],
         )  # fmt: skip
         drove = drive_head(opened, programme, interrupt, signals=False, log=log)
+        status.ended(log.states[-1][1])
         report = _report(options, opened, drove, feed, person) | {"limitation": limited, **more()}
         if recorder is not None:
             recorder.close()

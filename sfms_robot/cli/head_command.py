@@ -10,7 +10,7 @@ import typer
 
 from sfms_robot.cli.head_fit import fit
 from sfms_robot.cli.json_line import print_json
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, TorqueError
 
 INTERRUPTED = 130
 PACKAGES = typer.Option(
@@ -125,11 +125,16 @@ def calibrate(
 
     outcome = lead_through(name, port, Terminal(), joint, again)
     if json:
+        print()  # ends the line of the last question
         print_json(outcome.as_dict())
     else:
         print_calibration(outcome)
+    if outcome.torque_unconfirmed:
+        print(f"sfms-robot: {TorqueError(outcome.torque_unconfirmed)}", file=sys.stderr)
     if outcome.problems:
         raise typer.Exit(ConfigError.exit_code)
+    if outcome.torque_unconfirmed:
+        raise typer.Exit(TorqueError.exit_code)
     if outcome.exit == "interrupted":
         raise typer.Exit(INTERRUPTED)
 
@@ -153,8 +158,9 @@ def pose(
         print_json(told)
     else:
         print_pose(told)
-    if told["exit"] == "interrupted":
-        raise typer.Exit(INTERRUPTED)
+    if told["error"]:
+        print(f"sfms-robot: {told['error']}", file=sys.stderr)
+    raise typer.Exit(told["exit_code"])
 
 
 @app.command("solve")

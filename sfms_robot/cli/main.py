@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import signal
@@ -9,6 +10,8 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import pairwise
+from pathlib import Path
 
 import typer
 
@@ -95,11 +98,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code, problem = _outcome(verbose + _completed([word for word in words if word not in verbose]))
         if arguments is None:
             _ignore_interrupts()
-    if problem is not None and "--json" in words:
-        ended = "interrupted" if code == INTERRUPTED else "failed"
-        told = {"version": 1, "exit": ended, "error": problem, "exit_code": code}
-        with suppress(OSError):
-            print_json(told)
+    try:
+        if problem is not None and "--json" in words:
+            ended = "interrupted" if code == INTERRUPTED else "failed"
+            print_json({"version": 1, "exit": ended, "error": problem, "exit_code": code})
+        sys.stdout.flush()
+    except OSError:  # a pipe or disk that takes no more would fail again when the process ends
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 
 
@@ -149,15 +155,16 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
         return _said(UNEXPECTED, "there is nobody to answer (stdin ended)")
     except RobotError as error:
         return _said(error.exit_code, str(error))
-    except BrokenPipeError:
-        _silence_stdout()
-        return UNEXPECTED, None
-    except OSError as error:  # a file that somebody named, or a full disk behind stdout
-        _silence_stdout()
+    except BrokenPipeError as error:
+        return UNEXPECTED, str(error)
+    except OSError as error:  # a file that a flag names, or a full disk behind stdout
         logging.getLogger(__name__).info("what led to it", exc_info=True)
         problem = error.strerror or str(error)
-        named = error.filename is not None
-        return _said(ConfigError.exit_code, f"{error.filename}: {problem}") if named else _said(UNEXPECTED, problem)
+        if error.errno == errno.EMFILE:
+            return _said(UNEXPECTED, f"{problem}: raise the limit of the shell (ulimit -n)")
+        if error.filename is None:
+            return _said(UNEXPECTED, problem)
+        return _said(ConfigError.exit_code, f"{_flagged(str(error.filename), words)}: {problem}")
     except Exception as error:
         usage = getattr(error, "show", None)  # of a flag or argument that is none
         if usage is None:
@@ -178,12 +185,14 @@ def _completed(words: Sequence[str]) -> list[str]:
     return completed
 
 
+def _flagged(path: str, words: Sequence[str]) -> str:
+    """Return the flag and its value where `path` is that value or lies in it, else `path`."""
+    pairs = pairwise(part for word in words for part in word.split("=", 1))
+    flags = [(flag, value) for flag, value in pairs if flag.startswith("--") and Path(value).parts]
+    return next((f"{flag} {value}" for flag, value in flags if Path(path).is_relative_to(value)), path)
+
+
 def _said(code: int, problem: str) -> tuple[int, str]:
-    print(f"{NAME}: {problem}", file=sys.stderr)
+    with suppress(OSError):
+        print(f"{NAME}: {problem}", file=sys.stderr)
     return code, problem
-
-
-def _silence_stdout() -> None:
-    """What is still to be written to a pipe or disk that takes no more would fail again when the process ends."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -46,6 +46,8 @@ def print_run(report: Mapping[str, Any], record: Path | None) -> None:
     ]  # fmt: skip
     if "recording" in report:
         rows.append(("recording", f"{report['recording']['bytes'] * 1e-6:.1f} MB"))
+    if report["torque_unconfirmed"]:
+        rows += [("torque", f"NOT confirmed off: {', '.join(report['torque_unconfirmed'])}")]
     for name, text in rows:
         table.add_row(name, text)
     console = screen()

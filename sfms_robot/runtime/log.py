@@ -124,6 +124,7 @@ class RunLog:
     travel_rad: Doubles | None = None
     audited: Any = None
     state: Any = None  # of the loop at its end: timeline and limiter tell what they counted
+    torque_unconfirmed: list[str] = field(default_factory=list)  # joints that came on and are not confirmed off
     detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
     states: deque[tuple[float, RunState]] = field(default_factory=lambda: deque(maxlen=STATES))
     state_s: dict[str, float] = field(default_factory=dict)

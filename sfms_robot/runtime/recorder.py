@@ -19,8 +19,8 @@ import logging
 import math
 import queue
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -173,13 +173,17 @@ class Recorder:
             self._dropped += 1
 
     def _begin(self) -> None:
-        """Open the next file. Raises ConfigError where it cannot be written."""
+        """Open the next file and write its head. Raises ConfigError where it cannot be written."""
         self._parts += 1
         self._in_part = 0
-        self._file = _open(self._folder, part_name(self._parts))
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
-        self._writer.start(profile="", library="sfms-robot")
-        self._writer.add_metadata("run", self._about)
+        with _naming(self._folder), ExitStack() as stack:
+            self._file = _open(self._folder, part_name(self._parts))
+            stack.callback(self._file.close)
+            self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
+            self._writer.start(profile="", library="sfms-robot")
+            self._writer.add_metadata("run", self._about)
+            self._file.flush()
+            stack.pop_all()
         self._channels = {}
         for topic, properties in _SCHEMAS.items():
             schema = json.dumps({"type": "object", "properties": properties}).encode()
@@ -199,11 +203,13 @@ class Recorder:
             self._attempt(lambda: self._write(self._news(math.inf)))
 
     def _attempt(self, action: Callable[[], Any]) -> None:
-        """Whatever goes wrong with the file ends the recording, not the run, and is told in the report."""
+        """Do it; any failure of the file ends the recording, not the run, and is in the report."""
         try:
-            action()
+            with _naming(self._folder):
+                action()
         except Exception as error:
-            self._trouble = self._trouble or f"{type(error).__name__}: {error}"
+            kind = "" if isinstance(error, ConfigError) else f"{type(error).__name__}: "
+            self._trouble = self._trouble or f"{kind}{error}"
             _log.error("the recording ends here: %s", self._trouble)
 
     def _take(self, value: Tick | SpeakerFrame | Plan) -> None:
@@ -248,8 +254,10 @@ class Recorder:
 
 
 def check_folder(folder: Path, overwrite: bool = False) -> None:
-    """Whether a run may be recorded there. Raises ConfigError where one is already, unless it may be overwritten."""
-    if (folder / RUN_FILE).exists() and not overwrite:
+    """Raise ConfigError where a run cannot be recorded, or one is already that may not be overwritten."""
+    with _naming(folder):
+        there = (folder / RUN_FILE).exists()
+    if there and not overwrite:
         raise ConfigError(f"{folder}: holds a recording already (another folder, or --overwrite)")
 
 
@@ -277,15 +285,21 @@ def parts_of(folder: Path) -> list[Path]:
     return [first, *sorted(folder.glob("run-[0-9][0-9][0-9][0-9].mcap"))] if first.is_file() else []
 
 
-def _open(folder: Path, name: str) -> BinaryIO:
+@contextmanager
+def _naming(folder: Path) -> Iterator[None]:
+    """Raise an OSError of the block as a ConfigError that names the flag: `--record DIR: No space left on device`."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if name == RUN_FILE:
-            for old in parts_of(folder):  # of a recording that may be replaced, see `check_folder`
-                old.unlink()
-        return (folder / name).open("wb")
+        yield
     except OSError as error:
-        raise ConfigError(f"--record {folder}: cannot be written to: {error.strerror or error}") from error
+        raise ConfigError(f"--record {folder}: {error.strerror or error}") from error
+
+
+def _open(folder: Path, name: str) -> BinaryIO:
+    folder.mkdir(parents=True, exist_ok=True)
+    if name == RUN_FILE:
+        for old in parts_of(folder):  # of a recording that may be replaced, see `check_folder`
+            old.unlink()
+    return (folder / name).open("wb")
 
 
 def _now_utc() -> str:

@@ -7,7 +7,7 @@
     degraded        it continues without something: `why` names it
     halted          emergency stop, latched: `why` names every cause; ends when none is left
     stopping        it comes to rest
-    stopped, fault  torque is off: as asked, or by an error that `why` names
+    stopped, fault  torque is off: as asked, or by an error that `why` names, or could not be confirmed off
 
 One state after the other is a value (`RunState`); the facts of an instant are another (`Situation`).
 The table of every arrow, its cause and its longest time is in docs/safety.md; `ARROWS` is the same table, and no other

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from sfms_robot.frames import Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
+from sfms_robot.runtime.states import RunState
 from sfms_robot.signals.audio import energy_db
 
 _DIGITS: Final = 4
@@ -42,6 +43,7 @@ class RunStatus:
         self._facts = dict(facts)
         self._figures = figures
         self._tick: Tick | None = None
+        self._ended: dict[str, Any] = {}
         self._frame: SpeakerFrame | None = None
         self._planned_s: float | None = None
 
@@ -54,16 +56,28 @@ class RunStatus:
     def planned(self, plan: Plan) -> None:
         self._planned_s = plan.made_at_s
 
+    def ended(self, state: RunState) -> None:
+        """Show the last state of the run from now on: torque is off, or could not be confirmed off."""
+        self._ended = {"state": state.name, "why": list(state.why)}
+
     def close(self) -> None:
         """Nothing is open."""
 
     def document(self) -> dict[str, Any]:
         """What `--status` serves. From any thread; JSON has no inf and no NaN: null."""
         seen, frame = self._tick, self._frame
-        document: dict[str, Any] = {"version": 1, **self._facts, "state": "starting", "why": [], "time_s": 0.0}
+        document: dict[str, Any] = {
+            "version": 1,
+            **self._facts,
+            "state": "starting",
+            "why": [],
+            "torque_unconfirmed": [],
+            "time_s": 0.0,
+        }
         if seen is not None:
             document |= {"state": seen.state, "why": list(seen.why), "time_s": _number(seen.time_s)}
             document |= _servos(seen, self._joints)
+        document |= self._ended
         document["note"] = _note(document["state"], document["why"])
         document["person"] = _person(frame)
         document["planned_s"] = self._planned_s

@@ -70,6 +70,7 @@ class WireBus(ABC, Generic[L]):
         self._reconnect_s = reconnect_s
         self._counts = {"writes": 0, "reads": 0, "errors": 0, "retries": 0, "reconnects": 0}
         self._link: L | None = None
+        self._powered: frozenset[int] = frozenset()  # places whose torque came on and is not confirmed off
         self._forget_silence()
 
     def _forget_silence(self) -> None:
@@ -132,6 +133,14 @@ class WireBus(ABC, Generic[L]):
             self._link.port.close()
         self._link = None
         self._forget_silence()
+
+    def _unconfirmed(self, off: bool) -> dict[str, list[str]]:
+        """Return the entry of the statistics that lists the joints whose torque is not confirmed off.
+
+        `off`: torque off was sent. Joints that hold on purpose, and those whose torque never came on, are left out.
+        """
+        powered = [self._servos[place] for place in sorted(self._powered)] if off else []
+        return {"torque_unconfirmed": [servo.joint for servo in powered if servo.safety.stop == "release"]}
 
     def _connected(self) -> L:
         if self._link is None:

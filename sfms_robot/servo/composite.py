@@ -50,6 +50,7 @@ class CompositeBus:
         self._buses = dict(buses)
         self._rates_hz = rates_hz
         self._writers: dict[str, Writer] = {}
+        self._stops: list[threading.Thread] = []
         self._failures: dict[str, Exception] = {}  # by bus; said once
         self._unsaid: list[str] = []
         self._last: dict[str, Mapping[str, Reading]] = {}
@@ -145,12 +146,14 @@ class CompositeBus:
             writer.end()
         self.torque_off(policy)
         free = {name: self._buses[name] for name in self._buses if self._ended(name, began_s + _TICK_S)}
+        for thread in self._stops:  # of a call that an interrupt cut short: a bus has one user at a time
+            thread.join(max(0.0, began_s + within_s - time.monotonic()))
         if self._rates_hz is None or not self._writers:
             for bus in free.values():
                 bus.stop(policy, (within_s - _TICK_S) / len(free))
             return
-        threads = [_begin(bus.stop, policy) for bus in free.values()]
-        for name, thread in zip(free, threads, strict=True):
+        self._stops = [_begin(bus.stop, policy) for bus in free.values()]
+        for name, thread in zip(free, self._stops, strict=True):
             thread.join(max(0.0, began_s + within_s - time.monotonic()))
             if thread.is_alive():
                 log.warning("bus %r: does not confirm in time that its torque is off", name)
@@ -174,9 +177,9 @@ class CompositeBus:
             bus.close()
 
     def statistics(self) -> Mapping[str, Any]:
-        """Totals, and each bus's own under `buses`."""
+        """Return totals, and each bus's own under `buses`."""
         each = {name: dict(bus.statistics()) for name, bus in self._buses.items()}
-        total: dict[str, Any] = {}
+        total: dict[str, Any] = {"torque_unconfirmed": []}
         for counts in each.values():
             for key, value in counts.items():
                 total[key] = total[key] + value if key in total else value

@@ -97,7 +97,7 @@ class PageServer:
         self._human: asyncio.Task[bytes] | None = None
         self._record: Mapping[str, Any] | None = None
         self._recording: Path | None = None
-        self._over: bytes | None = None
+        self._over: Mapping[str, Any] | None = None  # the report
         self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # packed pictures, and messages
         self._files = CompressedFiles(STATIC)
         routes = [
@@ -152,9 +152,9 @@ class PageServer:
             visitor.tell(message)
 
     def end(self, report: Mapping[str, Any]) -> None:
-        """The run is over."""
-        self._over = told_json(type="over", report=report)
-        self.tell(self._over)
+        """Send visitors the report of the run, which is over."""
+        self._over = report
+        self.tell(told_json(type="over", report=report))
 
     def answer(self, number: int, message: bytes) -> None:
         """To one visitor, where it is still there."""
@@ -291,6 +291,7 @@ class PageServer:
         return told_json(
             type="hello", **self._hello, controls=self._visitors.controls(visitor), needs_token=not visitor.allowed,
             over=self._over is not None, record=self._record,
+            torque_unconfirmed=(self._over or {}).get("torque_unconfirmed", []),
         )  # fmt: skip
 
 

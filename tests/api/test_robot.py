@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import sfms_robot as sr
+from sfms_robot.app.wiring import emulated
+from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM
 
 pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
@@ -272,3 +274,22 @@ def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
     assert [change["state"] for change in robot.report()["states"]["changes"]] == [
         "starting", "halted", "starting", "stopping", "stopped",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("opens", [sr.Robot, sr.open_bus])
+def test_torque_that_is_not_confirmed_off_is_raised_by_the_end_and_in_the_report(opens, tmp_path):
+    servos = emulated(sr.load_head(HEAD))["main"]
+    device = str(tmp_path / "servos")
+    with launch(servos, link=device) as chain:
+        with (
+            pytest.raises(sr.BusError, match="torque of .* could not be confirmed off"),
+            opens(HEAD, port=device) as robot,
+        ):
+            if opens is sr.open_bus:
+                robot.enable()
+            chain.kill(servos[0].id)
+        report = robot.report()
+        unconfirmed = [joint for joint, each in sr.load_head(HEAD).joints.items() if each.id == servos[0].id]
+        assert (report["exit"], report["exit_code"], report["torque_unconfirmed"]) == ("failed", 4, unconfirmed)
+        assert opens is sr.open_bus or robot.state == "fault"
+        assert [servo.id for servo in servos if chain.state(servo.id)["torque"]] == [servos[0].id]

@@ -186,6 +186,33 @@ def test_a_servo_that_falls_silent_on_the_way_is_left_out(name):
     assert not overlay_file("two").exists()
 
 
+@pytest.mark.parametrize(("answer", "measured"), [("n", ["jaw"]), ("q", []), (KeyboardInterrupt, [])])
+def test_a_joint_whose_torque_is_not_confirmed_off_at_its_end_is_named(name, answer, measured):
+    with head_on_emulated_servos(name) as chain:
+
+        def cable_out() -> str:
+            chain.kill(1)
+            return Person(answer).ask("")
+
+        outcome = led(name, chain, Person("k", "5", "", "20", "", cable_out), joints=["jaw"])
+        assert chain.state(1)["torque"]
+    assert (outcome.measured, outcome.exit) == (measured, "done" if measured else "interrupted")
+    assert outcome.as_dict()["torque_unconfirmed"] == ["jaw"]
+
+
+def test_nobody_is_told_to_move_a_joint_by_hand_whose_torque_is_not_confirmed_off(name):
+    with head_on_emulated_servos(name) as chain:
+
+        def not_right() -> str:
+            chain.kill(1)
+            return "n"
+
+        answers: list[Answer] = ["", hand(chain, 1, 1990), hand(chain, 1, 2300), "", not_right]
+        outcome = led(name, chain, person := Person(*answers), joints=["jaw"])
+    assert person.heard.count("LOWER end") == 1
+    assert outcome.skipped["jaw"].startswith("torque of jaw could not be confirmed off")
+
+
 def test_a_silent_servo_is_left_out_and_the_others_are_done(name):
     with head_on_emulated_servos(name) as chain:
         chain.kill(1)

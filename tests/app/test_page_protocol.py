@@ -19,7 +19,13 @@ from sfms_robot.viewer.visitors import COMMAND_S, MOST_MALFORMED, OUTBOX, PERSON
 DOCS = Path(sfms_robot.__file__).parents[1] / "docs"
 PAGE = (DOCS / "protocol.md").read_text(encoding="utf-8").partition("## The page's WebSocket\n")[2]
 TOLD, ASKED = PAGE.partition("### What a page is told\n")[2].split("### What a page asks for\n")
-OF_VISITORS = {"controls", "needs_token", "over", "record"}  # of a hello: they differ between visitors, or change
+OF_VISITORS = {
+    "controls",
+    "needs_token",
+    "over",
+    "record",
+    "torque_unconfirmed",
+}  # of a hello: they differ between visitors, or change
 
 
 def rows(part: str) -> dict[str, set[str]]:

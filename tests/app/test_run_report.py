@@ -5,10 +5,16 @@ import resource
 import subprocess
 import sys
 from contextlib import contextmanager
+from dataclasses import replace
 
-from sfms_robot.app.session import RunOptions, run
-from sfms_robot.errors import ModelError
+import pytest
+
+from sfms_robot.app.head.pose import NobodyThere
+from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.session import Programme, RunOptions, drive_head, run
+from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 from sfms_robot.ports import Source
+from sfms_robot.runtime.safety import Interrupt, Released
 
 HEAD = "interbotix_wxxms"
 
@@ -32,7 +38,8 @@ def test_a_disk_that_is_full_costs_the_recording_and_neither_the_run_nor_its_rep
     )  # fmt: skip
     report = json.loads(out.splitlines()[-1])
     assert (code, report["exit"], report["frames"]) == (0, "done", 50)
-    assert "too large" in report["recording"]["trouble"] and "the recording ends here" in err
+    assert report["recording"]["trouble"] == f"--record {tmp_path / 'run'}: File too large"
+    assert "the recording ends here" in err
 
 
 def test_who_watches_a_run_sees_the_figures_of_its_report_as_they_grow():
@@ -50,6 +57,7 @@ def test_who_watches_a_run_sees_the_figures_of_its_report_as_they_grow():
     for key in ("head", "listener", "ticks", "frames", "tick", "latency_ms"):
         assert after[key] == report[key]
     assert set(after["motion"]) == set(report["motion"]) and after["duration_s"] == report["duration_s"]
+    assert (after["state"], after["torque_unconfirmed"], report["torque_unconfirmed"]) == ("stopped", [], [])
 
 
 class Broken(Source):
@@ -86,3 +94,80 @@ def test_a_recording_is_kept_unless_somebody_says_otherwise(tmp_path):
     code, _, err = command(*words)
     assert code == 2 and "holds a recording already" in err
     assert command(*words, "--overwrite")[0] == 0
+
+
+class Ending(NobodyThere):
+    """A person with whom a run ends after 0.2 s: by so many requests, by an error, or with the duration (0)."""
+
+    def __init__(self, how, interrupt):
+        self.how, self.interrupt = how, interrupt
+
+    def read(self, now_s):
+        if now_s > 0.2 and isinstance(self.how, Exception):
+            raise self.how
+        if now_s > 0.2 and not self.interrupt():
+            for _ in range(self.how):
+                self.interrupt.ask()
+        return ()
+
+
+def drive(how=0, fault=None, bus=lambda bus: bus):
+    """A drive of 0.4 s, and whether each servo has torque after it. `fault` begins when torque is on."""
+    interrupt = Interrupt()
+    with open_head(HeadOptions(HEAD, fast=True)) as opened:
+        chain = opened.opened["main"]
+        if fault is not None:
+            chain.inject(f"{fault}@{opened.clock.now_s() + 0.2}-1000")
+        programme = Programme(Ending(how, interrupt), NobodyThere(), 0.4)
+        drove = drive_head(replace(opened, bus=bus(opened.bus)), programme, interrupt, signals=False)
+        return drove, [chain.state(joint.id)["torque"] for joint in opened.config.joints.values()]
+
+
+@pytest.mark.parametrize("fault", [None, "silent", "silent:2"])
+@pytest.mark.parametrize(
+    ("how", "code"),
+    [
+        (0, 0),
+        (1, 130),
+        (2, 130),
+        (ZeroDivisionError("by zero"), 1),
+        (ConfigError("a flag"), 2),
+        (PortError("a port"), 3),
+        (BusError("a bus"), 4),
+        (ModelError("weights"), 5),
+    ],
+    ids=str,
+)
+def test_torque_that_is_not_confirmed_off_overrides_success_and_interruption_and_no_error(how, code, fault):
+    drove, torques = drive(how, fault)
+    named = {None: [], "silent": ["pan", "tilt"], "silent:2": ["tilt"]}[fault]
+    assert drove.log.torque_unconfirmed == named
+    assert torques == [joint in named for joint in ("pan", "tilt")]
+    own = code in (0, 130)
+    assert drove.exit_code == (4 if named and own else code)
+    assert drove.log.states[-1][1].name == ("fault" if named or not own else "stopped")
+    if named and own:
+        told = f"torque of {', '.join(named)} could not be confirmed off: switch off the supply before you touch it"
+        assert (drove.outcome, str(drove.error)) == ("failed", told)
+
+
+class CutShort:
+    """A bus whose first `stop` is cut short by a second Ctrl-C, before anything is sent."""
+
+    def __init__(self, bus):
+        self._bus, self.cut = bus, False
+
+    def __getattr__(self, name):
+        return getattr(self._bus, name)
+
+    def stop(self, policy):
+        if not self.cut:
+            self.cut = True
+            raise Released
+        self._bus.stop(policy)
+
+
+@pytest.mark.parametrize(("fault", "code"), [(None, 130), ("silent", 4)])
+def test_a_second_interrupt_in_the_middle_of_stop_does_not_skip_the_confirmation(fault, code):
+    drove, torques = drive(1, fault, CutShort)
+    assert (drove.exit_code, any(torques)) == (code, fault is not None)

@@ -10,8 +10,9 @@ from sfms_robot.app.servo.single_servo import field_named, read, read_registers
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
-from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
+from sfms_robot.errors import BusError, ConfigError, PortError, ServoError, TorqueError
 from sfms_robot.runtime.clock import VirtualClock
+from sfms_robot.servo.port import WrappedPort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import limit_names
 
@@ -171,6 +172,53 @@ def test_another_mode_is_refused_with_what_to_type():
     with wire_on(at("xl330-m288", registers={"operating_mode": 1})) as (wire, _):
         with pytest.raises(ServoError, match="sfms-robot servo write 1 operating_mode 3"):
             move(wire, wire.find(1), "2050", None)
+
+
+class Interrupted(Watched):
+    """Ctrl-C on the way; `more` then happens to the wire, once."""
+
+    def __init__(self, wire, chain, more):
+        super().__init__(wire, chain)
+        self.more = more
+
+    def wait_until(self, time_s):
+        super().wait_until(time_s)
+        if len(self.seen) == 5:
+            self.more(self.wire, self.chain)
+            raise KeyboardInterrupt
+
+
+class InterruptedPort(WrappedPort):
+    """A port on which the first write of each packet is cut short by another Ctrl-C, before anything is sent."""
+
+    def __init__(self, inner):
+        super().__init__(inner)
+        self.cut = set()
+
+    def write(self, data):
+        if bytes(data) not in self.cut:
+            self.cut.add(bytes(data))
+            raise KeyboardInterrupt
+        super().write(data)
+
+
+def again(wire, chain):
+    wire.link.port = InterruptedPort(wire.link.port)
+
+
+def cable_out(wire, chain):
+    chain.kill(1)
+
+
+@pytest.mark.parametrize(("more", "ends"), [(again, KeyboardInterrupt), (cable_out, TorqueError)])
+def test_after_an_interrupt_torque_is_off_or_named(more, ends):
+    with wire_on(at("ax-12a"), family="dynamixel1") as (wire, chain):
+        seen = wire.find(1)
+        wire.clock = Interrupted(wire, chain, more)
+        with pytest.raises(ends) as ended:
+            move(wire, seen, None, "200")
+        assert chain.state(1)["torque"] == (ends is TorqueError)
+    assert ends is KeyboardInterrupt or str(ended.value).startswith("torque of id 1 could not be confirmed off")
 
 
 # --- release ----------------------------------------------------------------------------------------------------

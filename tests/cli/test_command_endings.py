@@ -2,9 +2,11 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import typer
@@ -21,7 +23,7 @@ def command(capsys, monkeypatch):
     """A command line whose `listener list` raises what it is given; (code, stdout, stderr)."""
 
     def run(raised: BaseException | None, *words: str) -> tuple[object, str, str]:
-        def body(json: bool = typer.Option(False, "--json")) -> None:
+        def body(json: bool = typer.Option(False, "--json"), out: str = typer.Option("", "--out")) -> None:
             if raised is not None:
                 raise raised
 
@@ -119,6 +121,51 @@ def test_a_full_disk_behind_stdout_is_one_line():
     with open("/dev/full", "w") as full:
         done = subprocess.run([*START, "listener", "list"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1 and done.stderr.strip() == "sfms-robot: No space left on device"
+
+
+@pytest.mark.parametrize(
+    ("words", "path", "named"),
+    [
+        (["--out", "/d"], "/d/x.png", "--out /d"),
+        (["--out=/d/x.png"], "/d/x.png", "--out /d/x.png"),
+        (["--out", "/d"], "/e/x.png", "/e/x.png"),
+        (["--out", "."], "x.png", "x.png"),
+    ],
+)
+def test_a_file_that_fails_is_named_by_the_flag_that_led_to_it(command, words, path, named):
+    ended, out, err = command(PermissionError(13, "Permission denied", path), "breaks", "--json", *words)
+    assert (ended, json.loads(out)["error"]) == (2, f"{named}: Permission denied")
+    assert err == f"sfms-robot: {named}: Permission denied\n"
+
+
+def limited(*words, files):
+    """The command line with --json, in a process that may have so many files open; its exit code and last object."""
+    limit = partial(resource.setrlimit, resource.RLIMIT_NOFILE, (files, files))
+    done = subprocess.run([*START, *words, "--json"], capture_output=True, text=True, check=False, preexec_fn=limit)
+    assert "Traceback" not in done.stderr
+    return done.returncode, json.loads(done.stdout.splitlines()[-1])
+
+
+def test_too_few_descriptors_at_the_start_of_a_run_are_an_object():
+    code, told = limited("run", "--fast", "--head", "interbotix_wxxms", "--duration", "0.1", files=7)
+    why = "Too many open files: raise the limit of the shell (ulimit -n)"
+    assert (code, told) == (1, {"version": 1, "exit": "failed", "error": why, "exit_code": 1})
+
+
+def test_a_folder_that_cannot_hold_a_recording_is_an_object_that_names_the_flag(tmp_path):
+    folder = tmp_path / "file" / "run"
+    folder.parent.write_text("")
+    words = ("run", "--fast", "--head", "interbotix_wxxms", "--duration", "0.1", "--record", str(folder))
+    code, told = limited(*words, files=256)
+    assert (code, told["error"]) == (2, f"--record {folder}: Not a directory")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_a_full_disk_behind_stderr_costs_no_object():
+    with open("/dev/full", "w") as full:
+        words = [*START, "head", "check", "nobody", "--json"]
+        done = subprocess.run(words, stdout=subprocess.PIPE, stderr=full, text=True, check=False)
+    assert (done.returncode, json.loads(done.stdout)["exit_code"]) == (2, 2)
 
 
 def test_a_reader_that_has_gone_is_no_error_worth_a_word():

@@ -5,7 +5,10 @@ import json
 
 import pytest
 
+from sfms_robot.app.wiring import emulated
+from sfms_robot.config import load_head
 from sfms_robot.config.overlay import overlay_file
+from sfms_robot.emulator.launch import launch
 
 
 @pytest.fixture
@@ -32,6 +35,33 @@ def test_calibrate_leads_through_a_joint_and_says_what_it_wrote(run):
 def test_a_line_that_breaks_off_is_an_interruption(run):
     code, out, _ = run("head", "calibrate", "face28", "--port", "sim", "--joint", "jaw", typed="k\n5\n")
     assert code == 130 and "0 joints measured now" in out and "to be calibrated first: eye_pan_left" in out
+
+
+class Typist(io.StringIO):
+    """Lines that are typed; before the last one the cable of the servo comes off."""
+
+    def __init__(self, chain, lines):
+        super().__init__(lines)
+        self.chain, self.left = chain, lines.count("\n")
+
+    def readline(self, *size):
+        self.left -= 1
+        if self.left == 0:
+            self.chain.kill(1)
+        return super().readline(*size)
+
+
+@pytest.mark.parametrize("last", ["n", "q"])
+def test_calibrate_ends_with_4_when_torque_is_not_confirmed_off(command_line, monkeypatch, tmp_path, last):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    device = tmp_path / "servos"
+    with launch(emulated(load_head("interbotix_wxxms"))["main"], link=str(device)) as chain:
+        monkeypatch.setattr("sys.stdin", Typist(chain, f"k\n5\n\n5\n\n\n{last}\n"))
+        words = ("head", "calibrate", "interbotix_wxxms", "--port", device, "--joint", "pan", "--json")
+        ended = command_line(*words)
+        assert chain.state(1)["torque"]
+    assert (ended.code, ended.told["torque_unconfirmed"]) == (4, ["pan"])
+    assert ended.err.splitlines()[-1].startswith("sfms-robot: torque of pan could not be confirmed off")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 import base64
 import json
+import os
 import threading
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -12,7 +13,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
 from sfms_robot.runtime import recorder as recorder_module
-from sfms_robot.runtime.recorder import RUN_FILE, Recorder, check_folder, parts_of, write_report
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder, check_folder, part_name, parts_of, write_report
 
 JOINTS = ("neck_yaw", "jaw")
 
@@ -158,9 +159,30 @@ def test_a_value_that_cannot_be_written_is_trouble_told_once_and_not_a_crash(tmp
     assert "zip()" in recorder.statistics()["trouble"] and "the recording is not whole" in caplog.text
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_a_full_disk_is_named_with_its_flag_before_anything_moves_and_later_in_the_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "PART_MESSAGES", 10)
+    named = f"--record {tmp_path}: No space left on device"
+    (tmp_path / part_name(2)).symlink_to("/dev/full")
+    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    for n in range(20):
+        recorder.tick(tick(n / 100))
+    recorder.close()
+    assert recorder.statistics()["trouble"] == named
+    (tmp_path / RUN_FILE).unlink()
+    (tmp_path / RUN_FILE).symlink_to("/dev/full")
+    with pytest.raises(ConfigError, match=f"^{named}$"):
+        Recorder(tmp_path, JOINTS)
+
+
+def test_a_folder_that_cannot_be_looked_into_is_named_with_its_flag(tmp_path):
+    with pytest.raises(ConfigError, match="^--record .*xxx: File name too long$"):
+        check_folder(tmp_path / ("x" * 300))
+
+
 def test_a_folder_that_cannot_be_made_is_a_configuration_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="--record .*file/run: cannot be written to"):
+    with pytest.raises(ConfigError, match="--record .*file/run: Not a directory"):
         Recorder(tmp_path / "file" / "run", JOINTS)
 
 

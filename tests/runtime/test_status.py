@@ -7,6 +7,7 @@ import pytest
 
 from sfms_robot.frames import FaceFrame, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
+from sfms_robot.runtime.states import RunState
 from sfms_robot.runtime.status import RunStatus
 
 JOINTS = ("neck_yaw", "jaw")
@@ -71,3 +72,14 @@ def test_counters_are_asked_for_every_time() -> None:
     counts = iter(range(9))
     status = RunStatus(JOINTS, {}, lambda: {"ticks": next(counts)})
     assert [status.document()["ticks"] for _ in range(3)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("error", [None, "torque of jaw could not be confirmed off"])
+def test_after_the_end_it_shows_the_last_state_and_joints_whose_torque_is_not_confirmed_off(error) -> None:
+    status = RunStatus(JOINTS, {}, lambda: {"torque_unconfirmed": ["jaw"] if error else []})
+    assert RunStatus(JOINTS, {}).document()["torque_unconfirmed"] == []
+    status.tick(tick("stopping"))
+    status.ended(RunState("stopping").ended(3.0, error))
+    document = json.loads(json.dumps(status.document(), allow_nan=False))
+    shown = [document[key] for key in ("state", "why", "note", "torque_unconfirmed")]
+    assert shown == (["fault", [error], error, ["jaw"]] if error else ["stopped", [], None, []])

@@ -2,7 +2,7 @@ import threading
 
 import numpy as np
 import pytest
-from chain_rig import bus_of
+from chain_rig import bus_of, rig_of
 from emulated_port import BAUD
 
 from sfms_robot.config import load_firmware_map
@@ -244,3 +244,13 @@ def test_joints_that_were_left_out_take_goals_and_say_so():
     assert bus.statistics()["faults"] == ["jaw: left out"]
     bus.stop("release")
     bus.close()
+
+
+def test_unconfirmed_joints_of_all_buses_are_listed_together():
+    first, second = rig_of("xl330-m288", [2048, 2048]), Steady("antenna")
+    bus = CompositeBus({"first": first.bus, "second": second}, ["joint1", "antenna", "joint2"])
+    bus.connect()
+    bus.enable(bus.joints)
+    first.kill(2)
+    bus.stop("release")
+    assert bus.statistics()["torque_unconfirmed"] == ["joint2"]

@@ -10,6 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import BusError, PortError
+from sfms_robot.servo.codecs.maestro import set_target
 
 KINDS = ("maestro-24", "ssc-32")
 FIVE = (0, 1, 2, 5, 7)
@@ -166,7 +167,11 @@ def test_joint_that_must_hold_keeps_its_pulses_when_the_others_are_released(mode
     bench.bus.torque_off("release")
     assert bench.on() == [2]
     bench.bus.stop("release")
-    assert bench.on() == [2]
+    assert bench.on() == [2] and bench.bus.statistics()["torque_unconfirmed"] == []
+    bench.enable()
+    bench.kill()
+    bench.bus.stop("release")
+    assert bench.bus.statistics()["torque_unconfirmed"] == ["joint0", "joint1", "joint5", "joint7"]
 
 
 def test_torque_off_waits_for_nothing_and_stop_for_half_a_second_when_the_board_is_mute(model):
@@ -197,6 +202,15 @@ def test_stop_asks_whether_the_pulses_are_off_and_repeats_itself():
     bench.board.receive = deaf_to_the_first
     bench.bus.stop("release")
     assert lost and bench.on() == []
+
+
+def test_only_channels_whose_pulses_go_on_are_listed_where_the_board_reports_pulses():
+    bench = ConnectedBench("maestro-24")
+    bench.enable()
+    receive, last = bench.board.receive, set_target(7, 0)
+    bench.board.receive = lambda data, baud, now_s: receive(data.replace(last, b""), baud, now_s)
+    bench.bus.stop("release")
+    assert bench.on() == [7] and bench.bus.statistics()["torque_unconfirmed"] == ["joint7"]
 
 
 def test_one_joint_comes_on_within_a_second(model):

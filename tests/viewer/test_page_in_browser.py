@@ -394,3 +394,16 @@ def test_there_is_something_to_download_once_it_was_recorded(own_page, run):
     assert page.ask(f"{download}.hidden")
     press(page, "Stop recording")
     page.until(f"!{download}.hidden")
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_torque_that_the_end_of_a_run_could_not_confirm_off_is_named(own_page, run, late):
+    page = own_page.open(run.url)
+    over = "over: true, torque_unconfirmed: ['head_pan']" if late else "over: false"
+    page.driver.execute_script(
+        f"const told = (type, detail) => page.connection.dispatchEvent(new CustomEvent(type, {{detail}}));"
+        f"page.still = true; told('hello', {{...page.hello, {over}}});"
+        + ("" if late else "told('over', {report: {torque_unconfirmed: ['head_pan']}});")
+    )
+    page.until("document.getElementById('notice').textContent.startsWith('Torque is NOT confirmed off: head_pan.')")
+    page.until("document.getElementById('faults').textContent === 'head_pan: not confirmed off'")

@@ -138,13 +138,15 @@ def test_pictures_go_to_all_and_come_back_in_the_last_run(page):
         assert all(heard(visitor, "frame")["t"] == 1.0 for visitor in visitors)
         page.say("event", event="nod", at_s=1.2)
         page.say("status", status={"state": "listening"})
-        page.say("end", report={"exit": "done"})
+        report = {"exit": "failed", "torque_unconfirmed": ["neck_yaw"]}
+        page.say("end", report=report)
         for visitor in visitors:
             assert heard(visitor) == {"type": "event", "event": "nod", "at_s": 1.2}
             assert heard(visitor) == {"type": "status", "status": {"state": "listening"}}
-            assert heard(visitor) == {"type": "over", "report": {"exit": "done"}}
+            assert heard(visitor) == {"type": "over", "report": report}
     with visit(page) as late:
-        assert heard(late)["over"] is True
+        hello = heard(late)
+        assert (hello["over"], hello["torque_unconfirmed"]) == (True, ["neck_yaw"])
     lines = [json.loads(line) for line in got(page.url + "runs/last")[0].splitlines()]
     assert [line["type"] for line in lines] == ["hello", "frame", "event", "over"] and lines[0]["replay"] is True
 

@@ -306,7 +306,7 @@ class Robot:
         options = self._options
         return {
             "version": 1, "head": Path(options.head).name, "listener": Path(options.listener).name,
-            "port": options.port, "seed": options.seed, "exit": "running",
+            "port": options.port, "seed": options.seed, "exit": "running", "torque_unconfirmed": [],
             "duration_s": seen.seen.time_s if seen is not None and seen.seen is not None else 0.0,
             "frames": 0 if seen is None else seen.frames, "ticks": 0 if seen is None else seen.ticks,
             "callbacks_detached": dict(self._events.detached),

@@ -65,7 +65,10 @@ class Again(Exception):  # noqa: N818
 
 @dataclass
 class Outcome:
-    """What came of it: joints measured now and before, joints left out with the reason, and what the check found."""
+    """What came of it: joints measured now and before, joints left out with the reason, and what the check found.
+
+    `torque_unconfirmed`: joints whose torque came on and could not be confirmed off.
+    """
 
     head: str
     file: Path
@@ -75,6 +78,7 @@ class Outcome:
     skipped: dict[str, str] = field(default_factory=dict)
     missing: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    torque_unconfirmed: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
         return {"version": 1, **vars(self), "file": str(self.file)}
@@ -148,7 +152,8 @@ def _one(
         if identity is None:
             raise BusError(f"no answer from id {config.id} on bus {config.bus!r}")
         by_hand = _ask_how(talk, jumps(head, joint))
-        with probe(head, joint, where[config.bus], clock, identity.stored) as at:
+        unconfirmed = outcome.torque_unconfirmed
+        with probe(head, joint, where[config.bus], clock, stored=identity.stored, unconfirmed=unconfirmed) as at:
             while True:
                 try:
                     return _measure(config, identity, at, by_hand, talk, today)

@@ -16,7 +16,7 @@ import numpy as np
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.config import Head, Joint, load_firmware_map
 from sfms_robot.emulator.launch import Chain
-from sfms_robot.errors import ServoError
+from sfms_robot.errors import ServoError, TorqueError
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.servo.families import family_named
 
@@ -59,8 +59,10 @@ class Probe:
         raise ServoError(f"{self.name} (id {self._joint.id}) does not say where it stands")
 
     def limp(self) -> None:
-        """Torque off, for a hand to move it."""
+        """Switch torque off, for a hand to move it. Raises TorqueError where that could not be confirmed."""
         self._bus.stop("release")
+        if unconfirmed := self._bus.statistics()["torque_unconfirmed"]:
+            raise TorqueError(unconfirmed)
         self._goal_rad = None
 
     def go(self, ticks: int) -> int:
@@ -90,10 +92,13 @@ class Probe:
 
 
 @contextmanager
-def probe(head: Head, name: str, where: Chain | str, clock: Clock, stored: Mapping[str, int]) -> Iterator[Probe]:
-    """Open the joint's bus; limp again at the end. Raises RobotError for a servo that is not what the head says.
+def probe(
+    head: Head, name: str, where: Chain | str, clock: Clock, *, stored: Mapping[str, int], unconfirmed: list[str]
+) -> Iterator[Probe]:
+    """Open the joint's bus; limp again at the end, or named in `unconfirmed`.
 
-    `stored`: what its servo stores of zero and direction; a measurement may begin from any.
+    `stored`: zero and direction as its servo stores them; a measurement may begin from any. Raises RobotError for a
+    servo that is not what the head says.
     """
     joint, safety = head.joints[name], head.safety_of(name)
     safety = safety.model_copy(update={"stop": "release", "stored": {**safety.stored, **stored}})
@@ -107,6 +112,7 @@ def probe(head: Head, name: str, where: Chain | str, clock: Clock, stored: Mappi
         yield Probe(name, joint, bus, clock)
     finally:
         bus.stop("release")
+        unconfirmed += bus.statistics()["torque_unconfirmed"]
         bus.close()
 
 

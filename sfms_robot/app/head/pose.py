@@ -16,7 +16,7 @@ import numpy as np
 from sfms_robot.app.open_head import HeadOptions, open_head
 from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import SIM
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.runtime.feed import IDLE_FEED
@@ -93,7 +93,10 @@ def _value(channel: str, text: str) -> float:
 
 
 def pose_head(options: PoseOptions) -> dict[str, Any]:
-    """Rise to the face, hold it, back to rest. Says how far each joint went. Raises RobotError, the head at rest."""
+    """Rise to the face, hold it, return to rest. Reports how far each joint went, and torque not confirmed off.
+
+    Raises any other RobotError, the head at rest.
+    """
     face = parse_face(options.face)
     held = HeldFace(face, options.hold_s)
     with open_head(HeadOptions(options.head, options.port, options.fast, options.yes)) as opened:
@@ -101,7 +104,7 @@ def pose_head(options: PoseOptions) -> dict[str, Any]:
         furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
         alone = NobodyThere()
         drove = drive_head(opened, Programme(alone, alone, held.duration_s, held, observers=[furthest]), Interrupt())
-    if drove.error is not None:
+    if drove.error is not None and not isinstance(drove.error, TorqueError):
         raise drove.error
     shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]
     return {
@@ -110,6 +113,9 @@ def pose_head(options: PoseOptions) -> dict[str, Any]:
         "face": list(options.face),
         "port": options.port,
         "exit": drove.outcome,
+        "exit_code": drove.exit_code,
+        "error": drove.error and str(drove.error),
+        "torque_unconfirmed": drove.log.torque_unconfirmed,
         "joints": furthest.moved(),
         "blind": [name for name in shown if name in motion.retargeter.blind_channels],
     }

@@ -37,6 +37,7 @@ def run_report(
         "duration_s": round(log.listened_s, 4),
         "exit": outcome,
         "error": None if error is None else str(error),
+        "torque_unconfirmed": log.torque_unconfirmed,
         "frames": log.frames,
         "ticks": log.ticks,
         "tick": log.tick_report(rate_hz, elapsed_s),
@@ -67,6 +68,7 @@ def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> dict[str, Any]
     `real` False means virtual time.
     """
     return {
+        "torque_unconfirmed": log.torque_unconfirmed,
         "frames": log.frames,
         "ticks": log.ticks,
         "tick": log.tick_report(rate_hz, log.listened_s + (1 + log.eased) * log.period_s if real else None),

@@ -88,6 +88,7 @@ def play_back(folder: Path, options: PlaybackOptions, panel: Panel | None = None
         )  # fmt: skip
         with panel(status.document, interrupt, halt, knobs.turn_all) if panel is not None else nullcontext():
             drove = drive_head(opened, programme, interrupt, signals=False, log=log)
+            status.ended(log.states[-1][1])
     return {
         "version": 1,
         "head": opened.config.name,
@@ -98,6 +99,7 @@ def play_back(folder: Path, options: PlaybackOptions, panel: Panel | None = None
         "exit": drove.outcome,
         "exit_code": drove.exit_code,
         "error": None if drove.error is None else str(drove.error),
+        "torque_unconfirmed": log.torque_unconfirmed,
         "ticks": log.ticks,
         "limits": {"violations": log.audited.violations if log.audited else 0},
         "motion": log.motion_report(),

@@ -15,7 +15,7 @@ from sfms_robot.app.servo.single_servo import field_named, put, read, scan
 from sfms_robot.app.wiring import Opened, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map
 from sfms_robot.emulator.launch import Chain
-from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
+from sfms_robot.errors import BusError, ConfigError, PortError, RobotError, ServoError, TorqueError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.chain.slow_profile import WayInside, slow_profile, way_inside
 from sfms_robot.servo.families import family_named
@@ -113,7 +113,18 @@ def _torque_as_found(wire: Wire, seen: FoundServo) -> Iterator[None]:
         yield
     finally:
         if not was_on:
-            put(wire, seen, torque, 0)
+            _limp(wire, seen, torque)
+
+
+def _limp(wire: Wire, seen: FoundServo, torque: Field) -> None:
+    """Switch torque off, also when Ctrl-C comes meanwhile. Raises TorqueError where the servo does not confirm it."""
+    try:
+        put(wire, seen, torque, 0)
+    except KeyboardInterrupt:
+        _limp(wire, seen, torque)
+        raise
+    except RobotError as error:
+        raise TorqueError([f"id {seen.id}"]) from error
 
 
 @contextmanager
@@ -160,7 +171,7 @@ def _brought_in(wire: Wire, seen: FoundServo, start: int, limits: tuple[int, int
             raise ServoError(f"{where}, and does not come inside in {way.bound_s:.1f} s: torque is off")
         put(wire, seen, goal, here)
     except BaseException:  # before its usual profile is back, with which it would jump
-        put(wire, seen, torque, 0)
+        _limp(wire, seen, torque)
         raise
     finally:
         for name, value in usual.items():

@@ -138,7 +138,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         """
         wire = self._open()
         self._forget()
-        self._off, self._off_unsent = None, False
+        self._off, self._off_unsent, self._powered = None, False, frozenset()
         try:
             present = self._present(wire)
             if misfit := self._protocol.misfit(wire.exchange, present):
@@ -205,6 +205,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _switch_on(self, wire: RateLimitedPort, index: int) -> float:
         """Pulses on for one joint; the angle it was sent to, rad. Raises BusError when `torque_off` comes meanwhile."""
         servo = self._servos[index]
+        self._powered |= {index}
         self._resting -= {servo.id}
         self._take_over(index)
         self._send(wire, {servo.id: int(self._ticks[index])})
@@ -304,14 +305,16 @@ class PulseBus(WireBus[RateLimitedPort]):
             return
         wire = self._link or self._open_again()
         until_s = wire.port.now_s() + min(_STOP_S, within_s) if wire is not None else 0.0
-        for _ in range(_TRIES):
+        for _ in range(4 * _TRIES):  # each costs a mute board's patience
             if wire is None:
                 break
             try:
                 wire.wait(min(wire.busy_until_s, until_s))
                 if wire.port.now_s() >= until_s:
                     break
-                if self._is_off(wire):
+                on = self._still_on(wire)
+                self._powered = frozenset(i for i in self._powered if self._channels[i] in on)
+                if not on:
                     return
                 self._send_off()
             except BusError as error:
@@ -319,10 +322,13 @@ class PulseBus(WireBus[RateLimitedPort]):
                 wire = self._open_again()
         log.warning("bus %r: the %s does not confirm that its pulses are off", self.name, self.model)
 
-    def _is_off(self, wire: RateLimitedPort) -> bool:
-        """Whether the board says so; of one that cannot say, whether it answers at all."""
-        pulses = self._protocol.read_pulses(wire.exchange, self._off or ())
-        return self._answers(wire, restarted=True) if pulses is None else not any(pulses.values())
+    def _still_on(self, wire: RateLimitedPort) -> set[int]:
+        """Return the channels whose pulses are not confirmed off: none when a board that cannot report them answers."""
+        channels = self._off or ()
+        pulses = self._protocol.read_pulses(wire.exchange, channels)
+        if pulses is None:
+            return set() if self._answers(wire, restarted=True) else set(channels)
+        return {channel for channel, ticks in pulses.items() if ticks}
 
     def end_pulses(self, channels: Sequence[int]) -> bool:
         """Open the port, end the pulses of `channels` and close it; return whether the board confirmed it.
@@ -335,7 +341,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             for attempt in range(_TRIES):
                 wire.send(self._protocol.encode_off(self._off, restarted=attempt > 0))
                 wire.wait(wire.busy_until_s)
-                if self._is_off(wire):
+                if not self._still_on(wire):
                     return True
             return False
         finally:
@@ -403,6 +409,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             "silent": sorted(self._channels) if self._silent else [],
             "faults": list(self._fault_log),
             "stored_warnings": [],
+            **self._unconfirmed(self._off is not None),
         }
 
     # --- goals --------------------------------------------------------------------------------------------------

@@ -51,7 +51,8 @@ from sfms_robot.servo.registers import Field, Table
 log = logging.getLogger(__name__)
 
 READ_DEADLINE_S: Final = 0.003  # what a silent servo costs, once
-_CONFIRM_S: Final = 0.2  # that `stop` waits for servos to confirm, at most
+_CONFIRM_S: Final = 0.35  # that `stop` waits for servos to confirm, at most
+_ROUNDS: Final = 20  # of asking them; each costs a mute servo's patience
 _STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
 _EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
 _SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
@@ -182,6 +183,7 @@ class ChainBus(WireBus[L], Generic[L]):
             raise
         self._forget_silence()
         self._settings.clear()
+        self._powered, self._released = frozenset(), False
         self._enabled, self._link = False, link
 
     def _attach(self, link: L) -> None:
@@ -222,6 +224,7 @@ class ChainBus(WireBus[L], Generic[L]):
                 log.warning("%s (id %d) does not answer; it comes in when it does", joint, servo.id)
                 continue
             self._forget(index)
+            self._powered |= {index}
             with link.patient(PATIENCE_S):
                 steps = startup.torque_on(index) if member.identified else startup.bring_back(index, reboot=False)
                 self._telemetry.ticks[index] = finish(steps, partial(self._wait_enabling, link, joint))
@@ -294,8 +297,9 @@ class ChainBus(WireBus[L], Generic[L]):
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """As `ports.Bus`: torque off first, in one packet, then watchdogs off, in another; then both are read back and
-        written again, while there is time. Waits for nobody before the torque is off."""
+        written again, while there is time. Waits for no servo before the torque is off."""
         self._enabled = False
+        self._released |= policy == "release"
         armed = self._settings.changed(BUS_WATCHDOG)
         for member in self._members:
             member.stopped()
@@ -315,7 +319,7 @@ class ChainBus(WireBus[L], Generic[L]):
             self._say_off(link, watchdog, armed)
         budget_s = min(_CONFIRM_S, within_s)
         with link.patient(_STOP_PATIENCE_S), link.within(budget_s, budget_s):
-            self._confirm_off(link, torque, limp)
+            self._powered -= self._confirm_off(link, torque, limp)
             if watchdog is not None:
                 self._confirm_off(link, watchdog, [i for i in armed if i not in limp])
 
@@ -324,13 +328,13 @@ class ChainBus(WireBus[L], Generic[L]):
         if values:
             self._attempt(lambda: link.sync_write(field.address, values))
 
-    def _confirm_off(self, link: L, field: Field, indices: Sequence[int]) -> None:
-        """Read a register of all back, and write 0 again to those that do not say 0.
+    def _confirm_off(self, link: L, field: Field, indices: Sequence[int]) -> frozenset[int]:
+        """Read a register of all back, and write 0 again to those that do not report 0; return those that do.
 
-        Whoever is asked first in one round is asked last in the next: behind a dead servo the others are silent.
+        The servo that is asked first in one round is asked last in the next: behind a dead servo the others are silent.
         """
         rest = list(indices)
-        for _ in range(len(indices) + 2):
+        for _ in range(len(indices) + _ROUNDS):
             if not rest or not link.affords(link.framing.reads(1, field.size)):
                 break
             ids = [self._servos[i].id for i in rest]
@@ -343,6 +347,7 @@ class ChainBus(WireBus[L], Generic[L]):
             self._say_off(link, field, rest)
         for index in sorted(rest):
             log.warning("%s (id %d) does not confirm that its %s is off", *self._name(index), field.name)
+        return frozenset(indices).difference(rest)
 
     def _name(self, index: int) -> tuple[str, int]:
         return self._servos[index].joint, self._servos[index].id
@@ -430,6 +435,7 @@ class ChainBus(WireBus[L], Generic[L]):
             "silent": [member.id for member in self._members if not member.liveness.listed],
             "faults": list(self._reporter.said),
             "stored_warnings": [f"{', '.join(joints)}: {problem}" for problem, joints in self._warnings.items()],
+            **self._unconfirmed(self._released),
             "supply_mA": round(self._telemetry.supply_mA(), 1),
             "supply_peak_mA": round(self._peak_mA, 1),
         }
@@ -507,6 +513,7 @@ class ChainBus(WireBus[L], Generic[L]):
                 if not link.grants("return", longest, alone=True, late_s=AWAY_LATE_S):
                     return
                 left -= 1
+                self._powered |= {member.index}
                 member.step(now_s)
                 if member.rejoined:
                     self._back(member)

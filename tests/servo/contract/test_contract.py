@@ -532,3 +532,58 @@ def test_a_servo_that_comes_back_with_less_protection_is_one_more_warning(name, 
     (warned,) = rig.bus.statistics()["stored_warnings"]
     assert rig.torques() == [1] * 4 and warned.startswith(f"joint2: {register} is {value}")
     assert sum(f"comes back, and {register} is {value}" in each.getMessage() for each in caplog.records) == 1
+
+
+# --- torque that is not confirmed off ---------------------------------------------------------------------------
+
+
+def unconfirmed(rig):
+    return rig.bus.statistics()["torque_unconfirmed"]
+
+
+@pytest.mark.emulated
+def test_joints_that_came_on_and_do_not_confirm_that_torque_is_off_are_listed(rig):
+    rig.hold()
+    rig.bus.stop("release")
+    assert unconfirmed(rig) == []
+    rig.bus.enable(rig.bus.joints[:2])
+    for servo in rig.ids:
+        rig.chain.kill(servo)
+    rig.bus.stop("hold")
+    assert unconfirmed(rig) == []
+    for end in (rig.bus.torque_off, rig.bus.stop):  # of a bus that hangs, `stop` is never called
+        end("release")
+        assert unconfirmed(rig) == list(rig.bus.joints[:2])
+    assert rig.torques() == [True, True, False, False]
+    for servo in rig.ids:
+        rig.chain.revive(servo)
+    rig.bus.stop("release")
+    assert unconfirmed(rig) == [] and not any(rig.torques())
+
+
+@pytest.mark.emulated
+def test_no_joint_is_confirmed_over_a_port_that_is_gone(rig):
+    held = rig.hold()
+    rig.chain.hang_up()
+    rig.ticks(held, 5)
+    rig.bus.stop("release")
+    assert unconfirmed(rig) == list(rig.bus.joints)
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("family", [name for name, each in FAMILIES.items() if each.table.pulse_us is None])
+def test_a_servo_that_never_came_on_is_not_listed_and_one_that_came_back_is(family):
+    with emulated(family) as rig:
+        *_, last = rig.ids
+        rig.chain.kill(last)
+        held = rig.hold()
+        rig.ticks(held, 3)
+        rig.bus.stop("release")
+        assert unconfirmed(rig) == []
+        held = rig.bus.enable(rig.bus.joints)
+        rig.chain.revive(last)
+        rig.ticks(held, 150)
+        assert all(rig.torques())
+        rig.chain.kill(last)
+        rig.bus.stop("release")
+        assert unconfirmed(rig) == [f"joint{last}"]
