@@ -78,8 +78,8 @@ class TorqueError(BusError):
 
     def __init__(self, joints: Iterable[str]) -> None:
         super().__init__(
-            f"torque of {', '.join(joints)} could not be confirmed off: run sfms-robot servo release, or switch off the "
-            "supply, before you touch it"
+            f"torque of {', '.join(joints)} could not be confirmed off: run sfms-robot servo release or switch off "
+            "the supply before you touch it"
         )
 
 

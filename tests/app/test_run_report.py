@@ -147,7 +147,10 @@ def test_torque_that_is_not_confirmed_off_overrides_success_and_interruption_and
     assert drove.exit_code == (4 if named and own else code)
     assert drove.log.states[-1][1].name == ("fault" if named or not own else "stopped")
     if named and own:
-        told = f"torque of {', '.join(named)} could not be confirmed off: switch off the supply before you touch it"
+        told = (
+            f"torque of {', '.join(named)} could not be confirmed off: run sfms-robot servo release or switch off "
+            "the supply before you touch it"
+        )
         assert (drove.outcome, str(drove.error)) == ("failed", told)
 
 
