@@ -6,12 +6,13 @@ middle of its range, wherever it stands, so a host that enables torque before it
 
 from __future__ import annotations
 
+import struct
 from itertools import groupby
+from operator import itemgetter
 from typing import Final
 
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.dynamixel2_modes import POSITION, TORQUE_ON_BY_GOAL, TickFrames, motor_command
-from sfms_robot.emulator.emulated_servo import EmulatedServo
-from sfms_robot.emulator.present_values import PresentValues
 from sfms_robot.emulator.register_servo import RegisterServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Field, Table
@@ -25,6 +26,14 @@ _GOALS: Final = frozenset({"goal_pwm", "goal_current", "goal_velocity", "goal_po
 _BOUND_BY: Final = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
 _TURNS_CLEARED: Final = b"\x01\x44\x58\x4c\x22"  # parameters of `clear`
 FAULT_BITS: Final = {"voltage": 0, "overheating": 2, "overload": 5}  # of the X series; others say it in the map
+# Registers that are worked out whenever somebody reads them, in the order of the values.
+LIVE: Final = (
+    "realtime_tick", "moving", "moving_status", "present_pwm", "present_current", "present_load", "present_velocity",
+    "present_speed", "present_position", "velocity_trajectory", "position_trajectory", "present_input_voltage",
+    "present_voltage", "present_temperature",
+)  # fmt: skip
+_CODES: Final = {(1, "no"): "B", (2, "no"): "H", (4, "no"): "I",
+                 (1, "twos_complement"): "b", (2, "twos_complement"): "h", (4, "twos_complement"): "i"}  # fmt: skip
 
 
 class Dynamixel2Servo(RegisterServo):
@@ -327,3 +336,33 @@ def _pieces(addresses: list[int], data: bytes) -> list[tuple[int, bytes]]:
         places = list(run)
         out.append((places[0][1], bytes(data[index] for index, _ in places)))
     return out
+
+
+# --- registers that are worked out anew at every read: position, speed, voltage, ... ------------------------------------
+
+
+class PresentValues:
+    """Where the live registers of a model lie. Every X-series table holds them in one block: one struct fills it."""
+
+    def __init__(self, table: Table) -> None:
+        fields = [table[name] for name in LIVE if name in table.fields]
+        self._pick = itemgetter(*(i for i, name in enumerate(LIVE) if name in table.fields))
+        self._fields = fields
+        self.address = min(field.address for field in fields)
+        self.end = max(field.address + field.size for field in fields)
+        speed = table.fields.get("present_velocity") or table["present_speed"]
+        self.speed_per_tick = 60.0 / (table.ticks_per_revolution * speed.scale)
+        current = table.fields.get("present_current")
+        self.mA_per_tick = current.scale if current is not None else 1.0
+        layout = struct.Struct("<" + "".join(_CODES.get((field.size, field.sign), "") for field in fields))
+        in_order = [f.address for f in fields] == sorted(f.address for f in fields)
+        self._block = layout if in_order and layout.size == self.end - self.address else None
+
+    def put(self, raw: bytearray, values: tuple[int, ...]) -> None:
+        chosen = self._pick(values)
+        if self._block is not None:
+            self._block.pack_into(raw, self.address, *chosen)
+            return
+        for field, value in zip(self._fields, chosen, strict=True):
+            held = min(max(value, field.low), field.high)
+            raw[field.address : field.address + field.size] = field.to_bytes(held)

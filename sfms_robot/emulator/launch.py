@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import IO, Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
 

@@ -22,7 +22,7 @@ from enum import Enum, auto
 from typing import Final
 
 from sfms_robot.emulator.plant import MotorCommand
-from sfms_robot.emulator.register_file import RegisterFile
+from sfms_robot.emulator.register_servo import RegisterFile
 from sfms_robot.servo.registers import Field
 
 _MX_MULTI_TURN: Final = 4095

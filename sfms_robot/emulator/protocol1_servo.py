@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.protocol1_modes import POSITIONING, Mode, PositionFrame, angle_limits, mode_of, motor_command
 from sfms_robot.emulator.register_servo import RegisterServo
 from sfms_robot.emulator.servo_chain import same_baud

@@ -11,8 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Final, Generic, Self, TypeVar
 
-from sfms_robot.emulator.device import Reply
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo, Reply
 from sfms_robot.emulator.register_servo import RegisterServo
 from sfms_robot.servo.registers import Table
 
