@@ -21,11 +21,8 @@ from typing import Any, Final
 
 from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
-from sfms_robot.app.listen.limitation import limitation
-from sfms_robot.app.listen.report import figures_so_far, run_report
-from sfms_robot.app.listen.run_facts import run_facts
-from sfms_robot.app.listen.run_teller import RunTeller
-from sfms_robot.app.listen.status_server import StatusServer
+from sfms_robot.app.listen.report import RunTeller, figures_so_far, limitation, run_facts, run_report
+from sfms_robot.app.loopback_server import StatusServer
 from sfms_robot.app.open_head import HeadOptions, OpenHead, open_head, prepare_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head

@@ -234,7 +234,7 @@ def _calmness(per_minute: list[str], addressed: str) -> Calmness:
 
 def _check(audio: str, duration_s: float | None, json: bool) -> None:
     from sfms_robot.app.listen.sound_check import CHECK_S, check_sound
-    from sfms_robot.cli.meter import LevelMeter
+    from sfms_robot.cli.show import LevelMeter
 
     with LevelMeter() as meter:
         told = check_sound("mic" if audio == "default" else audio, duration_s or CHECK_S, None if json else meter)

@@ -1,6 +1,6 @@
 """Emulated Protocol 2.0 servos on one wire.
 
-The rules of the wire, beside those of `servo_chain`: on a sync or bulk read each servo waits for the one before it, and
+The rules of the wire, beside those of `ServoChain`: on a sync or bulk read each servo waits for the one before it, and
 two servos with one id talk over one another.
 """
 
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from sfms_robot.emulator.device import Reply
 from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
-from sfms_robot.emulator.servo_chain import ServoChain, same_baud
+from sfms_robot.emulator.register_servo import ServoChain, same_baud
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_status
 

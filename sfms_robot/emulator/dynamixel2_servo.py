@@ -338,7 +338,7 @@ def _pieces(addresses: list[int], data: bytes) -> list[tuple[int, bytes]]:
     return out
 
 
-# --- registers that are worked out anew at every read: position, speed, voltage, ... ------------------------------------
+# --- registers that are worked out at every read: position, speed, voltage, ... -------------------------------------
 
 
 class PresentValues:

@@ -14,8 +14,7 @@ from typing import Final
 
 from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.protocol1_modes import POSITIONING, Mode, PositionFrame, angle_limits, mode_of, motor_command
-from sfms_robot.emulator.register_servo import RegisterServo
-from sfms_robot.emulator.servo_chain import same_baud
+from sfms_robot.emulator.register_servo import RegisterServo, same_baud
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.registers import Field, Table
 

@@ -11,10 +11,9 @@ from urllib.request import urlopen
 import pytest
 from virtual_time import Time
 
-from sfms_robot.app.fleet.fleet_page import FleetPage
-from sfms_robot.app.listen.status_server import AUTO, StatusServer
-from sfms_robot.app.loopback_server import CONNECTION_S, MOST_CONNECTIONS, Answer, LoopbackServer
-from sfms_robot.app.serve.metrics import MetricsServer
+from sfms_robot.app.fleet.fleet_client import FleetPage
+from sfms_robot.app.loopback_server import AUTO, CONNECTION_S, MOST_CONNECTIONS, Answer, LoopbackServer, StatusServer
+from sfms_robot.app.serve.service import MetricsServer
 from sfms_robot.cli.main import main
 from sfms_robot.errors import ConfigError, PortError
 

@@ -8,7 +8,8 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from sfms_robot.errors import BusError, ModelError, PortError, RobotError
+from sfms_robot.config import Head, load_head
+from sfms_robot.errors import BusError, ConfigError, ModelError, PortError, RobotError
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
@@ -145,3 +146,18 @@ class Background:
             self._error.__cause__ = error
         finally:
             self.progress.came.set()
+
+
+def head_name(head: Head | str) -> str:
+    """Name or folder of a head.
+
+    What belongs to one build (its calibration, what is stored in its servos) lies beside the head's file, so a head
+    runs from there. Raises ConfigError for one that was changed since it was loaded, or was made without a file.
+    """
+    if isinstance(head, str):
+        return head
+    if head.folder is None or load_head(str(head.folder)) != head:
+        raise ConfigError(
+            f"head {head.name!r} is not what its file says: write it to a folder as head.yaml and name that folder"
+        )
+    return str(head.folder)

@@ -16,8 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from sfms_robot.app.api.background import Background, Report
-from sfms_robot.app.api.named_head import head_name
+from sfms_robot.app.api.background import Background, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
 from sfms_robot.app.session import RunOptions, run

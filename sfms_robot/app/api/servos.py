@@ -15,8 +15,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfms_robot.app.api.background import Background, Report
-from sfms_robot.app.api.named_head import head_name
+from sfms_robot.app.api.background import Background, Report, head_name
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.report import run_report
 from sfms_robot.app.open_head import HeadOptions, open_head

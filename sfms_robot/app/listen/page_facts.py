@@ -8,7 +8,7 @@ from typing import Any
 
 from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
 from sfms_robot.app.listen.knobs import LiveKnobs
-from sfms_robot.app.listen.named_expressions import NAMED_EXPRESSIONS
+from sfms_robot.app.listen.page_commands import NAMED_EXPRESSIONS
 from sfms_robot.config import Calmness, Head
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.frames import CHANNELS

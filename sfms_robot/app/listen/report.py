@@ -1,11 +1,30 @@
-"""The report of a run (`run --json`): every figure from the run's own log, the bus's counters or the listener."""
+"""What a run says of itself: its report (`run --json`), to its recording, and to the programs that it works with.
+
+Every figure of the report is from the run's own log, the bus's counters or the listener.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
 
-from sfms_robot.ports import Bus, PlanFeed
+import yaml
+
+from sfms_robot import __version__
+from sfms_robot.config import Head, load_listener
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.plugins import listener_folder
+from sfms_robot.ports import Bus, Outlet, PlanFeed, Tick
 from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.planned_events import EventWatch
+
+LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
 
 
 def run_report(
@@ -84,3 +103,88 @@ def _latency(log: RunLog, real: bool) -> dict[str, Any]:
 
 def _counts(state: object, names: tuple[str, ...]) -> dict[str, int]:
     return {name: int(getattr(state, name)) for name in names if hasattr(state, name)}
+
+
+# --- what a recording says of its run -------------------------------------------------------------------------------
+
+
+def run_facts(head: Head, listener: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """Text by text, for `Recorder(about=...)`.
+
+    `head_yaml` is the head as it was used, calibration included, and a head's file itself. Of a listener that is a
+    folder there are its configuration and the SHA-256 of its weights.
+    """
+    shown = {name: value for name, value in options.items() if value not in (None, (), False)}
+    return {
+        "head": head.name,
+        "listener": Path(listener).name,
+        **{name: str(options[name]) for name in ("seed", "port")},
+        "audio": Path(options["audio"]).name,
+        "version": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "options": json.dumps(shown, default=str),
+        "head_yaml": yaml.safe_dump(head.model_dump(mode="json", exclude_defaults=True), sort_keys=False),
+        **_listener(listener),
+    }
+
+
+def _listener(name: str) -> dict[str, str]:
+    try:
+        folder = listener_folder(name)
+    except ConfigError:  # an object that a program handed over
+        return {}
+    if folder is None:
+        return {}
+    facts = {"listener_config": (folder / "config.yaml").read_text(encoding="utf-8")}
+    if (weights := folder / "model.safetensors").is_file():
+        with weights.open("rb") as file:
+            facts["listener_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return facts
+
+
+def limitation(listener: str) -> str | None:
+    """Return one line about what a listener, by name or folder, cannot show on any head.
+
+    None: it can show all channels, or another package brings it.
+
+    Raises ConfigError.
+    """
+    folder = listener_folder(listener)
+    return None if folder is None else MotionSpace.of(load_listener(folder / "config.yaml"), folder).limitation
+
+
+# --- what the programs that a run works with receive ---------------------------------------------------------------
+
+
+class RunTeller:
+    """`ports.Observer`: sound as it is heard, events as they are decided or planned, states as they change."""
+
+    def __init__(self, outlet: Outlet) -> None:
+        self._outlet = outlet
+        self._state: tuple[str, tuple[str, ...]] | None = None
+        self._events = EventWatch()
+        for kind in EVENT_KINDS:
+            self._events.on(kind, self._event)
+
+    def tick(self, seen: Tick) -> None:
+        state = (seen.state, seen.why)
+        if state != self._state:
+            self._state = state
+            self._outlet.tells("state", seen.time_s, state=seen.state, why=list(seen.why))
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        if len(frame.audio):
+            self._outlet.hears(frame.audio, frame.time_s)
+
+    def planned(self, plan: Plan) -> None:
+        self._events.planned(plan)
+
+    def close(self) -> None:
+        self._events.close()
+
+    def _event(self, event: ListenerEvent) -> None:
+        told = {"lasts_s": round(event.duration_s, 3), "size": round(event.size, 4), "swings": event.swings}
+        if event.probability is not None:
+            told["probability"] = round(event.probability, 5)
+        self._outlet.tells("event", event.start_s, event=event.kind, **told)
