@@ -59,13 +59,13 @@ class LoopbackServer(ThreadingHTTPServer):
         super().__init__((host, port), answer)
         self.port = int(self.server_address[1])
         self.url = f"http://{host}:{self.port}/"
-        self.document: Document = dict
         self._name, self._now = name, now
         self._since_s: dict[Any, float] = {}  # connection -> when it was taken, oldest first
         self._thread: threading.Thread | None = None
 
-    def begin(self) -> None:
-        """Start to answer, in threads. Idempotent."""
+    def begin(self, document: Document = dict) -> None:
+        """Answer from now on, in threads, with this document."""
+        self.document = document
         if self._thread is None:
             self._thread = threading.Thread(target=self.serve_forever, name=self._name, daemon=True)
             self._thread.start()
@@ -165,9 +165,8 @@ class StatusServer:
         return self.url + self._taken
 
     def serve(self, document: Document) -> None:
-        """Answer with this document from now on, in threads of its own."""
-        self._server.document = document
-        self._server.begin()
+        """See `LoopbackServer`."""
+        self._server.begin(document)
 
     def close(self) -> None:
         """Give the port back. Idempotent."""

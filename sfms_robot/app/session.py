@@ -347,12 +347,8 @@ def _status(
 
 
 def _report(options: RunOptions, opened: OpenHead, drove: Drove, feed: PlanFeed, person: Source) -> dict[str, Any]:
-    report = run_report(
-        drove.log, opened.bus, feed, head=opened.config.name, listener=Path(options.listener).name,
-        port=options.port, seed=options.seed, outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz,
-        elapsed_s=drove.elapsed_s, priority=drove.priority,
-    )  # fmt: skip
-    report |= {"exit_code": drove.exit_code, "source": dict(person.statistics())}
+    report = run_report(opened, drove, feed, Path(options.listener).name, options.seed)
+    report |= {"source": dict(person.statistics())}
     return report | {"wire": opened.digests()} if options.fast else report
 
 

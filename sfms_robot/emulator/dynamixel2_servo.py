@@ -53,11 +53,8 @@ class Dynamixel2Servo(RegisterServo):
         self._bits = _fault_bits(table)
         self._reset(keep={}, areas=(True, False))
         self._take_stored(what)
-        self._put("torque_limit", self._get("max_torque"))
         self.plant.position = self.plant.reference = TickFrames(self._file).shaft(float(what.start_ticks))
-        self._put("goal_position", table.center_ticks)
-        self._settings()
-        self._watch_supply()
+        self._power_up()
 
     @property
     def return_level(self) -> int:
@@ -141,10 +138,7 @@ class Dynamixel2Servo(RegisterServo):
         self._deaf_until_s = now_s + REBOOT_S
         self.plant.position %= self.table.ticks_per_revolution
         self._reset(keep={}, areas=(False,))
-        self._put("torque_limit", self._get("max_torque"))  # XL-320
-        self._put("goal_position", self.table.center_ticks)
-        self._settings()
-        self._watch_supply()
+        self._power_up()
 
     def factory_reset(self, option: int, now_s: float) -> None:
         """0xFF everything, 1 all but the id, 2 all but id and baud; then a reboot."""
@@ -194,6 +188,12 @@ class Dynamixel2Servo(RegisterServo):
             self._latch(self._bits["overheating"])
 
     # --- inside -------------------------------------------------------------------------------------------------
+
+    def _power_up(self) -> None:
+        self._put("torque_limit", self._get("max_torque"))  # XL-320
+        self._put("goal_position", self.table.center_ticks)
+        self._settings()
+        self._watch_supply()
 
     def _refusal(self, field: Field, data: bytes, offset: int) -> int:
         if not field.writable or (field.eeprom and self.torque):
@@ -268,10 +268,9 @@ class Dynamixel2Servo(RegisterServo):
         self._frame = TickFrames(self._file)
         self.mode: int = self._frame.mode
         self._by_time = bool(get("drive_mode") & 0x04)
-        ends = [get(name) for name in ("min_position_limit", "cw_angle_limit") if name in self.table.fields]
-        self._lowest: int = ends[0] if ends else 0
-        ends = [get(name) for name in ("max_position_limit", "ccw_angle_limit") if name in self.table.fields]
-        self._highest: int = ends[0] if ends else round(self.table.ticks_per_revolution) - 1
+        last = round(self.table.ticks_per_revolution) - 1
+        self._lowest: int = get("min_position_limit", get("cw_angle_limit"))
+        self._highest: int = get("max_position_limit", get("ccw_angle_limit", last))
         self._hottest_c: float = float(get("temperature_limit", 255))
         self._drive = None
         if self.torque:

@@ -18,8 +18,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from types import TracebackType
+from dataclasses import asdict, dataclass
 from typing import IO, Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
@@ -36,6 +35,7 @@ _START_S = 20.0
 _BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Chain:
     """A running chain.
 
@@ -45,29 +45,20 @@ class Chain:
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
         servos: what is plugged in.
         priority: "fifo" where it answers as promptly as hardware; else why not (`realtime.realtime_priority`).
+        process, folder: what ends with it.
     """
 
-    def __init__(
-        self,
-        process: subprocess.Popen[bytes],
-        servos: Sequence[EmulatedServo],
-        virtual: bool,
-        device: str,
-        control: str,
-        folder: str,
-        priority: str,
-    ) -> None:
-        self.servos = tuple(servos)
-        self.virtual = virtual
-        self.device = device
-        self.control = control
-        self.priority = priority
-        self._process = process
-        self._folder = folder
+    process: subprocess.Popen[bytes]
+    servos: Sequence[EmulatedServo]
+    virtual: bool
+    device: str
+    control: str
+    folder: str
+    priority: str
 
     @property
     def pid(self) -> int:
-        return self._process.pid
+        return self.process.pid
 
     @property
     def read_deadline_s(self) -> float:
@@ -135,7 +126,7 @@ class Chain:
     @property
     def stdout(self) -> IO[bytes]:
         """Says nothing any more, and ends with the process."""
-        return cast("IO[bytes]", self._process.stdout)
+        return cast("IO[bytes]", self.process.stdout)
 
     def digest(self) -> tuple[str, int]:
         """SHA-256 and number of all bytes that hosts have sent."""
@@ -144,17 +135,17 @@ class Chain:
 
     def close(self) -> None:
         """End the process and remove its folder. Idempotent."""
-        if self._process.poll() is None:
-            self._process.terminate()
-        _reap(self._process)
-        shutil.rmtree(self._folder, ignore_errors=True)
+        if self.process.poll() is None:
+            self.process.terminate()
+        _reap(self.process)
+        shutil.rmtree(self.folder, ignore_errors=True)
         if os.path.islink(self.device) and not os.path.exists(self.device):
             os.unlink(self.device)  # it was killed, and left its link behind
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _json(self, request: str) -> Any:
@@ -212,8 +203,8 @@ def launch(
         "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
-    process, told = _started(description)
-    return Chain(process, servos, virtual, told["device"], told["control"], told["folder"], told["priority"])
+    process, ready = _started(description)
+    return Chain(process=process, servos=tuple(servos), virtual=virtual, **ready)
 
 
 def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:

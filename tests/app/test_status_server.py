@@ -13,7 +13,7 @@ from virtual_time import Time
 
 from sfms_robot.app.fleet.fleet_client import FleetPage
 from sfms_robot.app.loopback_server import AUTO, CONNECTION_S, MOST_CONNECTIONS, Answer, LoopbackServer, StatusServer
-from sfms_robot.app.serve.service import MetricsServer
+from sfms_robot.app.serve.service import metrics_server
 from sfms_robot.cli.main import main
 from sfms_robot.errors import ConfigError, PortError
 
@@ -124,8 +124,8 @@ def address(request):
             server.serve(lambda: {"state": "idle"})
         elif request.param == "metrics":
             pytest.importorskip("prometheus_client")
-            server = stack.enter_context(MetricsServer("0"))
-            server.serve(figures)
+            server = stack.enter_context(closing(metrics_server("0")))
+            server.begin(figures)
         else:
             server = stack.enter_context(closing(FleetPage(NoHeads(), 0)))
         yield server.url
@@ -151,8 +151,8 @@ def test_a_client_that_calls_this_machine_by_a_strangers_name_is_not_answered(ad
 
 def test_the_metrics_are_those_of_that_moment() -> None:
     pytest.importorskip("prometheus_client")
-    with MetricsServer("0") as server:
-        server.serve(figures)
+    with closing(metrics_server("0")) as server:
+        server.begin(figures)
         with urlopen(server.url, timeout=LIMIT_S) as answer:
             assert answer.headers["Content-Type"].startswith("text/plain")
             assert 'sfms_heads{listener="a",server="b"} 3.0' in answer.read().decode()

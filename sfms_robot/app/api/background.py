@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from sfms_robot.config import Head, load_head
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError, RobotError
-from sfms_robot.frames import Plan, SpeakerFrame
+from sfms_robot.frames import SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -21,7 +21,7 @@ _KINDS: Final = {kind.exit_code: kind for kind in (PortError, BusError, ModelErr
 Report = Mapping[str, Any]
 
 
-class FirstTick:
+class FirstTick(Observer):
     """An observer that knows the newest tick, and tells when there is one."""
 
     def __init__(self) -> None:
@@ -37,12 +37,6 @@ class FirstTick:
 
     def heard(self, frame: SpeakerFrame) -> None:
         self.frames += 1
-
-    def planned(self, plan: Plan) -> None:
-        """Counted by the run itself."""
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 class Background:

@@ -9,7 +9,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,12 +21,11 @@ from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
 from sfms_robot.app.listen.page_commands import PageCommands, Reach
 from sfms_robot.app.listen.page_facts import page_facts, people_per_minute
 from sfms_robot.app.listen.page_observer import PageObserver
-from sfms_robot.app.listen.preflight import begin_listening
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
 from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.listeners.open_feed import NamedFeed
+from sfms_robot.listeners.open_feed import NamedFeed, open_feed
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
@@ -90,7 +89,9 @@ class PageSession:
         self._chosen.clear()
         self.released = False
         with ExitStack() as stack:
-            feed = feed or self._listener(stack)
+            if feed is None:
+                listened = options.listener, options.seed, options.calmness, options.router, options.engine
+                feed = stack.enter_context(closing(open_feed(*listened)))
             halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
             scene = scene_of(head, options.packages)  # a picture that is broken is said before anything moves
             for line in scene.left_out if scene else ():
@@ -146,18 +147,6 @@ class PageSession:
     def _out_of_reach(self) -> None:
         self._commands.reach = None
 
-    def _listener(self, stack: ExitStack) -> NamedFeed:
-        feed = begin_listening(
-            self.options.listener,
-            self.options.seed,
-            self.options.calmness,
-            self.options.zenoh,
-            self.options.engine,
-            self.options.insecure,
-        )
-        stack.callback(feed.close)
-        return feed
-
     def _source(self, stack: ExitStack) -> Any:
         """Where a visitor is the person; None: the run opens what its options name."""
         options = self.options
@@ -167,8 +156,7 @@ class PageSession:
             options.hears, options.face, options.duration_s, agent_audio=options.agent_audio, play=options.play,
             visitor=self._person,
         )  # fmt: skip
-        stack.callback(source.close)
-        return source
+        return stack.enter_context(closing(source))
 
     def _facts(self, head: Any, knobs: Any, calmness: Calmness) -> dict[str, Any]:
         options = self.options

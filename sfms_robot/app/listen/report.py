@@ -10,7 +10,7 @@ import json
 import platform
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 
@@ -20,51 +20,42 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.plugins import listener_folder
-from sfms_robot.ports import Bus, Outlet, PlanFeed, Tick
+from sfms_robot.ports import Outlet, PlanFeed, Tick
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.planned_events import EventWatch
+
+if TYPE_CHECKING:
+    from sfms_robot.app.open_head import OpenHead
+    from sfms_robot.app.session import Drove
 
 LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
 
 
-def run_report(
-    log: RunLog,
-    bus: Bus,
-    feed: PlanFeed,
-    *,
-    head: str,
-    listener: str,
-    port: str,
-    seed: int,
-    outcome: str,
-    error: Exception | None,
-    rate_hz: float,
-    elapsed_s: float | None,
-    priority: str,
-) -> dict[str, Any]:
-    """Version 1 of the report. `elapsed_s` None means virtual time: wall-clock figures are null."""
-    real = elapsed_s is not None
+def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
+    """Return version 1 of the report. In virtual time wall-clock figures are null."""
+    log = drove.log
+    real = drove.elapsed_s is not None
     heard = dict(feed.statistics())
     timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
     plans = _counts(timeline, ("held", "eased", "late", "refused"))
     return {
         "version": 1,
-        "head": head,
+        "head": opened.config.name,
         "listener": listener,
-        "port": port,
+        "port": opened.options.port,
         "seed": seed,
         "duration_s": round(log.listened_s, 4),
-        "exit": outcome,
-        "error": None if error is None else str(error),
+        "exit": drove.outcome,
+        "error": None if drove.error is None else str(drove.error),
         "frames": log.frames,
         "ticks": log.ticks,
-        "tick": log.tick_report(rate_hz, elapsed_s),
+        "tick": log.tick_report(opened.rate_hz, drove.elapsed_s),
         "latency_ms": _latency(log, real),
         "listener_step_ms": heard.pop("step_ms"),
         "hop": heard.pop("hop", None),
         "budget_ms": heard.pop("budget_ms", None),
         "listener_state": heard,
-        "bus": dict(bus.statistics()),
+        "bus": dict(opened.bus.statistics()),
         "limits": {
             "violations": log.audited.violations if log.audited else 0,
             "clamped": log.audited.clamped if log.audited else 0,
@@ -76,7 +67,8 @@ def run_report(
         "attention": log.attention_report(),
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),
-        "priority": priority,
+        "priority": drove.priority,
+        "exit_code": drove.exit_code,
     }
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -131,14 +131,14 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
     config = session_config("serve", Router(options.zenoh, options.insecure))
     service_manager = ServiceManager()
     with ExitStack() as stack:
-        metrics = stack.enter_context(MetricsServer(options.metrics)) if options.metrics is not None else None
+        metrics = None if options.metrics is None else stack.enter_context(closing(metrics_server(options.metrics)))
         server = os.uname().nodename
         served = Served(options.listener, name, server, options.engine, options.hop, options.everybody)
         service = ZenohService(served, config, options.processes)
         stack.callback(service.close)
         pool = service.pool
         if metrics is not None:
-            metrics.serve(pool.statistics)
+            metrics.begin(pool.statistics)
             say(f"metrics: {metrics.url}")
         say(
             f"{name}: a plan every {pool.hop} frames, up to {pool.most} heads in {DEADLINE_S * 1e3:.0f} ms here, "
@@ -156,39 +156,25 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
 # --- figures for Prometheus -----------------------------------------------------------------------------------------
 
 
-class MetricsServer:
-    """Holds its port from construction until it is left; answers from `serve` on.
+def metrics_server(wanted: str) -> LoopbackServer:
+    """Bind the port of `serve --metrics [HOST:]PORT`: figures for Prometheus, by prometheus_client.
 
-    Args:
-        wanted: a port, "0" for any that is free; HOST:PORT beyond loopback.
-
-    Raises ConfigError, MissingExtra, PortError.
+    `wanted`: a port, "0" for any that is free; HOST:PORT beyond loopback. Raises ConfigError, MissingExtra, PortError.
     """
-
-    def __init__(self, wanted: str) -> None:
-        try:
-            import prometheus_client  # noqa: F401
-        except ImportError as error:
-            raise MissingExtra.of("--metrics", "remote") from error
-        self._host, self._port = _address(wanted)
-        self._taken = wanted
-        self.url = ""
-
-    def __enter__(self) -> MetricsServer:
-        try:
-            self._server = LoopbackServer(self._port, _Answer, "metrics", host=self._host)
-        except OSError as error:
-            raise PortError(f"--metrics {self._taken}: {error.strerror or error}") from error
-        self.url = f"{self._server.url}metrics"
-        return self
-
-    def serve(self, statistics: Document) -> None:
-        """Answer with these from now on."""
-        self._server.document = statistics
-        self._server.begin()
-
-    def __exit__(self, *_: object) -> None:
-        self._server.close()
+    try:
+        import prometheus_client  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra.of("--metrics", "remote") from error
+    host, _, number = wanted.rpartition(":")
+    port = port_number(number)
+    if port is None:
+        raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
+    try:
+        server = LoopbackServer(port, _Answer, "metrics", host=host or LOOPBACK)
+    except OSError as error:
+        raise PortError(f"--metrics {wanted}: {error.strerror or error}") from error
+    server.url += "metrics"
+    return server
 
 
 class _Answer(Answer):
@@ -219,11 +205,3 @@ class _Collector:
             metric = family(f"sfms_{name}", text, labels=["listener", "server"])
             metric.add_metric([told["listener"], told["server"]], float(value) * factor)
             yield metric
-
-
-def _address(wanted: str) -> tuple[str, int]:
-    host, _, number = wanted.rpartition(":")
-    port = port_number(number)
-    if port is None:
-        raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
-    return host or LOOPBACK, port
