@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
-from sfms_robot.app.listen.report import RunTeller, figures_so_far, limitation, run_facts, run_report
+from sfms_robot.app.listen.report import Drove, RunTeller, figures_so_far, limitation, run_facts, run_report
 from sfms_robot.app.loopback_server import StatusServer
 from sfms_robot.app.open_head import HeadOptions, OpenHead, open_head, prepare_head
 from sfms_robot.app.wiring import SIM
@@ -50,7 +50,6 @@ from sfms_robot.sources.registry import open_source, split_kind
 logger = logging.getLogger(__name__)
 
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
-INTERRUPTED: Final = 130
 
 Document = Callable[[], Mapping[str, Any]]
 Panel = Callable[[Document, Interrupt, HaltLatch, Callable[[float], None]], AbstractContextManager[object]]
@@ -84,24 +83,6 @@ class Programme:
     answers: bool = False
     halt: HaltLatch = field(default_factory=HaltLatch)
     observers: Sequence[Observer] = ()
-
-
-@dataclass(frozen=True)
-class Drove:
-    """How a drive ended: "done", "interrupted" or "failed", and then the error."""
-
-    outcome: str
-    log: RunLog
-    elapsed_s: float | None
-    priority: str
-    error: Exception | None = None
-
-    @property
-    def exit_code(self) -> int:
-        """Of the process: see `errors`."""
-        if self.outcome == "interrupted":
-            return INTERRUPTED
-        return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
 def run_log(opened: OpenHead) -> RunLog:

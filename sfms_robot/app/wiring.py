@@ -63,12 +63,10 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
     calibration, sagging = calibration_of(head.joints), sagging_joints(head)
     for index, (name, joint) in enumerate(head.joints.items()):
         table = Table.of(load_firmware_map(joint.model))
-        ticks = sagged_ticks(
-            sagged_rad(joint, name in sagging),
-            calibration.zero_ticks[index],
-            calibration.ticks_per_rad[index],
-            table.center_ticks,
-        )
+        angle_rad = sagged_rad(joint, name in sagging)
+        found = calibration.zero_ticks[index] + calibration.ticks_per_rad[index] * angle_rad
+        # Not held to the joint's limits, but to what a servo about its middle can read.
+        ticks = round(min(max(found, 0.0), 2.0 * table.center_ticks - 1.0))
         needs = JointNeeds(int(calibration.low_ticks[index]), int(calibration.high_ticks[index]))
         if multi_turn(table, needs):
             first, last = home_ticks(table.ticks_per_revolution, needs)
@@ -114,8 +112,3 @@ def sagging_joints(head: Head) -> frozenset[str]:
 def sagged_rad(joint: Joint, sags: bool) -> float:
     """Angle of a joint without torque: on the stop beyond its upper end (nose down), or hanging a little from rest."""
     return joint.max_rad + BEYOND_RAD if sags else joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)
-
-
-def sagged_ticks(angle_rad: float, zero_ticks: float, ticks_per_rad: float, center_ticks: int) -> int:
-    """Its servo's position: not held to the joint's limits, but to what a servo about `center_ticks` can read."""
-    return round(min(max(zero_ticks + ticks_per_rad * angle_rad, 0.0), 2.0 * center_ticks - 1.0))

@@ -20,13 +20,17 @@ INTERRUPTED = 130
 PACKAGES = typer.Option(
     [], "--package", metavar="DIR", help="A folder outside the head's that meshes may lie in; may be repeated."
 )
+NAME = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml.")
+JSON = typer.Option(False, "--json", help="Print as one JSON object.")
+JSON_OUTCOME = typer.Option(False, "--json", help="Print the outcome as one JSON object, last line of stdout.")
+YES = typer.Option(False, "--yes", help="Hobby servos may jump to rest when they come on.")
 
 app = typer.Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_args_is_help=True)
 
 
 @app.command("fit")
 def fit(
-    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    name: str = NAME,
     recording: Path | None = typer.Option(
         None, "--recording", metavar="DIR", help="run.mcap of the joints, and face.csv: what a tracker saw of them."
     ),
@@ -35,8 +39,8 @@ def fit(
     record: Path | None = typer.Option(None, "--record", metavar="DIR", help="Where --babble writes to."),
     minutes: float = typer.Option(2.0, "--minutes", min=0.1, max=60.0, help="Length of --babble."),
     seed: int = typer.Option(0, min=0, help="Of the random faces of --babble."),
-    yes: bool = typer.Option(False, "--yes", help="Hobby servos may jump to rest when they come on."),
-    json: bool = typer.Option(False, "--json", help="Print the outcome as one JSON object, last line of stdout."),
+    yes: bool = YES,
+    json: bool = JSON_OUTCOME,
 ) -> None:
     """From joints and what a face tracker saw of them, learn the drives that make the face look as asked.
 
@@ -71,7 +75,7 @@ def fit(
 @app.command("list")
 def list_heads(
     urdf: Path | None = typer.Option(None, "--urdf", metavar="FILE.png", help="Draw them all."),
-    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+    json: bool = JSON,
 ) -> None:
     """Shipped heads, with joints and buses."""
     from sfms_robot.app.catalogue import shipped_heads
@@ -92,12 +96,12 @@ def list_heads(
 
 @app.command("check")
 def check(
-    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    name: str = NAME,
     data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
     plot: Path | None = typer.Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
     listener: str | None = typer.Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
     packages: list[str] = PACKAGES,
-    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+    json: bool = JSON,
 ) -> None:
     """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
     from sfms_robot.app.head.head_check import check as check_head
@@ -122,13 +126,13 @@ def check(
 
 @app.command("show")
 def show(
-    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    name: str = NAME,
     joint: str | None = typer.Option(None, "--joint", metavar="JOINT", help="Only this joint."),
     urdf: Path | None = typer.Option(
         None, "--urdf", metavar="FILE.png", help="Draw the robot, and tell what its URDF's joints follow."
     ),
     packages: list[str] = PACKAGES,
-    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+    json: bool = JSON,
 ) -> None:
     """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
     if urdf is not None:
@@ -160,11 +164,11 @@ def show(
 
 @app.command("calibrate")
 def calibrate(
-    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    name: str = NAME,
     port: str = typer.Option(..., "--port", help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
     joint: list[str] = typer.Option([], "--joint", metavar="JOINT", help="Only this joint; may be given often."),
     again: bool = typer.Option(False, "--again", help="Also joints that are measured already."),
-    json: bool = typer.Option(False, "--json", help="Print the outcome as one JSON object, last line of stdout."),
+    json: bool = JSON_OUTCOME,
 ) -> None:
     """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
     from sfms_robot.app.head.calibrate import calibrate as lead_through
@@ -183,12 +187,12 @@ def calibrate(
 
 @app.command("pose")
 def pose(
-    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    name: str = NAME,
     face: list[str] = typer.Argument(..., metavar="EXPRESSION|CHANNEL=VALUE...", help="smile, blink, jawOpen=0.5 ..."),
     port: str = typer.Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
     hold: float = typer.Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="How long the pose is held."),
     fast: bool = typer.Option(False, help="Virtual time, on emulated servos."),
-    yes: bool = typer.Option(False, "--yes", help="Hobby servos may jump to rest when they come on."),
+    yes: bool = YES,
     json: bool = typer.Option(False, "--json", help="Print what moved as one JSON object, last line of stdout."),
 ) -> None:
     """Move one expression or channel under the head's limits, hold it, and go back to rest."""
@@ -206,7 +210,7 @@ def pose(
 
 @app.command("solve")
 def solve(
-    name: str = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml."),
+    name: str = NAME,
     poses: Path = typer.Option(
         ...,
         "--poses",

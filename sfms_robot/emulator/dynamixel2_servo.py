@@ -280,7 +280,7 @@ class Dynamixel2Servo(RegisterServo):
         plant, table, sign = self.plant, self.table, self._frame.sign
         per_tick = self._live.speed_per_tick
         top = table.top_speed_ticks_s
-        speed, current = sign * plant.speed, sign * plant.current_mA(top)
+        speed, current = sign * plant.speed, sign * plant.current_mA()
         drive = self._drive
         arrived = drive is None or drive.by_speed or abs(drive.goal - plant.position) < 8.0
         volts = round(10.0 * self.supply_v)

@@ -19,6 +19,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import IO, Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
@@ -32,6 +33,7 @@ READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be lat
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
 
 _START_S = 20.0
+_refusal = partial(ConfigError.at, "emulated chain")
 _BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
 
@@ -250,32 +252,32 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
         highest = 252 if table.channels is None else table.channels - 1
         key = ("" if table.channels is None else servo.model, servo.id)
         if key in seen:
-            raise ConfigError.at("emulated chain", "id", servo.id, "is used twice")
+            raise _refusal("id", servo.id, "is used twice")
         seen.add(key)
         if not 0 <= servo.id <= highest:
-            raise ConfigError.at("emulated chain", "id", servo.id, "is not a servo id", [f"0..{highest}"])
+            raise _refusal("id", servo.id, "is not a servo id", [f"0..{highest}"])
         bauds = sorted(table.baud_codes.values())
         if bauds and servo.baud not in bauds:
-            raise ConfigError.at("emulated chain", "baud", servo.baud, f"is no rate of {servo.model}", bauds)
+            raise _refusal("baud", servo.baud, f"is no rate of {servo.model}", bauds)
         if table.channels is not None:
             if servo.registers.keys() - _BOARD_SETTINGS.get(table.family, set()) or servo.supply_v is not None:
                 problem = "is a board of hobby servos: it has no registers, and does not know its supply"
-                raise ConfigError.at("emulated chain", "model", servo.model, problem)
+                raise _refusal("model", servo.model, problem)
             continue
         for name, value in servo.registers.items():
             register = table.registers.get(name)
             if register is None:
-                raise ConfigError.at("emulated chain", "register", name, f"is none of {servo.model}", table.registers)
+                raise _refusal("register", name, f"is none of {servo.model}", table.registers)
             if not register.low <= value <= register.high:
                 allowed = [f"{register.low}..{register.high}"]
-                raise ConfigError.at("emulated chain", name, value, f"is out of range of {servo.model}", allowed)
+                raise _refusal(name, value, f"is out of range of {servo.model}", allowed)
 
 
 def _check_link(link: str) -> None:
     if os.path.exists(link) or (os.path.lexists(link) and not os.path.islink(link)):
-        raise ConfigError.at("emulated chain", "link", link, "is already there")
+        raise _refusal("link", link, "is already there")
     if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
-        raise ConfigError.at("emulated chain", "link", link, "lies in a folder that does not exist")
+        raise _refusal("link", link, "lies in a folder that does not exist")
 
 
 def _reap(process: subprocess.Popen[bytes]) -> None:

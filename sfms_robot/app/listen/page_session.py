@@ -103,8 +103,7 @@ class PageSession:
             lonely = self._lonely(interrupt)
             stack.callback(recorder.close)
             self._commands.reach = Reach(halt, puppet, knobs, calmness, feed.calm, recorder.record, self._release)
-            stack.callback(self._out_of_reach)
-            stack.callback(self._remember, knobs)
+            stack.callback(self._ended, knobs)
             report = session.run(
                 options, _told_to(watcher, panel), source=self._source(stack), feed=feed,
                 observers=[watcher, recorder, *lonely, *observers], knobs=knobs,
@@ -136,16 +135,14 @@ class PageSession:
         endless = self._choices and any(_taken_of_visitors(self.options).values())
         return [EndsAlone(self.page, interrupt)] if endless else []
 
-    def _remember(self, knobs: LiveKnobs) -> None:
-        reach = self._commands.reach
+    def _ended(self, knobs: LiveKnobs) -> None:
+        """Take the run out of reach, and keep what visitors turned in it."""
+        reach, self._commands.reach = self._commands.reach, None
         assert reach is not None
         turned_to = {
             kind: tuple(f"{name}={value}" for name, value in knobs.values[kind].items()) for kind in KNOB_KINDS
         }
         self._set = {**turned_to, "calmness": reach.calmness}
-
-    def _out_of_reach(self) -> None:
-        self._commands.reach = None
 
     def _source(self, stack: ExitStack) -> Any:
         """Where a visitor is the person; None: the run opens what its options name."""

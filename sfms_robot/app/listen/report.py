@@ -9,6 +9,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,9 +27,27 @@ from sfms_robot.runtime.planned_events import EventWatch
 
 if TYPE_CHECKING:
     from sfms_robot.app.open_head import OpenHead
-    from sfms_robot.app.session import Drove
 
+INTERRUPTED: Final = 130  # exit code
 LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
+
+
+@dataclass(frozen=True)
+class Drove:
+    """How a drive ended: "done", "interrupted" or "failed", and then the error."""
+
+    outcome: str
+    log: RunLog
+    elapsed_s: float | None
+    priority: str
+    error: Exception | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """Of the process: see `errors`."""
+        if self.outcome == "interrupted":
+            return INTERRUPTED
+        return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
 def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
