@@ -39,7 +39,7 @@ class LoopbackServer(ThreadingHTTPServer):
 
     Attributes:
         port: the port that is bound; of 0, a free one.
-        url: of its root.
+        url: of its root; `note`: what people should know of it.
         document: gives what `Answer` has to say, at the time of a request.
     """
 
@@ -58,7 +58,7 @@ class LoopbackServer(ThreadingHTTPServer):
         """Bind the port. `now`: a monotonic clock [s]."""
         super().__init__((host, port), answer)
         self.port = int(self.server_address[1])
-        self.url = f"http://{host}:{self.port}/"
+        self.url, self.note = f"http://{host}:{self.port}/", ""
         self._name, self._now = name, now
         self._since_s: dict[Any, float] = {}  # connection -> when it was taken, oldest first
         self._thread: threading.Thread | None = None
@@ -140,37 +140,26 @@ class Answer(BaseHTTPRequestHandler):
 # --- the status of a run --------------------------------------------------------------------------------------------
 
 
-class StatusServer:
-    """`--status [PORT]`: how the run is, as one JSON document (`runtime.status`) at `url`. Read only.
+def status_server(wanted: str) -> LoopbackServer:
+    """Bind the port of `--status [PORT]`: how a run is, as one JSON document (`runtime.status`). Read only.
 
-    Holds its port from construction until `close`; clients that ask before `serve` wait.
-
-    Args:
-        wanted: a port, "0" for any that is free, or `AUTO`.
-
-    Raises ConfigError for what is no port, PortError for one that is in use.
-
-    Attributes:
-        port: that it has.
-        url: of the document.
+    `wanted`: a port, "0" for any that is free, or `AUTO`. Raises ConfigError for what is no port, PortError for one
+    that is in use.
     """
-
-    def __init__(self, wanted: str) -> None:
-        self._server = _bound(wanted)
-        self.port, self.url = self._server.port, self._server.url
-        self._taken = f" ({PORT} is taken)" if wanted == AUTO and self.port != PORT else ""
-
-    def __str__(self) -> str:
-        """Where it is, for people."""
-        return self.url + self._taken
-
-    def serve(self, document: Document) -> None:
-        """See `LoopbackServer`."""
-        self._server.begin(document)
-
-    def close(self) -> None:
-        """Give the port back. Idempotent."""
-        self._server.close()
+    if wanted != AUTO and port_number(wanted) is None:
+        raise ConfigError(f"--status {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or none)")
+    ports = [*range(PORT, PORT + _TRIED), 0] if wanted == AUTO else [int(wanted)]
+    problem: object = None
+    for port in ports:
+        try:
+            server = LoopbackServer(port, _Answer, "status")
+        except OSError as error:
+            problem = error.strerror or error
+            continue
+        if wanted == AUTO and port != PORT:
+            server.note = f" ({PORT} is taken)"
+        return server
+    raise PortError(f"--status {wanted}: {problem} (another port, or 0 for a free one)")
 
 
 class _Answer(Answer):
@@ -179,16 +168,3 @@ class _Answer(Answer):
             self.send_error(404)
             return
         self.answer(200, json.dumps(self.server.document(), allow_nan=False).encode(), "application/json")
-
-
-def _bound(wanted: str) -> LoopbackServer:
-    if wanted != AUTO and port_number(wanted) is None:
-        raise ConfigError(f"--status {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or none)")
-    ports = [*range(PORT, PORT + _TRIED), 0] if wanted == AUTO else [int(wanted)]
-    problem: object = None
-    for port in ports:
-        try:
-            return LoopbackServer(port, _Answer, "status")
-        except OSError as error:
-            problem = error.strerror or error
-    raise PortError(f"--status {wanted}: {problem} (another port, or 0 for a free one)")

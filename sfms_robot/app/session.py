@@ -22,7 +22,7 @@ from typing import Any, Final
 from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import Drove, RunTeller, figures_so_far, limitation, run_facts, run_report
-from sfms_robot.app.loopback_server import StatusServer
+from sfms_robot.app.loopback_server import LoopbackServer, status_server
 from sfms_robot.app.open_head import HeadOptions, OpenHead, open_head, prepare_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head
@@ -243,7 +243,7 @@ def run(
             stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
         tellers = [stack.enter_context(closing(RunTeller(outlet))) for outlet in person.outlets]
         if server is not None:
-            server.serve(status.document)
+            server.begin(status.document)
         watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
         programme = Programme(
             person, feed, duration_s,
@@ -290,13 +290,13 @@ def _enter_halts(options: RunOptions, halt: HaltLatch, signals: bool, stack: Exi
         stack.enter_context(halt_switch(options.halt_on, halt))
 
 
-def _status_server(options: RunOptions, facts: Mapping[str, Any], stack: ExitStack) -> StatusServer | None:
+def _status_server(options: RunOptions, facts: Mapping[str, Any], stack: ExitStack) -> LoopbackServer | None:
     """Serves that a run begins; a port that is taken is found before a listener is loaded."""
     if options.status is None:
         return None
-    server = stack.enter_context(closing(StatusServer(options.status)))
-    server.serve(RunStatus((), facts).document)
-    logger.warning("status: %s", server)
+    server = stack.enter_context(closing(status_server(options.status)))
+    server.begin(RunStatus((), facts).document)
+    logger.warning("status: %s%s", server.url, server.note)
     return server
 
 

@@ -160,24 +160,18 @@ def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
 # --- the page -------------------------------------------------------------------------------------------------------
 
 
-class FleetPage:
-    """Serves from construction until `close`. Raises PortError for a port that is taken (0: any free one)."""
-
-    def __init__(self, fleet: Fleet, port: int = PORT) -> None:
-        board = FleetBoard()
-        for document in fleet.states():
-            board.told(document)
-        fleet.follow(board.told)
-        try:
-            self._server = _Server(port, fleet, board)
-        except OSError as error:
-            raise PortError(f"--port {port}: {error.strerror or error} (another, or 0 for a free one)") from error
-        self.url = self._server.url
-        self._server.begin()
-
-    def close(self) -> None:
-        """Give the port back."""
-        self._server.close()
+def fleet_page(fleet: Fleet, port: int = PORT) -> LoopbackServer:
+    """Serve the page until `close`. Raises PortError for a port that is taken (0: any free one)."""
+    board = FleetBoard()
+    for document in fleet.states():
+        board.told(document)
+    fleet.follow(board.told)
+    try:
+        server = _Server(port, fleet, board)
+    except OSError as error:
+        raise PortError(f"--port {port}: {error.strerror or error} (another, or 0 for a free one)") from error
+    server.begin()
+    return server
 
 
 class _Server(LoopbackServer):

@@ -45,9 +45,9 @@ def check_names(
     listener_folder(listener)
     check_source(audio, face, agent_audio, play=play)
     if status is not None:
-        from sfms_robot.app.loopback_server import StatusServer  # http.server: only for who wants it
+        from sfms_robot.app.loopback_server import status_server  # http.server: only for who wants it
 
-        StatusServer(status).close()
+        status_server(status).close()
     for part in port.split(","):
         device = part.rpartition("=")[2]
         if (device.startswith("/") or is_address(device)) and (problem := access_problem(device)):
