@@ -17,7 +17,7 @@ _DPI: Final = 110
 
 
 def checked_file(file: Path, option: str) -> Path:
-    """The file. Raises ConfigError, which names the option, where none can be written."""
+    """Return the file. Raises ConfigError, which names the option, where none can be written."""
     if file.is_dir():
         raise ConfigError(f"{option} {file}: cannot be written: is a folder")
     if not file.parent.is_dir():
@@ -26,7 +26,7 @@ def checked_file(file: Path, option: str) -> Path:
 
 
 def made_folder(folder: Path, option: str) -> Path:
-    """The folder, which is there now. Raises ConfigError, which names the option, where it cannot be made."""
+    """Make the folder, and return it. Raises ConfigError, which names the option, where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -38,14 +38,14 @@ def made_folder(folder: Path, option: str) -> Path:
 
 
 def checked_png(png: Path, option: str) -> Path:
-    """The file, before anybody has worked for it. Raises ConfigError where no PNG can be written there."""
+    """Return the file, before the work for it begins. Raises ConfigError where no PNG can be written there."""
     if png.suffix.lower() != ".png":
         raise ConfigError(f"{option} {png}: is no name of a picture (FILE.png)")
     return checked_file(png, option)
 
 
 def new_figure(width_in: float, height_in: float, dpi: int = _DPI) -> Figure:
-    """An empty figure. Raises MissingExtra without matplotlib."""
+    """Return an empty figure. Raises MissingExtra without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -63,7 +63,7 @@ def save(figure: Figure, png: Path) -> None:
 
 
 def plain(axes: Axes, size: float = 8, grid: Literal["both", "x"] = "both") -> None:
-    """No box, faint grid."""
+    """Draw no box, and a faint grid."""
     axes.tick_params(labelsize=size, colors=INK, length=2, which="both")
     axes.grid(axis=grid, color=RULE, linewidth=0.6)
     axes.set_axisbelow(True)

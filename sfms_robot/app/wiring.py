@@ -101,7 +101,7 @@ def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
 
 
 def sagging_joints(head: Head) -> frozenset[str]:
-    """Joints that bear the weight of the head, which falls forward: those that pitch a serial neck."""
+    """Return joints that bear the weight of the head, which falls forward: those that pitch a serial neck."""
     neck = head.kinematics
     if neck is None or neck.kind != "serial" or "pitch" not in neck.axes:
         return frozenset()
@@ -110,5 +110,5 @@ def sagging_joints(head: Head) -> frozenset[str]:
 
 
 def sagged_rad(joint: Joint, sags: bool) -> float:
-    """Angle of a joint without torque: on the stop beyond its upper end (nose down), or hanging a little from rest."""
+    """Return the angle without torque: on the stop beyond its upper end (nose down), or hanging a little from rest."""
     return joint.max_rad + BEYOND_RAD if sags else joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)

@@ -1,4 +1,4 @@
-"""A run in a thread of its own: begun, asked to end, waited for, and what went wrong handed to whoever asks."""
+"""A run in a thread of its own: begin it, ask it to end, wait for it, and learn what went wrong."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ class Background:
 
 
 def head_name(head: Head | str) -> str:
-    """Name or folder of a head.
+    """Return the name or folder of a head that a program loaded, as a run opens it.
 
     What belongs to one build (its calibration, what is stored in its servos) lies beside the head's file, so a head
     runs from there. Raises ConfigError for one that was changed since it was loaded, or was made without a file.

@@ -3,7 +3,7 @@
     who answers -> torque off, moved by hand, or moved by keys -> ends, rest, direction -> a slow check -> saved
 
 All it needs of a terminal is a line out and a line in, so it works over any connection. Every joint is saved when it
-is done: who stops in the middle goes on there the next time. Only the overlay of this build is written.
+is done: a calibration that is stopped goes on there the next time. Only the overlay of this build is written.
 """
 
 from __future__ import annotations

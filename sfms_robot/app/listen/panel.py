@@ -346,7 +346,7 @@ class Keyboard:
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Given back while inside, whoever wants to take it."""
+        """Give the terminal back while inside; no thread can take it meanwhile."""
         with self._lock:
             self.give_back()
             yield
@@ -366,7 +366,7 @@ class Keyboard:
 
 
 def in_background(fd: int) -> bool:
-    """Whether the terminal `fd` belongs to another program at the moment. False for one that belongs to no shell."""
+    """Return whether the terminal `fd` belongs to another program now. False where it belongs to no shell."""
     try:
         return hasattr(os, "tcgetpgrp") and os.tcgetpgrp(fd) != os.getpgrp()
     except OSError:
@@ -374,7 +374,7 @@ def in_background(fd: int) -> bool:
 
 
 def keyboard(stream: TextIO | None) -> Keyboard | None:
-    """That of a terminal; None where `stream` is none, or the system (Windows) has no such terminals."""
+    """Return the keyboard of a terminal; None where `stream` is no terminal, or the system (Windows) has none."""
     if termios is None or stream is None or stream.closed or not stream.isatty():
         return None
     return Keyboard(stream.fileno())
@@ -382,7 +382,7 @@ def keyboard(stream: TextIO | None) -> Keyboard | None:
 
 @contextmanager
 def reading_keys(found: Keyboard, pressed: Callable[[str], object]) -> Iterator[None]:
-    """`pressed(key)` in a thread of its own, for every key while inside."""
+    """Call `pressed(key)` in a thread of its own, for every key while inside."""
     ours, theirs = os.pipe()  # readable once it is over
 
     def work() -> None:

@@ -34,7 +34,7 @@ LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts tha
 
 @dataclass(frozen=True)
 class Drove:
-    """How a drive ended: "done", "interrupted" or "failed", and then the error."""
+    """The end of a drive: "done", "interrupted" or "failed", and then the error."""
 
     outcome: str
     log: RunLog
@@ -120,7 +120,7 @@ def _counts(state: object, names: tuple[str, ...]) -> dict[str, int]:
 
 
 def run_facts(head: Head, listener: str, options: Mapping[str, Any]) -> dict[str, str]:
-    """Text by text, for `Recorder(about=...)`.
+    """Return what a recording says of its run, text by text, for `Recorder(about=...)`: what ran, on what, and how.
 
     `head_yaml` is the head as it was used, calibration included, and a head's file itself. Of a listener that is a
     folder there are its configuration and the SHA-256 of its weights.

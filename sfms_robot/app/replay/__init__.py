@@ -34,7 +34,7 @@ def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> d
 
 
 def sheet(recording: RunRecording, png: Path | str) -> list[Instant]:
-    """Draw the face the listener asked for and what the servos did, and say at which instants.
+    """Draw virtual head and robot at twelve instants: the face asked for, what the servos did. Return the instants.
 
     A head that is not at hand, has other joints now or names no URDF is left out. Raises MissingExtra without vtk.
     """
@@ -43,7 +43,7 @@ def sheet(recording: RunRecording, png: Path | str) -> list[Instant]:
 
 
 def _robot(recording: RunRecording) -> tuple[RobotScene, Doubles] | None:
-    """What it looks like, and the angles (N, J) that were read, or asked for where none was."""
+    """Return the robot's picture, and the angles (N, J) that were read, or asked for where none was."""
     try:
         head = load_head(recording.about["head"])
         scene = scene_of(head) if tuple(head.joints) == recording.joints else None
