@@ -1,8 +1,7 @@
 """Emulated servos and boards in this process, without a wire."""
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.device import plugged
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo, plugged
 from sfms_robot.servo.registers import Table
 
 

@@ -7,6 +7,7 @@ client that sends its request at once is answered beside any number of slow ones
 
 from __future__ import annotations
 
+import json
 import socket
 import sys
 import threading
@@ -16,12 +17,17 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-from sfms_robot.endpoint import LOOPBACK
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
+from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.origin import host_problem
 
 MOST_CONNECTIONS: Final = 32
 CONNECTION_S: Final = 10.0  # for the request and for the answer, however either trickles
 _NO_DESCRIPTOR_S: Final = 0.1  # pause where no connection can be taken: else the thread would spin until one can
+
+AUTO: Final = "auto"  # `--status` without a port: `PORT`, or the next that is free
+PORT: Final = 8775
+_TRIED: Final = 20
 
 Document = Callable[[], Mapping[str, Any]]
 
@@ -33,7 +39,7 @@ class LoopbackServer(ThreadingHTTPServer):
 
     Attributes:
         port: the port that is bound; of 0, a free one.
-        url: of its root.
+        url: of its root; `note`: what people should know of it.
         document: gives what `Answer` has to say, at the time of a request.
     """
 
@@ -52,14 +58,14 @@ class LoopbackServer(ThreadingHTTPServer):
         """Bind the port. `now`: a monotonic clock [s]."""
         super().__init__((host, port), answer)
         self.port = int(self.server_address[1])
-        self.url = f"http://{host}:{self.port}/"
-        self.document: Document = dict
+        self.url, self.note = f"http://{host}:{self.port}/", ""
         self._name, self._now = name, now
         self._since_s: dict[Any, float] = {}  # connection -> when it was taken, oldest first
         self._thread: threading.Thread | None = None
 
-    def begin(self) -> None:
-        """Start to answer, in threads. Idempotent."""
+    def begin(self, document: Document = dict) -> None:
+        """Answer from now on, in threads, with this document."""
+        self.document = document
         if self._thread is None:
             self._thread = threading.Thread(target=self.serve_forever, name=self._name, daemon=True)
             self._thread.start()
@@ -129,3 +135,36 @@ class Answer(BaseHTTPRequestHandler):
 
     def log_message(self, *_: object) -> None:
         """Log nothing: a line per request helps no reader."""
+
+
+# --- the status of a run --------------------------------------------------------------------------------------------
+
+
+def status_server(wanted: str) -> LoopbackServer:
+    """Bind the port of `--status [PORT]`: how a run is, as one JSON document (`runtime.status`). Read only.
+
+    `wanted`: a port, "0" for any that is free, or `AUTO`. Raises ConfigError for what is no port, PortError for one
+    that is in use.
+    """
+    if wanted != AUTO and port_number(wanted) is None:
+        raise ConfigError(f"--status {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or none)")
+    ports = [*range(PORT, PORT + _TRIED), 0] if wanted == AUTO else [int(wanted)]
+    problem: object = None
+    for port in ports:
+        try:
+            server = LoopbackServer(port, _Answer, "status")
+        except OSError as error:
+            problem = error.strerror or error
+            continue
+        if wanted == AUTO and port != PORT:
+            server.note = f" ({PORT} is taken)"
+        return server
+    raise PortError(f"--status {wanted}: {problem} (another port, or 0 for a free one)")
+
+
+class _Answer(Answer):
+    def do_GET(self) -> None:
+        if self.path not in ("/", "/status"):
+            self.send_error(404)
+            return
+        self.answer(200, json.dumps(self.server.document(), allow_nan=False).encode(), "application/json")

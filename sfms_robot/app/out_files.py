@@ -1,14 +1,23 @@
-"""Files that a command will write, looked at before anybody has worked for them."""
+"""Files that a command will write, checked before the work for them begins; and how pictures look."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, MissingExtra
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, FAINT, RULE, TRUTH, KEY = "#2a2d34", "#7d828c", "#e4e9ec", "#9aa3ad", "#c8553d"
+SERIES: Final = ("#1f6f9c", "#c29a2e", "#5b8c5a", "#c8553d", "#7a5c99")
+_DPI: Final = 110
 
 
 def checked_file(file: Path, option: str) -> Path:
-    """The file. Raises ConfigError, which names the option, where none can be written."""
+    """Return the file. Raises ConfigError, which names the option, where none can be written."""
     if file.is_dir():
         raise ConfigError(f"{option} {file}: cannot be written: is a folder")
     if not file.parent.is_dir():
@@ -17,9 +26,48 @@ def checked_file(file: Path, option: str) -> Path:
 
 
 def made_folder(folder: Path, option: str) -> Path:
-    """The folder, which is there now. Raises ConfigError, which names the option, where it cannot be made."""
+    """Make the folder, and return it. Raises ConfigError, which names the option, where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{option} {folder}: cannot be written to: {error.strerror or error}") from error
     return folder
+
+
+# --- pictures of tables and heads -----------------------------------------------------------------------------------
+
+
+def checked_png(png: Path, option: str) -> Path:
+    """Return the file, before the work for it begins. Raises ConfigError where no PNG can be written there."""
+    if png.suffix.lower() != ".png":
+        raise ConfigError(f"{option} {png}: is no name of a picture (FILE.png)")
+    return checked_file(png, option)
+
+
+def new_figure(width_in: float, height_in: float, dpi: int = _DPI) -> Figure:
+    """Return an empty figure. Raises MissingExtra without matplotlib."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra.of("a plot", "pictures") from error
+    return Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
+
+
+def save(figure: Figure, png: Path) -> None:
+    """Write a picture. Raises ConfigError where that cannot be done."""
+    try:
+        png.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(png)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{png}: cannot be written: {error}") from error
+
+
+def plain(axes: Axes, size: float = 8, grid: Literal["both", "x"] = "both") -> None:
+    """Draw no box, and a faint grid."""
+    axes.tick_params(labelsize=size, colors=INK, length=2, which="both")
+    axes.grid(axis=grid, color=RULE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(FAINT)

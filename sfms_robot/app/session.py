@@ -21,11 +21,8 @@ from typing import Any, Final
 
 from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
-from sfms_robot.app.listen.limitation import limitation
-from sfms_robot.app.listen.report import figures_so_far, run_report
-from sfms_robot.app.listen.run_facts import run_facts
-from sfms_robot.app.listen.run_teller import RunTeller
-from sfms_robot.app.listen.status_server import StatusServer
+from sfms_robot.app.listen.report import Drove, RunTeller, figures_so_far, limitation, run_facts, run_report
+from sfms_robot.app.loopback_server import LoopbackServer, status_server
 from sfms_robot.app.open_head import HeadOptions, OpenHead, open_head, prepare_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head
@@ -53,7 +50,6 @@ from sfms_robot.sources.registry import open_source, split_kind
 logger = logging.getLogger(__name__)
 
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
-INTERRUPTED: Final = 130
 
 Document = Callable[[], Mapping[str, Any]]
 Panel = Callable[[Document, Interrupt, HaltLatch, Callable[[float], None]], AbstractContextManager[object]]
@@ -87,24 +83,6 @@ class Programme:
     answers: bool = False
     halt: HaltLatch = field(default_factory=HaltLatch)
     observers: Sequence[Observer] = ()
-
-
-@dataclass(frozen=True)
-class Drove:
-    """How a drive ended: "done", "interrupted" or "failed", and then the error."""
-
-    outcome: str
-    log: RunLog
-    elapsed_s: float | None
-    priority: str
-    error: Exception | None = None
-
-    @property
-    def exit_code(self) -> int:
-        """Of the process: see `errors`."""
-        if self.outcome == "interrupted":
-            return INTERRUPTED
-        return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
 def run_log(opened: OpenHead) -> RunLog:
@@ -270,7 +248,7 @@ def run(
             stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
         tellers = [stack.enter_context(closing(RunTeller(outlet))) for outlet in person.outlets]
         if server is not None:
-            server.serve(status.document)
+            server.begin(status.document)
         watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
         programme = Programme(
             person, feed, duration_s,
@@ -318,13 +296,13 @@ def _enter_halts(options: RunOptions, halt: HaltLatch, signals: bool, stack: Exi
         stack.enter_context(halt_switch(options.halt_on, halt))
 
 
-def _status_server(options: RunOptions, facts: Mapping[str, Any], stack: ExitStack) -> StatusServer | None:
+def _status_server(options: RunOptions, facts: Mapping[str, Any], stack: ExitStack) -> LoopbackServer | None:
     """Serves that a run begins; a port that is taken is found before a listener is loaded."""
     if options.status is None:
         return None
-    server = stack.enter_context(closing(StatusServer(options.status)))
-    server.serve(RunStatus((), facts).document)
-    logger.warning("status: %s", server)
+    server = stack.enter_context(closing(status_server(options.status)))
+    server.begin(RunStatus((), facts).document)
+    logger.warning("status: %s%s", server.url, server.note)
     return server
 
 
@@ -356,12 +334,8 @@ def _status(
 
 
 def _report(options: RunOptions, opened: OpenHead, drove: Drove, feed: PlanFeed, person: Source) -> dict[str, Any]:
-    report = run_report(
-        drove.log, opened.bus, feed, head=opened.config.name, listener=Path(options.listener).name,
-        port=options.port, seed=options.seed, outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz,
-        elapsed_s=drove.elapsed_s, priority=drove.priority,
-    )  # fmt: skip
-    report |= {"exit_code": drove.exit_code, "source": dict(person.statistics())}
+    report = run_report(opened, drove, feed, Path(options.listener).name, options.seed)
+    report |= {"source": dict(person.statistics())}
     return report | {"wire": opened.digests()} if options.fast else report
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from math import radians
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,6 @@ from sfms_robot.config import Bus as BusConfig
 from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map
 from sfms_robot.config.emulate import load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo
-from sfms_robot.emulator.sagging import sagged_rad, sagged_ticks, sagging_joints
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
@@ -24,6 +24,8 @@ from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
 SIM: Final = "sim"
+HANGING: Final = 0.3  # fraction of the way from rest to its lower end, where nothing pulls hard
+BEYOND_RAD: Final = radians(2.0)  # how far a stop lies outside the range of the head's file
 
 Opened = Mapping[str, Chain | str]  # per named bus: an emulated chain, or a serial device
 
@@ -61,12 +63,10 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
     calibration, sagging = calibration_of(head.joints), sagging_joints(head)
     for index, (name, joint) in enumerate(head.joints.items()):
         table = Table.of(load_firmware_map(joint.model))
-        ticks = sagged_ticks(
-            sagged_rad(joint, name in sagging),
-            calibration.zero_ticks[index],
-            calibration.ticks_per_rad[index],
-            table.center_ticks,
-        )
+        angle_rad = sagged_rad(joint, name in sagging)
+        found = calibration.zero_ticks[index] + calibration.ticks_per_rad[index] * angle_rad
+        # Not held to the joint's limits, but to what a servo about its middle can read.
+        ticks = round(min(max(found, 0.0), 2.0 * table.center_ticks - 1.0))
         needs = JointNeeds(int(calibration.low_ticks[index]), int(calibration.high_ticks[index]))
         if multi_turn(table, needs):
             first, last = home_ticks(table.ticks_per_revolution, needs)
@@ -95,3 +95,20 @@ def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
         ]
         for bus, servos in emulated(head).items()
     }
+
+
+# --- where the joints of a head stand that is switched off ----------------------------------------------------------
+
+
+def sagging_joints(head: Head) -> frozenset[str]:
+    """Return joints that bear the weight of the head, which falls forward: those that pitch a serial neck."""
+    neck = head.kinematics
+    if neck is None or neck.kind != "serial" or "pitch" not in neck.axes:
+        return frozenset()
+    pitch = neck.axes["pitch"]
+    return frozenset([pitch] if isinstance(pitch, str) else [pitch.lower, pitch.upper])
+
+
+def sagged_rad(joint: Joint, sags: bool) -> float:
+    """Return the angle without torque: on the stop beyond its upper end (nose down), or hanging a little from rest."""
+    return joint.max_rad + BEYOND_RAD if sags else joint.rest_rad + HANGING * (joint.min_rad - joint.rest_rad)

@@ -82,10 +82,9 @@ def page(
     json: bool = typer.Option(False, "--json", help="Print its address as one JSON object when it is served."),
 ) -> None:
     """Serve a page with a tile per head and a button that halts all, until Ctrl-C or SIGTERM."""
-    from sfms_robot.app.fleet.fleet_client import Fleet
-    from sfms_robot.app.fleet.fleet_page import FleetPage
+    from sfms_robot.app.fleet.fleet_client import Fleet, fleet_page
 
-    with Fleet(zenoh, insecure, key) as found, closing(FleetPage(found, port)) as served, suppress(KeyboardInterrupt):
+    with Fleet(zenoh, insecure, key) as found, closing(fleet_page(found, port)) as served, suppress(KeyboardInterrupt):
         if json:
             print_json({"version": 1, "url": served.url})
         else:

@@ -62,8 +62,7 @@ def _view(folder: Path, view: str) -> None:
     """Until nobody looks any more, or Ctrl-C."""
     from contextlib import closing, suppress
 
-    from sfms_robot.app.listen.browser_window import open_browser
-    from sfms_robot.app.listen.preflight import begin_page
+    from sfms_robot.app.listen.preflight import begin_page, open_browser
     from sfms_robot.app.replay.page_replay import show_recording, wait_for_visitors
 
     page = begin_page(view)

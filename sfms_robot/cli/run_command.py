@@ -5,16 +5,12 @@ from __future__ import annotations
 import sys
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 
 from sfms_robot.cli.head_command import PACKAGES
 from sfms_robot.cli.json_line import print_json
 from sfms_robot.data import head_names, listener_names, speaker_names
-
-if TYPE_CHECKING:
-    from sfms_robot.config import Calmness
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
@@ -185,7 +181,11 @@ def run(
 
     check_names(head, listener, port, audio, face, agent_audio, play, status)
     runs_on = engine_named(engine)
-    calm = _calmness(calmness, addressed) if calmness or addressed != "sense" else None
+    calm = None
+    if calmness or addressed != "sense":
+        from sfms_robot.app.listen.knobs import calmed
+
+        calm = calmed(calmness, addressed)
     if check:
         _check(audio, duration, json)
         return
@@ -226,21 +226,13 @@ def run(
     raise typer.Exit(report.get("exit_code", 0))
 
 
-def _calmness(per_minute: list[str], addressed: str) -> Calmness:
-    from sfms_robot.app.listen.knobs import calmed
-
-    return calmed(per_minute, addressed)
-
-
 def _check(audio: str, duration_s: float | None, json: bool) -> None:
     from sfms_robot.app.listen.sound_check import CHECK_S, check_sound
-    from sfms_robot.cli.meter import LevelMeter
+    from sfms_robot.cli.show import LevelMeter, print_sound_check
 
     with LevelMeter() as meter:
         told = check_sound("mic" if audio == "default" else audio, duration_s or CHECK_S, None if json else meter)
     if json:
         print_json(told)
         return
-    from sfms_robot.cli.show import print_sound_check
-
     print_sound_check(told)

@@ -24,25 +24,26 @@ control socket says how many there are and what time it is. Control requests and
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import select
 import shutil
 import signal
 import socket
+import struct
 import sys
 import tempfile
 import time
+import tty
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from sfms_robot.emulator.device import plugged
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo, plugged
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
-from sfms_robot.emulator.pseudo_terminal import PseudoTerminal
 from sfms_robot.errors import ConfigError
 from sfms_robot.realtime import realtime_priority
 from sfms_robot.servo.registers import Table
@@ -50,6 +51,47 @@ from sfms_robot.servo.registers import Table
 _CHUNK: Final = 4096
 _PATIENCE_S: Final = 1.0  # for bytes that a client said it had written
 _IDLE_S: Final = 0.25  # the longest that motors are left alone in real time
+_TCGETS2: Final = 0x802C542A  # struct termios2 tells any rate as a number, odd ones too
+_TERMIOS2: Final = struct.Struct("=4IB19s2I")
+_OUTPUT_RATE: Final = -1
+
+
+class PseudoTerminal:
+    """The open pty that the chain sits behind.
+
+    `link` is a symbolic link to it, replaced when it is opened and removed when it is closed: the name stays when the
+    adapter is hung up and comes back.
+    """
+
+    def __init__(self, link: str) -> None:
+        self.link = link
+        self.fd, self._slave = os.openpty()  # the slave stays open, so that hosts may come and go
+        tty.setraw(self._slave)
+        os.set_blocking(self.fd, False)
+        self.path = os.ttyname(self._slave)
+        beside = f"{link}.new"
+        if os.path.lexists(beside):
+            os.unlink(beside)
+        os.symlink(self.path, beside)
+        os.replace(beside, link)
+
+    def baud(self) -> int:
+        """What the host has set."""
+        raw = fcntl.ioctl(self.fd, _TCGETS2, bytes(_TERMIOS2.size))
+        return int(_TERMIOS2.unpack(raw)[_OUTPUT_RATE])
+
+    def send(self, data: bytes, patience_s: float) -> None:
+        """Write what the terminal takes within `patience_s`; the rest is lost, as on a wire."""
+        view = memoryview(data)
+        while view and select.select([], [self.fd], [], patience_s)[1]:
+            view = view[os.write(self.fd, view) :]
+
+    def close(self) -> None:
+        """Hosts see the device vanish. The link goes too, unless somebody else has taken its name."""
+        if os.path.islink(self.link) and os.readlink(self.link) == self.path:
+            os.unlink(self.link)
+        os.close(self.fd)
+        os.close(self._slave)
 
 
 @dataclass

@@ -1,12 +1,15 @@
-"""What hangs on an emulated wire: something that hears bytes and answers in packets."""
+"""Devices on an emulated wire: each receives bytes and answers in packets.
+
+`EmulatedServo` is plain data, so that the process of an emulated chain loads neither configs nor libraries.
+"""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, Protocol
 
-from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.servo.registers import Table
 
 _DEVICES: Final = {  # (family, protocol) -> class; imported only when something of it is plugged in
@@ -16,6 +19,24 @@ _DEVICES: Final = {  # (family, protocol) -> class; imported only when something
     ("maestro", None): "sfms_robot.emulator.pulse_boards:MaestroBoard",
     ("ssc32", None): "sfms_robot.emulator.pulse_boards:Ssc32Board",
 }
+
+
+@dataclass(frozen=True)
+class EmulatedServo:
+    """What is plugged in, or on a board one of its channels.
+
+    `start_ticks`: what its position reads when the host comes, torque off: outside its limits, or beyond one turn where
+    somebody has turned it by hand since it was switched on. `registers`: what somebody stored in it before, by name
+    (homing offset, position limits, shutdown, ...). `supply_v` None: a voltage that it is content with.
+    """
+
+    id: int
+    model: str = "xl330-m288"
+    baud: int = 1_000_000
+    start_ticks: int = 2048
+    firmware: int = 53
+    registers: Mapping[str, int] = field(default_factory=dict)
+    supply_v: float | None = None
 
 
 class Reply(NamedTuple):

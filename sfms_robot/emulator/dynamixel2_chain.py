@@ -1,6 +1,6 @@
 """Emulated Protocol 2.0 servos on one wire.
 
-The rules of the wire, beside those of `servo_chain`: on a sync or bulk read each servo waits for the one before it, and
+The rules of the wire, beside those of `ServoChain`: on a sync or bulk read each servo waits for the one before it, and
 two servos with one id talk over one another.
 """
 
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from sfms_robot.emulator.device import Reply
 from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
-from sfms_robot.emulator.servo_chain import ServoChain, same_baud
+from sfms_robot.emulator.register_servo import ServoChain, same_baud
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_status
 
@@ -115,11 +115,8 @@ def _is_old(servo: Dynamixel2Servo) -> bool:
 
 def _broadcast(code: int, params: bytes, listening: Listening, now_s: float) -> Iterator[Reply]:
     last = 0
-    for servo_id in sorted(listening.own):
-        there = listening.own[servo_id]
-        answers = [_single(servo, code, params, now_s, broadcast=True) for servo in there]
-        packets = [answer for answer in answers if answer is not None]
-        if packets:
+    for servo_id, there in sorted(listening.own.items()):
+        if packets := _packets(there, code, params, now_s, broadcast=True):
             pause_s = there[0].return_delay_s + _SLOT_S * (servo_id - last)
             last = servo_id
             yield Reply((servo_id,), _collided(packets), pause_s)
@@ -129,12 +126,10 @@ def _addressed(packet: Packet, listening: Listening, now_s: float) -> Iterator[R
     """One id: those whose own it is answer, those whose second id it is obey in silence."""
     servo_id, code, params = packet.servo, packet.instruction, packet.params
     for servo in listening.second.get(servo_id, ()):
-        _single(servo, code, params, now_s, broadcast=False)
+        _single(servo, code, params, now_s)
     there = listening.own.get(servo_id, [])
     pause_s = max((servo.return_delay_s for servo in there), default=0.0)
-    answers = [_single(servo, code, params, now_s, broadcast=False) for servo in there]
-    packets = [answer for answer in answers if answer is not None]
-    if packets:
+    if packets := _packets(there, code, params, now_s):
         yield Reply((servo_id,), _collided(packets), pause_s)
 
 
@@ -150,8 +145,16 @@ def _collided(packets: Sequence[bytes]) -> bytes:
     return bytes(out)
 
 
-def _single(servo: Dynamixel2Servo, code: int, params: bytes, now_s: float, broadcast: bool) -> bytes | None:
-    """What one servo answers to an instruction of its own, or None."""
+def _packets(
+    servos: Sequence[Dynamixel2Servo], code: int, params: bytes, now_s: float, broadcast: bool = False
+) -> list[bytes]:
+    """Return the answers of servos of one id, in their order; every one of them obeys."""
+    answers = [_single(servo, code, params, now_s, broadcast) for servo in servos]
+    return [answer for answer in answers if answer is not None]
+
+
+def _single(servo: Dynamixel2Servo, code: int, params: bytes, now_s: float, broadcast: bool = False) -> bytes | None:
+    """Return the answer of one servo to an instruction of its own, or None."""
     error, data, level, servo_id = 0, b"", 2, servo.id  # it still answers by the id it is just losing
     if code == dxl2.PING:
         (error, found), level = servo.read(0, 7, now_s), 0
@@ -166,17 +169,15 @@ def _single(servo: Dynamixel2Servo, code: int, params: bytes, now_s: float, broa
         error = servo.register(_word(params), params[2:])
     elif code == dxl2.ACTION:
         error = servo.action(now_s)
-    elif code == dxl2.REBOOT:
+    elif code in (dxl2.REBOOT, dxl2.FACTORY_RESET):  # answered first, as it still is
+        if broadcast and code == dxl2.FACTORY_RESET and params[0] == 0xFF:
+            return None  # ignored since firmware 42: all would have one id
         reply = _status(servo, 0, b"", servo_id)
         answers = servo.return_level >= 2 and not broadcast
-        servo.reboot(now_s)
-        return reply if answers else None
-    elif code == dxl2.FACTORY_RESET:
-        if broadcast and params[0] == 0xFF:  # ignored since firmware 42: all would have one id
-            return None
-        reply = _status(servo, 0, b"", servo_id)
-        answers = servo.return_level >= 2 and not broadcast
-        servo.factory_reset(params[0], now_s)
+        if code == dxl2.REBOOT:
+            servo.reboot(now_s)
+        else:
+            servo.factory_reset(params[0], now_s)
         return reply if answers else None
     elif code == dxl2.CLEAR:
         error = servo.clear(params, now_s)

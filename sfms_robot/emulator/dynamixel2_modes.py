@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from sfms_robot.emulator.plant import MotorCommand
-from sfms_robot.emulator.register_file import RegisterFile
+from sfms_robot.emulator.register_servo import RegisterFile
 from sfms_robot.servo.registers import Table
 
 CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16

@@ -6,12 +6,13 @@ middle of its range, wherever it stands, so a host that enables torque before it
 
 from __future__ import annotations
 
+import struct
 from itertools import groupby
+from operator import itemgetter
 from typing import Final
 
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.dynamixel2_modes import POSITION, TORQUE_ON_BY_GOAL, TickFrames, motor_command
-from sfms_robot.emulator.emulated_servo import EmulatedServo
-from sfms_robot.emulator.present_values import PresentValues
 from sfms_robot.emulator.register_servo import RegisterServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Field, Table
@@ -25,6 +26,14 @@ _GOALS: Final = frozenset({"goal_pwm", "goal_current", "goal_velocity", "goal_po
 _BOUND_BY: Final = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
 _TURNS_CLEARED: Final = b"\x01\x44\x58\x4c\x22"  # parameters of `clear`
 FAULT_BITS: Final = {"voltage": 0, "overheating": 2, "overload": 5}  # of the X series; others say it in the map
+# Registers that are worked out whenever somebody reads them, in the order of the values.
+LIVE: Final = (
+    "realtime_tick", "moving", "moving_status", "present_pwm", "present_current", "present_load", "present_velocity",
+    "present_speed", "present_position", "velocity_trajectory", "position_trajectory", "present_input_voltage",
+    "present_voltage", "present_temperature",
+)  # fmt: skip
+_CODES: Final = {(1, "no"): "B", (2, "no"): "H", (4, "no"): "I",
+                 (1, "twos_complement"): "b", (2, "twos_complement"): "h", (4, "twos_complement"): "i"}  # fmt: skip
 
 
 class Dynamixel2Servo(RegisterServo):
@@ -44,11 +53,8 @@ class Dynamixel2Servo(RegisterServo):
         self._bits = _fault_bits(table)
         self._reset(keep={}, areas=(True, False))
         self._take_stored(what)
-        self._put("torque_limit", self._get("max_torque"))
         self.plant.position = self.plant.reference = TickFrames(self._file).shaft(float(what.start_ticks))
-        self._put("goal_position", table.center_ticks)
-        self._settings()
-        self._watch_supply()
+        self._power_up()
 
     @property
     def return_level(self) -> int:
@@ -132,10 +138,7 @@ class Dynamixel2Servo(RegisterServo):
         self._deaf_until_s = now_s + REBOOT_S
         self.plant.position %= self.table.ticks_per_revolution
         self._reset(keep={}, areas=(False,))
-        self._put("torque_limit", self._get("max_torque"))  # XL-320
-        self._put("goal_position", self.table.center_ticks)
-        self._settings()
-        self._watch_supply()
+        self._power_up()
 
     def factory_reset(self, option: int, now_s: float) -> None:
         """0xFF everything, 1 all but the id, 2 all but id and baud; then a reboot."""
@@ -185,6 +188,12 @@ class Dynamixel2Servo(RegisterServo):
             self._latch(self._bits["overheating"])
 
     # --- inside -------------------------------------------------------------------------------------------------
+
+    def _power_up(self) -> None:
+        self._put("torque_limit", self._get("max_torque"))  # XL-320
+        self._put("goal_position", self.table.center_ticks)
+        self._settings()
+        self._watch_supply()
 
     def _refusal(self, field: Field, data: bytes, offset: int) -> int:
         if not field.writable or (field.eeprom and self.torque):
@@ -259,10 +268,9 @@ class Dynamixel2Servo(RegisterServo):
         self._frame = TickFrames(self._file)
         self.mode: int = self._frame.mode
         self._by_time = bool(get("drive_mode") & 0x04)
-        ends = [get(name) for name in ("min_position_limit", "cw_angle_limit") if name in self.table.fields]
-        self._lowest: int = ends[0] if ends else 0
-        ends = [get(name) for name in ("max_position_limit", "ccw_angle_limit") if name in self.table.fields]
-        self._highest: int = ends[0] if ends else round(self.table.ticks_per_revolution) - 1
+        last = round(self.table.ticks_per_revolution) - 1
+        self._lowest: int = get("min_position_limit", get("cw_angle_limit"))
+        self._highest: int = get("max_position_limit", get("ccw_angle_limit", last))
         self._hottest_c: float = float(get("temperature_limit", 255))
         self._drive = None
         if self.torque:
@@ -272,7 +280,7 @@ class Dynamixel2Servo(RegisterServo):
         plant, table, sign = self.plant, self.table, self._frame.sign
         per_tick = self._live.speed_per_tick
         top = table.top_speed_ticks_s
-        speed, current = sign * plant.speed, sign * plant.current_mA(top)
+        speed, current = sign * plant.speed, sign * plant.current_mA()
         drive = self._drive
         arrived = drive is None or drive.by_speed or abs(drive.goal - plant.position) < 8.0
         volts = round(10.0 * self.supply_v)
@@ -327,3 +335,33 @@ def _pieces(addresses: list[int], data: bytes) -> list[tuple[int, bytes]]:
         places = list(run)
         out.append((places[0][1], bytes(data[index] for index, _ in places)))
     return out
+
+
+# --- registers that are worked out at every read: position, speed, voltage, ... -------------------------------------
+
+
+class PresentValues:
+    """Where the live registers of a model lie. Every X-series table holds them in one block: one struct fills it."""
+
+    def __init__(self, table: Table) -> None:
+        fields = [table[name] for name in LIVE if name in table.fields]
+        self._pick = itemgetter(*(i for i, name in enumerate(LIVE) if name in table.fields))
+        self._fields = fields
+        self.address = min(field.address for field in fields)
+        self.end = max(field.address + field.size for field in fields)
+        speed = table.fields.get("present_velocity") or table["present_speed"]
+        self.speed_per_tick = 60.0 / (table.ticks_per_revolution * speed.scale)
+        current = table.fields.get("present_current")
+        self.mA_per_tick = current.scale if current is not None else 1.0
+        layout = struct.Struct("<" + "".join(_CODES.get((field.size, field.sign), "") for field in fields))
+        in_order = [f.address for f in fields] == sorted(f.address for f in fields)
+        self._block = layout if in_order and layout.size == self.end - self.address else None
+
+    def put(self, raw: bytearray, values: tuple[int, ...]) -> None:
+        chosen = self._pick(values)
+        if self._block is not None:
+            self._block.pack_into(raw, self.address, *chosen)
+            return
+        for field, value in zip(self._fields, chosen, strict=True):
+            held = min(max(value, field.low), field.high)
+            raw[field.address : field.address + field.size] = field.to_bytes(held)

@@ -152,7 +152,7 @@ class EmulatedWire:
 
     def add(self, fault: Fault) -> None:
         """Raises ConfigError when nobody here can have that fault."""
-        concerned = [s for s in self._servos(fault) if hasattr(s, "set_supply") or fault.kind != "voltage"]
+        concerned = [s for s in self._concerned(fault) if hasattr(s, "set_supply") or fault.kind != "voltage"]
         if fault.kind not in ("echo", "noise", "hangup") and not concerned:
             raise ConfigError.at("emulate", "fault", fault.text, "concerns no servo of this wire")
         self._faults.add(fault)
@@ -185,14 +185,16 @@ class EmulatedWire:
             device.advance(now_s)
 
     def set_supply(self, volts: float, now_s: float) -> None:
-        for device in self._devices:
-            for servo in servos_of(device):
-                if hasattr(servo, "set_supply"):
-                    servo.set_supply(volts, now_s)
+        for servo in self._servos:
+            if hasattr(servo, "set_supply"):
+                servo.set_supply(volts, now_s)
 
-    def _servos(self, fault: Fault) -> list[Any]:
-        everyone = [servo for device in self._devices for servo in servos_of(device)]
-        return [servo for servo in everyone if fault.ids is None or servo.id in fault.ids]
+    @property
+    def _servos(self) -> list[Any]:
+        return [servo for device in self._devices for servo in servos_of(device)]
+
+    def _concerned(self, fault: Fault) -> list[Any]:
+        return [servo for servo in self._servos if fault.ids is None or servo.id in fault.ids]
 
     def _happen(self, fault: Fault, began: bool, now_s: float) -> None:
         kind = fault.kind
@@ -202,7 +204,7 @@ class EmulatedWire:
             self._outbox.clear()
         elif kind == "brownout":
             self._brown_out(fault, began, now_s)
-        for servo in self._servos(fault):
+        for servo in self._concerned(fault):
             if kind == "silent":
                 servo.dead = began
             elif kind == "mute":
@@ -216,13 +218,13 @@ class EmulatedWire:
                 _feed(servo, self._before_brownout, fault.value, began, now_s)
 
     def _brown_out(self, fault: Fault, began: bool, now_s: float) -> None:
-        """The supply drops: everybody falls silent, and starts anew when it is back."""
-        for device in self._devices:
-            for servo in servos_of(device):
-                if hasattr(servo, "set_supply"):
-                    _feed(servo, self._before_brownout, fault.value, began, now_s)
-                    continue
+        """Drop the supply: all servos fall silent, and start again when it is back."""
+        for servo in self._servos:
+            if hasattr(servo, "set_supply"):
+                _feed(servo, self._before_brownout, fault.value, began, now_s)
+            else:
                 servo.dead = began
+        for device in self._devices:
             if hasattr(device, "restart"):
                 device.restart(now_s)  # without a supply there are no pulses either
 

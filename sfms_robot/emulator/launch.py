@@ -18,12 +18,12 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from types import TracebackType
+from dataclasses import asdict, dataclass
+from functools import partial
 from typing import IO, Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
 
@@ -33,9 +33,11 @@ READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be lat
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
 
 _START_S = 20.0
+_refusal = partial(ConfigError.at, "emulated chain")
 _BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Chain:
     """A running chain.
 
@@ -45,29 +47,20 @@ class Chain:
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
         servos: what is plugged in.
         priority: "fifo" where it answers as promptly as hardware; else why not (`realtime.realtime_priority`).
+        process, folder: what ends with it.
     """
 
-    def __init__(
-        self,
-        process: subprocess.Popen[bytes],
-        servos: Sequence[EmulatedServo],
-        virtual: bool,
-        device: str,
-        control: str,
-        folder: str,
-        priority: str,
-    ) -> None:
-        self.servos = tuple(servos)
-        self.virtual = virtual
-        self.device = device
-        self.control = control
-        self.priority = priority
-        self._process = process
-        self._folder = folder
+    process: subprocess.Popen[bytes]
+    servos: Sequence[EmulatedServo]
+    virtual: bool
+    device: str
+    control: str
+    folder: str
+    priority: str
 
     @property
     def pid(self) -> int:
-        return self._process.pid
+        return self.process.pid
 
     @property
     def read_deadline_s(self) -> float:
@@ -135,7 +128,7 @@ class Chain:
     @property
     def stdout(self) -> IO[bytes]:
         """Says nothing any more, and ends with the process."""
-        return cast("IO[bytes]", self._process.stdout)
+        return cast("IO[bytes]", self.process.stdout)
 
     def digest(self) -> tuple[str, int]:
         """SHA-256 and number of all bytes that hosts have sent."""
@@ -144,17 +137,17 @@ class Chain:
 
     def close(self) -> None:
         """End the process and remove its folder. Idempotent."""
-        if self._process.poll() is None:
-            self._process.terminate()
-        _reap(self._process)
-        shutil.rmtree(self._folder, ignore_errors=True)
+        if self.process.poll() is None:
+            self.process.terminate()
+        _reap(self.process)
+        shutil.rmtree(self.folder, ignore_errors=True)
         if os.path.islink(self.device) and not os.path.exists(self.device):
             os.unlink(self.device)  # it was killed, and left its link behind
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _json(self, request: str) -> Any:
@@ -212,8 +205,8 @@ def launch(
         "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
-    process, told = _started(description)
-    return Chain(process, servos, virtual, told["device"], told["control"], told["folder"], told["priority"])
+    process, ready = _started(description)
+    return Chain(process=process, servos=tuple(servos), virtual=virtual, **ready)
 
 
 def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:
@@ -259,32 +252,32 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
         highest = 252 if table.channels is None else table.channels - 1
         key = ("" if table.channels is None else servo.model, servo.id)
         if key in seen:
-            raise ConfigError.at("emulated chain", "id", servo.id, "is used twice")
+            raise _refusal("id", servo.id, "is used twice")
         seen.add(key)
         if not 0 <= servo.id <= highest:
-            raise ConfigError.at("emulated chain", "id", servo.id, "is not a servo id", [f"0..{highest}"])
+            raise _refusal("id", servo.id, "is not a servo id", [f"0..{highest}"])
         bauds = sorted(table.baud_codes.values())
         if bauds and servo.baud not in bauds:
-            raise ConfigError.at("emulated chain", "baud", servo.baud, f"is no rate of {servo.model}", bauds)
+            raise _refusal("baud", servo.baud, f"is no rate of {servo.model}", bauds)
         if table.channels is not None:
             if servo.registers.keys() - _BOARD_SETTINGS.get(table.family, set()) or servo.supply_v is not None:
                 problem = "is a board of hobby servos: it has no registers, and does not know its supply"
-                raise ConfigError.at("emulated chain", "model", servo.model, problem)
+                raise _refusal("model", servo.model, problem)
             continue
         for name, value in servo.registers.items():
             register = table.registers.get(name)
             if register is None:
-                raise ConfigError.at("emulated chain", "register", name, f"is none of {servo.model}", table.registers)
+                raise _refusal("register", name, f"is none of {servo.model}", table.registers)
             if not register.low <= value <= register.high:
                 allowed = [f"{register.low}..{register.high}"]
-                raise ConfigError.at("emulated chain", name, value, f"is out of range of {servo.model}", allowed)
+                raise _refusal(name, value, f"is out of range of {servo.model}", allowed)
 
 
 def _check_link(link: str) -> None:
     if os.path.exists(link) or (os.path.lexists(link) and not os.path.islink(link)):
-        raise ConfigError.at("emulated chain", "link", link, "is already there")
+        raise _refusal("link", link, "is already there")
     if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
-        raise ConfigError.at("emulated chain", "link", link, "lies in a folder that does not exist")
+        raise _refusal("link", link, "lies in a folder that does not exist")
 
 
 def _reap(process: subprocess.Popen[bytes]) -> None:

@@ -163,8 +163,8 @@ class Plant:
         if abs(self.temperature_C - AMBIENT_C) < 1e-3 and target == AMBIENT_C:
             self.temperature_C = AMBIENT_C
 
-    def current_mA(self, top_speed: float) -> float:
-        """Plausible winding current: friction while it turns, and its effort."""
+    def current_mA(self) -> float:
+        """Return a plausible winding current: friction while it turns, and its effort."""
         if self.speed == 0.0 and self.effort == 0.0:
             return 0.0
         friction = _FRICTION_MA * min(max(self.speed / _CREEP, -1.0), 1.0)

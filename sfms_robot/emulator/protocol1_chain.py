@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 from sfms_robot.emulator.device import Reply
 from sfms_robot.emulator.protocol1_servo import Protocol1Servo
-from sfms_robot.emulator.servo_chain import ServoChain
+from sfms_robot.emulator.register_servo import ServoChain
 from sfms_robot.servo.codecs import dxl1, feetech, protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
 

@@ -22,7 +22,7 @@ from enum import Enum, auto
 from typing import Final
 
 from sfms_robot.emulator.plant import MotorCommand
-from sfms_robot.emulator.register_file import RegisterFile
+from sfms_robot.emulator.register_servo import RegisterFile
 from sfms_robot.servo.registers import Field
 
 _MX_MULTI_TURN: Final = 4095
@@ -47,9 +47,8 @@ _STS_MODES: Final = {1: Mode.WHEEL, 2: Mode.PWM, 3: Mode.STEP}
 
 def angle_limits(file: RegisterFile) -> tuple[int, int]:
     """Lowest and highest goal of a joint."""
-    if file.table.family == "feetech":
-        return file.get("min_position_limit"), file.get("max_position_limit")
-    return file.get("cw_angle_limit"), file.get("ccw_angle_limit")
+    lowest = file.get("min_position_limit", file.get("cw_angle_limit"))  # Feetech, Dynamixel
+    return lowest, file.get("max_position_limit", file.get("ccw_angle_limit"))
 
 
 def mode_of(file: RegisterFile) -> Mode:

@@ -12,10 +12,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.protocol1_modes import POSITIONING, Mode, PositionFrame, angle_limits, mode_of, motor_command
-from sfms_robot.emulator.register_servo import RegisterServo
-from sfms_robot.emulator.servo_chain import same_baud
+from sfms_robot.emulator.register_servo import RegisterServo, same_baud
 from sfms_robot.servo.codecs import dxl1, feetech
 from sfms_robot.servo.registers import Field, Table
 
@@ -155,10 +154,6 @@ class Protocol1Servo(RegisterServo):
                 self._put_role("torque_limit", 0)  # stays 0 when torque is switched on again
         self._settings()
 
-    def clear(self, status: int) -> None:
-        """What caused these faults is over."""
-        self.fault_status &= ~status
-
     def _lose_power(self) -> None:
         self._drive = None
 
@@ -220,9 +215,9 @@ class Protocol1Servo(RegisterServo):
             self._keep(field)
 
     def _stepped(self, wanted: Mapping[str, int]) -> float:
-        """In step mode: where the steps written so far lead, shaft ticks."""
-        going = self._drive is not None and self._mode is Mode.STEP
-        start = self._drive.goal if going and self._drive is not None else self.plant.position
+        """Return where the steps written so far lead in step mode, in shaft ticks."""
+        drive = self._drive
+        start = drive.goal if drive is not None and self._mode is Mode.STEP else self.plant.position
         return start + wanted.get("goal_position", 0)
 
     def _keep(self, field: Field) -> None:
@@ -289,7 +284,7 @@ class Protocol1Servo(RegisterServo):
         }
         current = table.role("present_current")
         if current is not None:
-            measured["present_current"] = round(plant.current_mA(table.top_speed_ticks_s) / (current.scale or 1.0))
+            measured["present_current"] = round(plant.current_mA() / (current.scale or 1.0))
         for role, value in measured.items():
             self._put_role(role, value)
         self._put("moving", int(plant.speed != 0.0))

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.registers import Table

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.head.head_check import check as check_head
-from sfms_robot.app.open_head import build_bus
-from sfms_robot.app.safety_settings import check_safety
+from sfms_robot.app.open_head import build_bus, check_safety
 from sfms_robot.app.servo.doctor import examine
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_firmware_map, load_head

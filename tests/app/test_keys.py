@@ -9,7 +9,7 @@ import termios
 
 import pytest
 
-from sfms_robot.app.listen.keys import Keyboard
+from sfms_robot.app.listen.panel import Keyboard
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo terminals here")
 LIMIT_S = 60.0  # only what never comes waits for so long,

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.listen.knobs import turned
-from sfms_robot.app.listen.named_expressions import NAMED_EXPRESSIONS
-from sfms_robot.app.listen.page_commands import PageCommands, Reach
+from sfms_robot.app.listen.page_commands import NAMED_EXPRESSIONS, PageCommands, Reach
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.errors import RobotError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS

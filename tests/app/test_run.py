@@ -21,8 +21,8 @@ import json, sys
 from pathlib import Path
 from sfms_robot.app import session
 from sfms_robot.app.listen.page_observer import PageObserver
-from sfms_robot.app.listen.page_recorder import PageRecorder
-from sfms_robot.app.listen.run_teller import RunTeller
+from sfms_robot.app.listen.page_session import PageRecorder
+from sfms_robot.app.listen.report import RunTeller
 from sfms_robot.config import load_head
 from sfms_robot.ports import Observer
 from sfms_robot.runtime.safety import Interrupt

@@ -11,18 +11,17 @@ from urllib.request import urlopen
 import pytest
 from virtual_time import Time
 
-from sfms_robot.app.fleet.fleet_page import FleetPage
-from sfms_robot.app.listen.status_server import AUTO, StatusServer
-from sfms_robot.app.loopback_server import CONNECTION_S, MOST_CONNECTIONS, Answer, LoopbackServer
-from sfms_robot.app.serve.metrics import MetricsServer
+from sfms_robot.app.fleet.fleet_client import fleet_page
+from sfms_robot.app.loopback_server import AUTO, CONNECTION_S, MOST_CONNECTIONS, Answer, LoopbackServer, status_server
+from sfms_robot.app.serve.service import metrics_server
 from sfms_robot.cli.main import main
 from sfms_robot.errors import ConfigError, PortError
 
 
 def test_the_document_is_served_as_it_is_at_that_moment() -> None:
     states = iter(["starting", "listening"])
-    with closing(StatusServer("0")) as server:
-        server.serve(lambda: {"state": next(states)})
+    with closing(status_server("0")) as server:
+        server.begin(lambda: {"state": next(states)})
         for state in ("starting", "listening"):
             with urlopen(server.url, timeout=5) as answer:
                 assert answer.headers["Content-Type"] == "application/json"
@@ -32,9 +31,9 @@ def test_the_document_is_served_as_it_is_at_that_moment() -> None:
 
 
 def test_another_document_takes_the_place_of_the_first() -> None:
-    with closing(StatusServer("0")) as server:
+    with closing(status_server("0")) as server:
         for state in ("starting", "listening"):
-            server.serve(lambda state=state: {"state": state})
+            server.begin(lambda state=state: {"state": state})
             with urlopen(server.url, timeout=5) as answer:
                 assert json.load(answer) == {"state": state}
 
@@ -46,8 +45,8 @@ def test_who_does_not_wait_for_the_answer_is_nobodys_trouble(capfd) -> None:
         asked.wait()
         return {"long": 10_000_000 * "x"}
 
-    with closing(StatusServer("0")) as server:
-        server.serve(slow)
+    with closing(status_server("0")) as server:
+        server.begin(slow)
         with socket.create_connection(("127.0.0.1", server.port)) as gone:
             gone.sendall(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
         asked.set()
@@ -57,22 +56,22 @@ def test_who_does_not_wait_for_the_answer_is_nobodys_trouble(capfd) -> None:
 
 
 def test_a_port_that_is_in_use_is_refused_in_one_line() -> None:
-    with closing(StatusServer("0")) as server:
+    with closing(status_server("0")) as server:
         with pytest.raises(PortError, match=f"^--status {server.port}: Address already in use .*$"):
-            StatusServer(str(server.port))
-    with closing(StatusServer(str(server.port))) as again:
+            status_server(str(server.port))
+    with closing(status_server(str(server.port))) as again:
         assert again.port == server.port
 
 
 def test_without_a_port_the_next_that_is_free_is_taken() -> None:
-    with closing(StatusServer(AUTO)) as first, closing(StatusServer(AUTO)) as second:
-        assert second.port != first.port and str(second) == f"http://127.0.0.1:{second.port}/ (8775 is taken)"
+    with closing(status_server(AUTO)) as first, closing(status_server(AUTO)) as second:
+        assert second.port != first.port and second.note == " (8775 is taken)"
 
 
 @pytest.mark.parametrize("wanted", ["-1", "65536", "http", "", "١"])
 def test_what_is_no_port_is_refused_in_one_line(wanted: str) -> None:
     with pytest.raises(ConfigError, match=r"is no TCP port \(0 to 65535"):
-        StatusServer(wanted)
+        status_server(wanted)
 
 
 def test_a_port_in_use_is_found_before_a_listener_is_loaded(capsys, monkeypatch) -> None:
@@ -80,7 +79,7 @@ def test_a_port_in_use_is_found_before_a_listener_is_loaded(capsys, monkeypatch)
         raise AssertionError("a listener was loaded")
 
     monkeypatch.setattr("sfms_robot.app.listen.preflight.begin_listening", load)
-    with closing(StatusServer("0")) as server, pytest.raises(SystemExit) as ended:
+    with closing(status_server("0")) as server, pytest.raises(SystemExit) as ended:
         main(["run", "--duration", "1", "--status", str(server.port)])
     assert ended.value.code == PortError.exit_code
     assert f"--status {server.port}: Address already in use" in capsys.readouterr().err
@@ -121,14 +120,14 @@ def address(request):
     """One of the three servers; gives its URL."""
     with ExitStack() as stack:
         if request.param == "status":
-            server = stack.enter_context(closing(StatusServer("0")))
-            server.serve(lambda: {"state": "idle"})
+            server = stack.enter_context(closing(status_server("0")))
+            server.begin(lambda: {"state": "idle"})
         elif request.param == "metrics":
             pytest.importorskip("prometheus_client")
-            server = stack.enter_context(MetricsServer("0"))
-            server.serve(figures)
+            server = stack.enter_context(closing(metrics_server("0")))
+            server.begin(figures)
         else:
-            server = stack.enter_context(closing(FleetPage(NoHeads(), 0)))
+            server = stack.enter_context(closing(fleet_page(NoHeads(), 0)))
         yield server.url
 
 
@@ -152,8 +151,8 @@ def test_a_client_that_calls_this_machine_by_a_strangers_name_is_not_answered(ad
 
 def test_the_metrics_are_those_of_that_moment() -> None:
     pytest.importorskip("prometheus_client")
-    with MetricsServer("0") as server:
-        server.serve(figures)
+    with closing(metrics_server("0")) as server:
+        server.begin(figures)
         with urlopen(server.url, timeout=LIMIT_S) as answer:
             assert answer.headers["Content-Type"].startswith("text/plain")
             assert 'sfms_heads{listener="a",server="b"} 3.0' in answer.read().decode()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.cli.meter import LevelMeter, meter_line
+from sfms_robot.cli.show import LevelMeter, meter_line
 
 pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
 

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from sfms_robot.config import load_firmware_map, map_files, variant
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
-from sfms_robot.emulator.emulated_servo import EmulatedServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Table
 

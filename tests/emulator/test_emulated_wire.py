@@ -3,7 +3,7 @@
 import pytest
 from emulated_devices import chain_of, device_of, servos_of
 
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import ConfigError

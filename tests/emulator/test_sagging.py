@@ -2,10 +2,9 @@
 
 import pytest
 
-from sfms_robot.app.wiring import calibration_of, emulated
+from sfms_robot.app.wiring import BEYOND_RAD, calibration_of, emulated, sagged_rad, sagging_joints
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.data import head_names
-from sfms_robot.emulator.sagging import BEYOND_RAD, sagged_rad, sagging_joints
 
 HEADS = head_names()
 PITCHES = {

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.open_head import build_bus, build_motion
-from sfms_robot.app.wiring import emulated
+from sfms_robot.app.wiring import emulated, sagged_rad
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
-from sfms_robot.emulator.sagging import sagged_rad
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.ports import Source, Tick

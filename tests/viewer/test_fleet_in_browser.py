@@ -7,9 +7,8 @@ from contextlib import closing
 import pytest
 from chromium import Page, missing
 
-from sfms_robot.app.fleet.fleet_client import Fleet
+from sfms_robot.app.fleet.fleet_client import Fleet, fleet_page
 from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key
-from sfms_robot.app.fleet.fleet_page import FleetPage
 from sfms_robot.network import Router, close_session, serve_session, session_config
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -52,7 +51,7 @@ def fleet(tmp_path):
     router = serve_session(session_config("serve", endpoint=endpoint))
     heads = {name: Head(name, file) for name in NAMES}
     try:
-        with Fleet(file) as asked, closing(FleetPage(asked, 0)) as page, Page(tmp_path / "chromium") as browser:
+        with Fleet(file) as asked, closing(fleet_page(asked, 0)) as page, Page(tmp_path / "chromium") as browser:
             browser.driver.get(page.url)
             browser.ask("(said.textContent = nobody)")  # as of a page that was there before the heads
             browser.until(f"{TILES}.length == {len(NAMES)}")

@@ -1,4 +1,4 @@
-"""A run in a thread of its own: begun, asked to end, waited for, and what went wrong handed to whoever asks."""
+"""A run in a thread of its own: begin it, ask it to end, wait for it, and learn what went wrong."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from sfms_robot.errors import BusError, ModelError, PortError, RobotError
-from sfms_robot.frames import Plan, SpeakerFrame
+from sfms_robot.config import Head, load_head
+from sfms_robot.errors import BusError, ConfigError, ModelError, PortError, RobotError
+from sfms_robot.frames import SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -20,7 +21,7 @@ _KINDS: Final = {kind.exit_code: kind for kind in (PortError, BusError, ModelErr
 Report = Mapping[str, Any]
 
 
-class FirstTick:
+class FirstTick(Observer):
     """An observer that knows the newest tick, and tells when there is one."""
 
     def __init__(self) -> None:
@@ -36,12 +37,6 @@ class FirstTick:
 
     def heard(self, frame: SpeakerFrame) -> None:
         self.frames += 1
-
-    def planned(self, plan: Plan) -> None:
-        """Counted by the run itself."""
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 class Background:
@@ -145,3 +140,18 @@ class Background:
             self._error.__cause__ = error
         finally:
             self.progress.came.set()
+
+
+def head_name(head: Head | str) -> str:
+    """Return the name or folder of a head that a program loaded, as a run opens it.
+
+    What belongs to one build (its calibration, what is stored in its servos) lies beside the head's file, so a head
+    runs from there. Raises ConfigError for one that was changed since it was loaded, or was made without a file.
+    """
+    if isinstance(head, str):
+        return head
+    if head.folder is None or load_head(str(head.folder)) != head:
+        raise ConfigError(
+            f"head {head.name!r} is not what its file says: write it to a folder as head.yaml and name that folder"
+        )
+    return str(head.folder)

@@ -13,11 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
-from sfms_robot.app.api.background import Background, Report
-from sfms_robot.app.api.named_head import head_name
+from sfms_robot.app.api.background import Background, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
 from sfms_robot.app.session import RunOptions, run
@@ -147,9 +145,7 @@ class Robot:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         """`stop`. Does not hide an exception that is on its way."""
         try:
             self.stop()

@@ -9,14 +9,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfms_robot.app.api.background import Background, Report
-from sfms_robot.app.api.named_head import head_name
+from sfms_robot.app.api.background import Background, Report, head_name
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.report import run_report
 from sfms_robot.app.open_head import HeadOptions, open_head
@@ -79,9 +77,7 @@ class Servos:
         self.rest_rad = self._opened.motion.rest_rad
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         """`stop`, then the ports are given back. Does not hide an exception that is on its way."""
         with self._stack:
             try:
@@ -174,12 +170,7 @@ class Servos:
         opened, alone = self._opened, NobodyThere()
         programme = Programme(alone, alone, None, retargeter=self._target, halt=halt, observers=[observer])
         drove = drive_head(opened, programme, interrupt, signals=False)
-        report = run_report(
-            drove.log, opened.bus, alone, head=opened.config.name, listener="none", port=self._options.port, seed=0,
-            outcome=drove.outcome, error=drove.error, rate_hz=opened.rate_hz, elapsed_s=drove.elapsed_s,
-            priority=drove.priority,
-        )  # fmt: skip
-        return {**report, "exit_code": drove.exit_code}
+        return run_report(opened, drove, alone, "none", 0)
 
 
 class _Target:

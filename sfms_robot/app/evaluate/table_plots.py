@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sfms_robot.app.evaluate import trajectory_plots
-from sfms_robot.app.plot_style import INK, RULE, SERIES, new_figure, plain, save
+from sfms_robot.app.out_files import INK, RULE, SERIES, new_figure, plain, save
 from sfms_robot.evaluation.paper import score_history as history
 from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.evaluation.paper.restoration import Windows

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import torch
 
-from sfms_robot.app.plot_style import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain
+from sfms_robot.app.out_files import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain
 from sfms_robot.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.evaluation.paper.restoration import Windows
 from sfms_robot.evaluation.paper.score_history import Snapshot

@@ -1,4 +1,13 @@
-"""`sfms-robot fleet`: who is there, and halt or resume of some or all. The other side of `fleet_head`."""
+"""`sfms-robot fleet`: who is there, and halt or resume of some or all. The other side of `fleet_head`.
+
+`sfms-robot fleet page`: a tile per head and a button that halts all, in a browser, on loopback.
+
+    GET  /        the page
+    GET  /heads   {"heads": [tile, ...]} (`tile`)
+    POST /halt    {"heads": [name, ...]}, none: all     POST /resume  the same
+
+Pages of other sites may not send commands: their browser tells whose page it is (Origin), and a command is JSON.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +17,19 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 from sfms_robot.app.fleet.fleet_head import ROOT, fleet_key, fleet_name, proof
-from sfms_robot.errors import PortError
+from sfms_robot.app.loopback_server import Answer, LoopbackServer
+from sfms_robot.errors import PortError, RobotError
 from sfms_robot.network import AWAY_S, Connection, Router, session_config
+from sfms_robot.origin import origin_problem
 
 ASK_S: Final = 2.0  # that heads have to answer
 GONE_S: Final = 3.0  # a head that has told nothing for so long is away
+PORT: Final = 8776
+PAGE: Final = Path(__file__).with_name("fleet.html")
+_LONGEST: Final = 4096
 
 Document = Mapping[str, Any]
 
@@ -48,9 +61,7 @@ class Fleet:
             )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._connection is not None:
             self._connection.close()
 
@@ -144,3 +155,70 @@ def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
         "hottest": hottest,
         "faults": document.get("faults", {}),
     }
+
+
+# --- the page -------------------------------------------------------------------------------------------------------
+
+
+def fleet_page(fleet: Fleet, port: int = PORT) -> LoopbackServer:
+    """Serve the page until `close`. Raises PortError for a port that is taken (0: any free one)."""
+    board = FleetBoard()
+    for document in fleet.states():
+        board.told(document)
+    fleet.follow(board.told)
+    try:
+        server = _Server(port, fleet, board)
+    except OSError as error:
+        raise PortError(f"--port {port}: {error.strerror or error} (another, or 0 for a free one)") from error
+    server.begin()
+    return server
+
+
+class _Server(LoopbackServer):
+    def __init__(self, port: int, fleet: Fleet, board: FleetBoard) -> None:
+        super().__init__(port, _Answer, "fleet page")
+        self.fleet, self.board = fleet, board
+
+
+class _Answer(Answer):
+    def do_GET(self) -> None:
+        assert isinstance(self.server, _Server)
+        if self.path == "/":
+            self.answer(200, PAGE.read_bytes(), "text/html; charset=utf-8")
+        elif self.path == "/heads":
+            self._json(200, {"heads": self.server.board.tiles()})
+        else:
+            self.send_error(404)
+
+    def do_POST(self) -> None:
+        assert isinstance(self.server, _Server)
+        problem = origin_problem(self.headers.get("Origin"), self.headers.get("Host", ""))
+        if problem is not None or self.headers.get_content_type() != "application/json":
+            self._json(403, {"error": problem or "a command is JSON (Content-Type: application/json)"})
+            return
+        fleet = self.server.fleet
+        orders: Mapping[str, Callable[[list[str]], Any]] = {
+            "/halt": lambda heads: fleet.halt(heads, "the fleet's page"),
+            "/resume": fleet.resume,
+        }
+        order = orders.get(self.path)
+        if order is None:
+            self.send_error(404)
+            return
+        try:
+            self._json(200, {"answers": order(self._heads())})
+        except (RobotError, ValueError) as error:
+            self._json(400, {"error": str(error)})
+
+    def _heads(self) -> list[str]:
+        length = int(self.headers.get("Content-Length") or 0)
+        if not 0 <= length <= _LONGEST:
+            raise ValueError(f"a command of {length} bytes")
+        told = json.loads(self.rfile.read(length) or b"{}")
+        heads = told.get("heads", []) if isinstance(told, dict) else None
+        if not isinstance(heads, list) or not all(isinstance(each, str) for each in heads):
+            raise ValueError("heads is no list of names")
+        return heads
+
+    def _json(self, code: int, told: Mapping[str, Any]) -> None:
+        self.answer(code, json.dumps(told).encode(), "application/json")

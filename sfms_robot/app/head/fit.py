@@ -7,7 +7,7 @@ A recording is a folder: `run.mcap` as `run --record` and `head fit --babble` wr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -66,9 +66,9 @@ class HeadFit:
     file: str
 
     def as_dict(self) -> dict[str, Any]:
-        joints = [{"joint": r.joint, "moved": r.moved, "before": r.before, "after": r.after} for r in self.rows]
-        told = {"head": self.head, "frames": self.frames, "delay_s": self.delay_s, "before": self.before}
-        return {**told, "after": self.after, "file": self.file, "joints": joints}
+        told = asdict(self)
+        told["joints"] = told.pop("rows")
+        return told
 
 
 def fit_head(name: str, recording: Path, practice: bool = False) -> HeadFit:

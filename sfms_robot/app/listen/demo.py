@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app import session
-from sfms_robot.app.listen.browser_window import open_browser
 from sfms_robot.app.listen.page_session import page_session
+from sfms_robot.app.listen.preflight import open_browser
 from sfms_robot.config import load_head
 from sfms_robot.errors import MissingExtra
 from sfms_robot.retarget.head_retargeter import HeadRetargeter

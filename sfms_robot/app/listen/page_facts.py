@@ -8,7 +8,7 @@ from typing import Any
 
 from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
 from sfms_robot.app.listen.knobs import LiveKnobs
-from sfms_robot.app.listen.named_expressions import NAMED_EXPRESSIONS
+from sfms_robot.app.listen.page_commands import NAMED_EXPRESSIONS
 from sfms_robot.config import Calmness, Head
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.frames import CHANNELS
@@ -40,8 +40,8 @@ def page_facts(
         "listener": Path(listener).name,
         "speaker": speaker,
         "seed": seed,
-        "listeners": _lines(shipped_listeners(), "description") if choices else [],
-        "speakers": _lines(shipped_speakers(), "description") if choices else [],
+        "listeners": _lines(shipped_listeners()) if choices else [],
+        "speakers": _lines(shipped_speakers()) if choices else [],
         "joints": [
             {
                 "name": name, "min_rad": joint.min_rad, "max_rad": joint.max_rad, "rest_rad": joint.rest_rad,
@@ -76,5 +76,5 @@ def people_per_minute(listener: str) -> dict[str, float]:
     return {kind: hazard.per_minute for kind, hazard in load_tables().hazards.items()}
 
 
-def _lines(rows: list[dict[str, Any]], line: str) -> list[dict[str, str]]:
-    return [{"name": row["name"], "line": row[line]} for row in rows]
+def _lines(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+    return [{"name": row["name"], "line": row["description"]} for row in rows]

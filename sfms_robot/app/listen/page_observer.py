@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, Floats, ListenerEvent, Plan, Reading, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals import voice_activity
@@ -29,8 +29,8 @@ _EPS_FRAMES: Final = 1e-6
 T = TypeVar("T")
 
 
-class PageObserver:
-    """`ports.Observer`.
+class PageObserver(Observer):
+    """`ports.Observer`. The page is closed by the code that opened it.
 
     Args:
         joints: names, in the order of `Tick.goals_rad`.
@@ -75,9 +75,6 @@ class PageObserver:
         self._hazards_hz = plan.hazards_hz
         if plan.events:
             self._page.later(self._tell_events)
-
-    def close(self) -> None:
-        """The page is closed by who opened it."""
 
     def _packed(self, seen: Tick) -> bytes:
         frame = self._frame

@@ -6,9 +6,10 @@ A visitor's choice brings the head to rest, and the next run begins with it; the
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,16 +21,16 @@ from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
 from sfms_robot.app.listen.page_commands import PageCommands, Reach
 from sfms_robot.app.listen.page_facts import page_facts, people_per_minute
 from sfms_robot.app.listen.page_observer import PageObserver
-from sfms_robot.app.listen.page_recorder import PageRecorder
-from sfms_robot.app.listen.preflight import begin_listening
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
-from sfms_robot.listeners.open_feed import NamedFeed
+from sfms_robot.frames import Plan, SpeakerFrame
+from sfms_robot.listeners.open_feed import NamedFeed, open_feed
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.browser import Visitor
 from sfms_robot.sources.registry import BROWSER, open_source, split_kind
@@ -42,6 +43,7 @@ _LOOK_S: Final = 0.5
 MAX_SEED: Final = 2**32 - 1
 
 logger = logging.getLogger(__name__)
+LONGEST_S: Final = 300.0  # of one recording; what comes after it is left out
 
 
 class PageSession:
@@ -87,7 +89,9 @@ class PageSession:
         self._chosen.clear()
         self.released = False
         with ExitStack() as stack:
-            feed = feed or self._listener(stack)
+            if feed is None:
+                listened = options.listener, options.seed, options.calmness, options.router, options.engine
+                feed = stack.enter_context(closing(open_feed(*listened)))
             halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
             scene = scene_of(head, options.packages)  # a picture that is broken is said before anything moves
             for line in scene.left_out if scene else ():
@@ -99,8 +103,7 @@ class PageSession:
             lonely = self._lonely(interrupt)
             stack.callback(recorder.close)
             self._commands.reach = Reach(halt, puppet, knobs, calmness, feed.calm, recorder.record, self._release)
-            stack.callback(self._out_of_reach)
-            stack.callback(self._remember, knobs)
+            stack.callback(self._ended, knobs)
             report = session.run(
                 options, _told_to(watcher, panel), source=self._source(stack), feed=feed,
                 observers=[watcher, recorder, *lonely, *observers], knobs=knobs,
@@ -132,28 +135,14 @@ class PageSession:
         endless = self._choices and any(_taken_of_visitors(self.options).values())
         return [EndsAlone(self.page, interrupt)] if endless else []
 
-    def _remember(self, knobs: LiveKnobs) -> None:
-        reach = self._commands.reach
+    def _ended(self, knobs: LiveKnobs) -> None:
+        """Take the run out of reach, and keep what visitors turned in it."""
+        reach, self._commands.reach = self._commands.reach, None
         assert reach is not None
         turned_to = {
             kind: tuple(f"{name}={value}" for name, value in knobs.values[kind].items()) for kind in KNOB_KINDS
         }
         self._set = {**turned_to, "calmness": reach.calmness}
-
-    def _out_of_reach(self) -> None:
-        self._commands.reach = None
-
-    def _listener(self, stack: ExitStack) -> NamedFeed:
-        feed = begin_listening(
-            self.options.listener,
-            self.options.seed,
-            self.options.calmness,
-            self.options.zenoh,
-            self.options.engine,
-            self.options.insecure,
-        )
-        stack.callback(feed.close)
-        return feed
 
     def _source(self, stack: ExitStack) -> Any:
         """Where a visitor is the person; None: the run opens what its options name."""
@@ -164,8 +153,7 @@ class PageSession:
             options.hears, options.face, options.duration_s, agent_audio=options.agent_audio, play=options.play,
             visitor=self._person,
         )  # fmt: skip
-        stack.callback(source.close)
-        return source
+        return stack.enter_context(closing(source))
 
     def _facts(self, head: Any, knobs: Any, calmness: Calmness) -> dict[str, Any]:
         options = self.options
@@ -263,3 +251,55 @@ def _told_to(watcher: PageObserver, panel: session.Panel | None) -> session.Pane
         return nullcontext() if panel is None else panel(document, interrupt, halt, turn)
 
     return shown
+
+
+class PageRecorder:
+    """`ports.Observer`: hands what happens to a `Recorder` while there is one. `record` is called in the page's thread.
+
+    Args:
+        folder: where recordings go, each into one of its own. about: see `Recorder`.
+    """
+
+    def __init__(self, page: PageProcess, folder: Path, joints: Sequence[str], about: Mapping[str, str]) -> None:
+        self._page, self._folder, self._joints, self._about = page, folder, tuple(joints), dict(about)
+        self._recorder: Recorder | None = None
+        self._into: Path | None = None
+        self._began_s = self._now_s = 0.0
+        self._tell(False, None)
+
+    def record(self, on: bool) -> None:
+        """Begin one, or end it and let it be downloaded; blocks until it is written. Raises ConfigError."""
+        if on and self._recorder is None:
+            into = self._folder / f"recording-{len(list(self._folder.iterdir())) + 1}"
+            recorder = Recorder(into, self._joints, about=self._about)
+            self._into, self._began_s, self._recorder = into, self._now_s, recorder
+            self._tell(True, 0.0)
+        elif not on:
+            self.close()
+
+    def tick(self, seen: Tick) -> None:
+        self._now_s = seen.time_s
+        recorder = self._recorder
+        if recorder is not None and seen.time_s - self._began_s <= LONGEST_S:
+            recorder.tick(seen)
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        recorder = self._recorder
+        if recorder is not None and frame.time_s - self._began_s <= LONGEST_S:
+            recorder.heard(frame)
+
+    def planned(self, plan: Plan) -> None:
+        recorder = self._recorder
+        if recorder is not None and plan.made_at_s - self._began_s <= LONGEST_S:
+            recorder.planned(plan)
+
+    def close(self) -> None:
+        """End the one that goes on."""
+        recorder, self._recorder = self._recorder, None
+        if recorder is not None:
+            recorder.close()
+            self._tell(False, min(LONGEST_S, math.ceil(self._now_s - self._began_s)))
+
+    def _tell(self, on: bool, seconds: float | None) -> None:
+        file = None if on or self._into is None else str(self._into / RUN_FILE)
+        self._page.say("recorded", file=file, record={"on": on, "seconds": seconds})

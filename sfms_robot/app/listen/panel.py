@@ -9,23 +9,28 @@ from __future__ import annotations
 import logging
 import os
 import queue
+import select
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sfms_robot.app.listen.keys import ESCAPE, Keyboard, in_background, keyboard, reading_keys
 from sfms_robot.app.listen.knobs import STEP
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.halt_switches import resume_here
 from sfms_robot.runtime.safety import Interrupt
+
+try:
+    import termios
+except ImportError:  # Windows
+    termios = None  # type: ignore[assignment]
 
 PERIOD_S: Final = 0.25
 JOIN_S: Final = 1.0  # a terminal that is held (Ctrl-S) takes nothing: the run ends without it
@@ -42,6 +47,9 @@ _HELP: Final = (
     "q: come to rest and end; Ctrl-C twice: torque off at once"
 )
 _NO_KEYS: Final = "no keys here: Ctrl-C ends the run"
+_ESCAPE: Final = "\x1b"
+_LOOK_S: Final = 0.2  # between two looks at whether this program has come to the foreground
+_LOCAL, _CONTROL = 3, 6  # of what `tcgetattr` gives
 
 Document = Callable[[], Mapping[str, Any]]
 Turn = Callable[[float], None]
@@ -67,7 +75,7 @@ def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch, turn: 
 
 
 def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch, turn: Turn) -> None:
-    if key in (" ", "h", ESCAPE):
+    if key in (" ", "h", _ESCAPE):
         halt.close("key")
     elif key == "r":
         resume_here(halt)
@@ -288,3 +296,110 @@ def _faults(faults: Mapping[str, str]) -> str:
     named = [f"{joint} {fault}" for joint, fault in list(faults.items())[:_FAULTS]]
     more = len(faults) - len(named)
     return "; ".join([*named, f"and {more} more"] if more else named)
+
+
+# --- single keys, while a run goes on -------------------------------------------------------------------------------
+
+
+class Keyboard:
+    """The terminal behind a file descriptor: `take` for single keys, `give_back` for lines. From any thread.
+
+    No Enter is needed, nothing is echoed, and afterwards the terminal is as it was. It is in cbreak mode while this
+    program is in its foreground, so Ctrl-C, Ctrl-\\ and Ctrl-Z stay signals. In the background it belongs to other
+    programs: it is left alone, and nothing is read.
+
+    `leave` gives it back for good: a thread that was about to take it does not.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._usual: list[Any] | None = None
+        self._left = False
+        self._lock = threading.RLock()  # a signal handler may interrupt who holds it
+
+    def take(self) -> bool:
+        """Single keys from now on; False in the background. Asked again and again: a shell may set it otherwise."""
+        with self._lock:
+            if self._left or in_background(self._fd):
+                return False
+            found = termios.tcgetattr(self._fd)
+            if found[_LOCAL] & termios.ICANON:
+                self._usual = found
+                control = list(found[_CONTROL])
+                control[termios.VMIN], control[termios.VTIME] = 1, 0
+                single = [*found[:_CONTROL], control]
+                single[_LOCAL] &= ~(termios.ECHO | termios.ICANON)
+                termios.tcsetattr(self._fd, termios.TCSANOW, single)
+            return True
+
+    def give_back(self) -> None:
+        """As it was found. Idempotent."""
+        with self._lock:
+            if self._usual is not None and not in_background(self._fd):
+                termios.tcsetattr(self._fd, termios.TCSANOW, self._usual)
+            self._usual = None
+
+    def leave(self) -> None:
+        with self._lock:
+            self._left = True
+            self.give_back()
+
+    @contextmanager
+    def lent(self) -> Iterator[None]:
+        """Give the terminal back while inside; no thread can take it meanwhile."""
+        with self._lock:
+            self.give_back()
+            yield
+
+    def wait(self, over: int) -> str | None:
+        """Blocks until keys are pressed or `_LOOK_S` is over: the keys, or "". None once `over` is readable.
+
+        A sequence of several bytes (an arrow, Alt with a key) counts as the Esc that it begins with, and as that alone.
+        """
+        ready, _, _ = select.select([over, self._fd] if self.take() else [over], [], [], _LOOK_S)
+        if over in ready:
+            return None
+        if self._fd not in ready:
+            return ""
+        read = os.read(self._fd, 64).decode("ascii", "replace")
+        return None if not read else _ESCAPE if _ESCAPE in read else read
+
+
+def in_background(fd: int) -> bool:
+    """Return whether the terminal `fd` belongs to another program now. False where it belongs to no shell."""
+    try:
+        return hasattr(os, "tcgetpgrp") and os.tcgetpgrp(fd) != os.getpgrp()
+    except OSError:
+        return False
+
+
+def keyboard(stream: TextIO | None) -> Keyboard | None:
+    """Return the keyboard of a terminal; None where `stream` is no terminal, or the system (Windows) has none."""
+    if termios is None or stream is None or stream.closed or not stream.isatty():
+        return None
+    return Keyboard(stream.fileno())
+
+
+@contextmanager
+def reading_keys(found: Keyboard, pressed: Callable[[str], object]) -> Iterator[None]:
+    """Call `pressed(key)` in a thread of its own, for every key while inside."""
+    ours, theirs = os.pipe()  # readable once it is over
+
+    def work() -> None:
+        try:
+            while (keys := found.wait(ours)) is not None:
+                for key in keys:
+                    pressed(key)
+        except (OSError, termios.error):  # the terminal was closed
+            return
+
+    thread = threading.Thread(target=work, name="keys", daemon=True)
+    try:  # from here on: a signal may end the program before the first key
+        thread.start()
+        yield
+    finally:
+        os.close(theirs)
+        if thread.ident is not None:
+            thread.join(JOIN_S)
+        found.leave()
+        os.close(ours)

@@ -1,4 +1,4 @@
-"""What a slip of the keyboard breaks, found before anything is loaded.
+"""Checks and processes that come before anything is loaded: what a slip of the keyboard breaks, listener, page.
 
 Names, files and devices, by the very functions that the run will use; `session.run` looks at all the rest. Standard
 library only, so the answer takes as long as the interpreter does to start.
@@ -6,6 +6,10 @@ library only, so the answer takes as long as the interpreter does to start.
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -15,14 +19,15 @@ from sfms_robot.plugins import listener_folder
 from sfms_robot.servo.discovery import access_problem, is_address
 from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 
-ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
-PAGE: Final = "sfms_robot.app.listen.page_scene:main"
-
 if TYPE_CHECKING:
     from sfms_robot.config import Calmness
     from sfms_robot.listeners.engine import EngineName
     from sfms_robot.listeners.open_feed import NamedFeed
     from sfms_robot.viewer.page_process import PageProcess
+
+ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
+PAGE: Final = "sfms_robot.app.listen.page_scene:main"
+_IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
 
 
 def check_names(
@@ -40,9 +45,9 @@ def check_names(
     listener_folder(listener)
     check_source(audio, face, agent_audio, play=play)
     if status is not None:
-        from sfms_robot.app.listen.status_server import StatusServer  # http.server: only for who wants it
+        from sfms_robot.app.loopback_server import status_server  # http.server: only for who wants it
 
-        StatusServer(status).close()
+        status_server(status).close()
     for part in port.split(","):
         device = part.rpartition("=")[2]
         if (device.startswith("/") or is_address(device)) and (problem := access_problem(device)):
@@ -99,3 +104,26 @@ def begin_page(
     from sfms_robot.viewer.page_process import Address, PageProcess  # only for who wants it
 
     return PageProcess(Address.parsed(wanted, certificate, key), PAGE)
+
+
+def can_open(environment: Mapping[str, str], platform: str) -> bool:
+    """Return whether there is a screen, and the user of this program sits in front of it."""
+    if "SSH_CONNECTION" in environment:
+        return False
+    return platform in ("darwin", "win32") or any(environment.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def open_browser(url: str) -> bool:
+    """Show `url` in a browser window of this computer; return whether that can be. Never blocks, raises nothing."""
+    if not can_open(os.environ, sys.platform):
+        return False
+    import webbrowser  # only for the one command that opens a window
+
+    try:
+        browser = webbrowser.get()
+    except webbrowser.Error:
+        return False
+    if getattr(browser, "name", "") in _IN_TERMINALS:
+        return False
+    threading.Thread(target=browser.open, args=(url,), name="browser", daemon=True).start()
+    return True

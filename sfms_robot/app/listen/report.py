@@ -1,52 +1,81 @@
-"""The report of a run (`run --json`): every figure from the run's own log, the bus's counters or the listener."""
+"""What a run says of itself: its report (`run --json`), to its recording, and to the programs that it works with.
+
+Every figure of the report is from the run's own log, the bus's counters or the listener.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.ports import Bus, PlanFeed
+import yaml
+
+from sfms_robot import __version__
+from sfms_robot.config import Head, load_listener
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.plugins import listener_folder
+from sfms_robot.ports import Outlet, PlanFeed, Tick
 from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.planned_events import EventWatch
+
+if TYPE_CHECKING:
+    from sfms_robot.app.open_head import OpenHead
+
+INTERRUPTED: Final = 130  # exit code
+LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
 
 
-def run_report(
-    log: RunLog,
-    bus: Bus,
-    feed: PlanFeed,
-    *,
-    head: str,
-    listener: str,
-    port: str,
-    seed: int,
-    outcome: str,
-    error: Exception | None,
-    rate_hz: float,
-    elapsed_s: float | None,
-    priority: str,
-) -> dict[str, Any]:
-    """Version 1 of the report. `elapsed_s` None means virtual time: wall-clock figures are null."""
-    real = elapsed_s is not None
+@dataclass(frozen=True)
+class Drove:
+    """The end of a drive: "done", "interrupted" or "failed", and then the error."""
+
+    outcome: str
+    log: RunLog
+    elapsed_s: float | None
+    priority: str
+    error: Exception | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """Of the process: see `errors`."""
+        if self.outcome == "interrupted":
+            return INTERRUPTED
+        return 0 if self.error is None else getattr(self.error, "exit_code", 1)
+
+
+def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
+    """Return version 1 of the report. In virtual time wall-clock figures are null."""
+    log = drove.log
+    real = drove.elapsed_s is not None
     heard = dict(feed.statistics())
     timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
     plans = _counts(timeline, ("held", "eased", "late", "refused"))
     return {
         "version": 1,
-        "head": head,
+        "head": opened.config.name,
         "listener": listener,
-        "port": port,
+        "port": opened.options.port,
         "seed": seed,
         "duration_s": round(log.listened_s, 4),
-        "exit": outcome,
-        "error": None if error is None else str(error),
+        "exit": drove.outcome,
+        "error": None if drove.error is None else str(drove.error),
         "torque_unconfirmed": log.torque_unconfirmed,
         "frames": log.frames,
         "ticks": log.ticks,
-        "tick": log.tick_report(rate_hz, elapsed_s),
+        "tick": log.tick_report(opened.rate_hz, drove.elapsed_s),
         "latency_ms": _latency(log, real),
         "listener_step_ms": heard.pop("step_ms"),
         "hop": heard.pop("hop", None),
         "budget_ms": heard.pop("budget_ms", None),
         "listener_state": heard,
-        "bus": dict(bus.statistics()),
+        "bus": dict(opened.bus.statistics()),
         "limits": {
             "violations": log.audited.violations if log.audited else 0,
             "clamped": log.audited.clamped if log.audited else 0,
@@ -58,7 +87,8 @@ def run_report(
         "attention": log.attention_report(),
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),
-        "priority": priority,
+        "priority": drove.priority,
+        "exit_code": drove.exit_code,
     }
 
 
@@ -86,3 +116,88 @@ def _latency(log: RunLog, real: bool) -> dict[str, Any]:
 
 def _counts(state: object, names: tuple[str, ...]) -> dict[str, int]:
     return {name: int(getattr(state, name)) for name in names if hasattr(state, name)}
+
+
+# --- what a recording says of its run -------------------------------------------------------------------------------
+
+
+def run_facts(head: Head, listener: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a recording says of its run, text by text, for `Recorder(about=...)`: what ran, on what, and how.
+
+    `head_yaml` is the head as it was used, calibration included, and a head's file itself. Of a listener that is a
+    folder there are its configuration and the SHA-256 of its weights.
+    """
+    shown = {name: value for name, value in options.items() if value not in (None, (), False)}
+    return {
+        "head": head.name,
+        "listener": Path(listener).name,
+        **{name: str(options[name]) for name in ("seed", "port")},
+        "audio": Path(options["audio"]).name,
+        "version": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "options": json.dumps(shown, default=str),
+        "head_yaml": yaml.safe_dump(head.model_dump(mode="json", exclude_defaults=True), sort_keys=False),
+        **_listener(listener),
+    }
+
+
+def _listener(name: str) -> dict[str, str]:
+    try:
+        folder = listener_folder(name)
+    except ConfigError:  # an object that a program handed over
+        return {}
+    if folder is None:
+        return {}
+    facts = {"listener_config": (folder / "config.yaml").read_text(encoding="utf-8")}
+    if (weights := folder / "model.safetensors").is_file():
+        with weights.open("rb") as file:
+            facts["listener_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return facts
+
+
+def limitation(listener: str) -> str | None:
+    """Return one line about what a listener, by name or folder, cannot show on any head.
+
+    None: it can show all channels, or another package brings it.
+
+    Raises ConfigError.
+    """
+    folder = listener_folder(listener)
+    return None if folder is None else MotionSpace.of(load_listener(folder / "config.yaml"), folder).limitation
+
+
+# --- what the programs that a run works with receive ---------------------------------------------------------------
+
+
+class RunTeller:
+    """`ports.Observer`: sound as it is heard, events as they are decided or planned, states as they change."""
+
+    def __init__(self, outlet: Outlet) -> None:
+        self._outlet = outlet
+        self._state: tuple[str, tuple[str, ...]] | None = None
+        self._events = EventWatch()
+        for kind in EVENT_KINDS:
+            self._events.on(kind, self._event)
+
+    def tick(self, seen: Tick) -> None:
+        state = (seen.state, seen.why)
+        if state != self._state:
+            self._state = state
+            self._outlet.tells("state", seen.time_s, state=seen.state, why=list(seen.why))
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        if len(frame.audio):
+            self._outlet.hears(frame.audio, frame.time_s)
+
+    def planned(self, plan: Plan) -> None:
+        self._events.planned(plan)
+
+    def close(self) -> None:
+        self._events.close()
+
+    def _event(self, event: ListenerEvent) -> None:
+        told = {"lasts_s": round(event.duration_s, 3), "size": round(event.size, 4), "swings": event.swings}
+        if event.probability is not None:
+            told["probability"] = round(event.probability, 5)
+        self._outlet.tells("event", event.start_s, event=event.kind, **told)

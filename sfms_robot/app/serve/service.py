@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
+from sfms_robot.app.loopback_server import Answer, Document, LoopbackServer
 from sfms_robot.app.serve.batch_process import Served
-from sfms_robot.app.serve.metrics import MetricsServer
 from sfms_robot.app.serve.worker_pool import WorkerPool
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
+from sfms_robot.errors import ConfigError, MissingExtra, PortError
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.serving.stream_server import DEADLINE_S
 from sfms_robot.listeners.zenoh_link import ROOT, down_key, join_key
@@ -23,6 +25,28 @@ from sfms_robot.network import Router, check_name, check_zenoh, close_session, s
 
 if TYPE_CHECKING:
     import zenoh
+
+_MS: Final = 1e-3
+
+# Name, kind, what it says, where in the statistics of `StreamServer`, and the factor to the unit of the name.
+_FIGURES: Final[tuple[tuple[str, str, str, tuple[str, ...], float], ...]] = (
+    ("heads", "gauge", "Heads that are listened for", ("heads",), 1.0),
+    ("heads_most", "gauge", "Heads that could be answered in time", ("most_heads",), 1.0),
+    ("plans", "counter", "Plans made", ("plans",), 1.0),
+    ("deadline_misses", "counter", "Plans later than the deadline", ("deadline_misses",), 1.0),
+    ("deadline_seconds", "gauge", "Promised from a frame to its plan", ("deadline_ms",), _MS),
+    ("plan_delay_p50_seconds", "gauge", "Median from a frame to its plan, of the last plans", ("delay_ms", "p50"), _MS),
+    ("plan_delay_p99_seconds", "gauge", "99th percentile of the same", ("delay_ms", "p99"), _MS),
+    ("batches", "counter", "Batches stepped", ("batches",), 1.0),
+    ("steps", "counter", "Frames stepped, over all heads", ("steps",), 1.0),
+    ("batch_size_p50", "gauge", "Median of the heads in a batch", ("batch_size", "p50"), 1.0),
+    ("batch_size_p99", "gauge", "99th percentile of the same", ("batch_size", "p99"), 1.0),
+    ("frames_skipped", "counter", "Frames left out, since too many were waiting", ("skipped_frames",), 1.0),
+    ("frames_lost", "counter", "Frames that never came", ("lost_frames",), 1.0),
+    ("refused", "counter", "Robots that were refused", ("refused",), 1.0),
+    ("malformed", "counter", "Messages that could not be read", ("malformed",), 1.0),
+    ("cost_scale", "gauge", "How much longer batches take than measured at the start", ("cost_scale",), 1.0),
+)
 
 
 @dataclass(frozen=True)
@@ -107,14 +131,14 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
     config = session_config("serve", Router(options.zenoh, options.insecure))
     service_manager = ServiceManager()
     with ExitStack() as stack:
-        metrics = stack.enter_context(MetricsServer(options.metrics)) if options.metrics is not None else None
+        metrics = None if options.metrics is None else stack.enter_context(closing(metrics_server(options.metrics)))
         server = os.uname().nodename
         served = Served(options.listener, name, server, options.engine, options.hop, options.everybody)
         service = ZenohService(served, config, options.processes)
         stack.callback(service.close)
         pool = service.pool
         if metrics is not None:
-            metrics.serve(pool.statistics)
+            metrics.begin(pool.statistics)
             say(f"metrics: {metrics.url}")
         say(
             f"{name}: a plan every {pool.hop} frames, up to {pool.most} heads in {DEADLINE_S * 1e3:.0f} ms here, "
@@ -127,3 +151,57 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
         if pool.problem is not None:
             raise pool.problem
         return dict(pool.statistics())
+
+
+# --- figures for Prometheus -----------------------------------------------------------------------------------------
+
+
+def metrics_server(wanted: str) -> LoopbackServer:
+    """Bind the port of `serve --metrics [HOST:]PORT`: figures for Prometheus, by prometheus_client.
+
+    `wanted`: a port, "0" for any that is free; HOST:PORT beyond loopback. Raises ConfigError, MissingExtra, PortError.
+    """
+    try:
+        import prometheus_client  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra.of("--metrics", "remote") from error
+    host, _, number = wanted.rpartition(":")
+    port = port_number(number)
+    if port is None:
+        raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
+    try:
+        server = LoopbackServer(port, _Answer, "metrics", host=host or LOOPBACK)
+    except OSError as error:
+        raise PortError(f"--metrics {wanted}: {error.strerror or error}") from error
+    server.url += "metrics"
+    return server
+
+
+class _Answer(Answer):
+    def do_GET(self) -> None:
+        from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+
+        self.answer(200, generate_latest(_Collector(self.server.document)), CONTENT_TYPE_LATEST)
+
+
+class _Collector:
+    """The statistics as Prometheus reads them."""
+
+    def __init__(self, statistics: Document) -> None:
+        self._statistics = statistics
+
+    def collect(self) -> Iterable[Any]:
+        """Yield one metric for each figure that the statistics hold now."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        told = self._statistics()
+        for name, kind, text, keys, factor in _FIGURES:
+            value: Any = told
+            for key in keys:
+                value = value[key]
+            if value is None:
+                continue
+            family = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
+            metric = family(f"sfms_{name}", text, labels=["listener", "server"])
+            metric.add_metric([told["listener"], told["server"]], float(value) * factor)
+            yield metric

@@ -11,7 +11,7 @@ from emulated_port import Straight
 
 from sfms_robot.app.bench import campaign_rig
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.emulated_servo import EmulatedServo
+from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.ports import Bus
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
