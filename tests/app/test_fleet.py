@@ -53,7 +53,7 @@ KEY = b"k" * 64
 @pytest.mark.parametrize("command", ["resume", "end"])
 def test_resume_and_end_need_a_proof_of_the_key_which_counts_once(run, command):
     controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
-    run.halt.close("kitchen")
+    run.halt.close("kitchen", "fleet")
 
     def sent(**more):
         return controls.obey(json.dumps({"command": command, **more}).encode(), "hall", KEY)
