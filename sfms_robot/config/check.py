@@ -15,13 +15,11 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from sfms_robot.config.base import UNKNOWN_KEY, Name, one_line
 from sfms_robot.config.consistency import problems, rates, wiring
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Head, load_head
-from sfms_robot.config.inheritance import expanded
+from sfms_robot.config.head import Head, expanded, load_head
 from sfms_robot.config.joint import Joint, LimitClass
 from sfms_robot.config.kinematics import Kinematics
 from sfms_robot.config.kinematics import problems as neck_problems
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
-from sfms_robot.config.migration import migrated
 from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.overlay import load_overlay
 from sfms_robot.config.register_rules import register_problems
@@ -79,7 +77,7 @@ def _problems(raw: Any) -> list[str]:
     if not isinstance(raw, dict):
         return [f"a head is a table of {', '.join(Head.model_fields)}"]
     try:
-        full = expanded(migrated(raw))
+        full = expanded(raw)
     except ValueError as error:
         return [str(error)]
     found: list[str] = []

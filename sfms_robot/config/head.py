@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from sfms_robot.config.base import Model, Name, parse
+from sfms_robot.config.base import Model, Name, load
 from sfms_robot.config.camera_mount import CameraMount
 from sfms_robot.config.consistency import problems, rates, wiring
-from sfms_robot.config.inheritance import expanded
 from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
 from sfms_robot.config.kinematics import Kinematics
 from sfms_robot.config.kinematics import problems as neck_problems
 from sfms_robot.config.life import Life
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
-from sfms_robot.config.migration import VERSION, former_words, migrated
 from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.robot_description import RobotDescription
 from sfms_robot.config.robot_description import problems as description_problems
 from sfms_robot.config.safety_rules import Faults, Safety
-from sfms_robot.config.yaml_file import read
 from sfms_robot.data import find
 
-logger = logging.getLogger(__name__)
+VERSION: Final = 1  # of a head's file
+NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # what a twin does not take over
 
 
 class Head(Model):
@@ -63,7 +60,7 @@ class Head(Model):
     @model_validator(mode="before")
     @classmethod
     def _expanded(cls, value: Any) -> Any:
-        return expanded(migrated(value))
+        return expanded(value)
 
     @model_validator(mode="after")
     def _consistent(self) -> Head:
@@ -85,12 +82,46 @@ class Head(Model):
 
 
 def load_head(name: str) -> Head:
-    """A head by shipped name or folder. Words of an older version are taken, and each is told in the log."""
+    """Return a head by shipped name or folder. Raises ConfigError."""
     folder = find("heads", name, "head.yaml")
     file = folder / "head.yaml"
-    raw = read(file)
-    for line in former_words(raw):
-        logger.warning("%s: %s", file, line)
-    head = parse(Head, raw, file)
+    head = load(Head, file)
     head._folder = folder
     return head
+
+
+def expanded(raw: Any) -> Any:
+    """Return a head's plain data with `joint_defaults` and `mirror_of` filled into its joints.
+
+    A mirrored drive is the same drive with left and right exchanged. Channels that end in Left or Right change places;
+    roll, yaw and y, which have one channel for both sides, change sign. A joint whose plus points to the same side of
+    the head as that of its twin (pan, say) is of the opposite sense: its drive, and its range, are negated as well.
+
+    A value of the wrong type stays as it is, for the models to refuse. Raises ValueError for a newer version.
+    """
+    if not isinstance(raw, dict):
+        return raw
+    version = raw.get("version")
+    if isinstance(version, int) and version > VERSION:
+        raise ValueError(f"version = {version} is of a newer sfms-robot; this one reads version {VERSION}")
+    if not isinstance(raw.get("joints"), dict):
+        return raw
+    defaults = raw.get("joint_defaults")
+    shared = defaults if isinstance(defaults, dict) else {}
+    written = raw["joints"]
+    joints = {name: {**shared, **joint} if isinstance(joint, dict) else joint for name, joint in written.items()}
+    for name, joint in written.items():
+        named = joint.get("mirror_of") if isinstance(joint, dict) else None
+        if isinstance(named, str) and isinstance(twin := written.get(named), dict):
+            joints[name] = {**_seen_in_mirror({**shared, **twin}, joint.get("mirror_sense")), **joint}
+    return {**raw, "joints": joints}
+
+
+def _seen_in_mirror(twin: dict[str, Any], sense: Any) -> dict[str, Any]:
+    out = {key: value for key, value in twin.items() if key not in NOT_SHARED}
+    if sense != "opposite":  # a servo on the other side of the head turns the other way for the same motion
+        return {**out, "sign": -1 if out.get("sign", 1) == 1 else 1}
+    for key, other in (("min_deg", "max_deg"), ("max_deg", "min_deg"), ("rest_deg", "rest_deg")):
+        if isinstance(twin.get(other), (int, float)):
+            out[key] = -twin[other]
+    return out

@@ -12,7 +12,6 @@ from sfms_robot.plugins import plugins
 
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
 BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
-FORMER_FAMILIES: Final[Mapping[str, str]] = {"dynamixel": "dynamixel2"}  # as 0.1.0 called them
 HIGHEST_RATE_HZ: Final = 1000.0
 
 # Bytes of one sync write of goal positions: around it, and per servo with its id. A board of hobby servos is not here:
@@ -25,7 +24,6 @@ _BITS: Final = 10  # of a byte on the wire: start, eight, stop
 
 
 def _family(name: str) -> str:
-    name = FORMER_FAMILIES.get(name, name)
     if name in BUS_FAMILIES:
         return name
     known = [*BUS_FAMILIES, *plugins(BUS_GROUP)]
