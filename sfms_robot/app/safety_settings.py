@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sfms_robot.config import FirmwareMap, Head, Joint
-from sfms_robot.config.register_rules import check_registers
+from sfms_robot.config.safety_rules import check_registers
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.servo.policy import tells_current, torque_register

@@ -2,27 +2,134 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from sfms_robot.config.base import Model, Name, load
-from sfms_robot.config.camera_mount import CameraMount
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, load
 from sfms_robot.config.consistency import problems, rates, wiring
 from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
-from sfms_robot.config.kinematics import Kinematics
+from sfms_robot.config.kinematics import Kinematics, Triple
 from sfms_robot.config.kinematics import problems as neck_problems
-from sfms_robot.config.life import Life
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
 from sfms_robot.config.named_bus import Bus
-from sfms_robot.config.robot_description import RobotDescription
-from sfms_robot.config.robot_description import problems as description_problems
 from sfms_robot.config.safety_rules import Faults, Safety
 from sfms_robot.data import find
 
 VERSION: Final = 1  # of a head's file
+Share = Annotated[float, Field(ge=0, le=1)]
 NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # what a twin does not take over
+
+
+class CameraMount(Model):
+    """A camera and where it looks; axes are the head's, x forward, y left, z up.
+
+    Attributes:
+        on: `head` moves with the neck; `base` stays.
+        at_m: its place, from the middle of the head at home.
+        rpy_deg: how it is turned, roll, pitch (+ down) and yaw (+ left); zero looks ahead.
+    """
+
+    on: Literal["head", "base"]
+    at_m: Triple = (0.0, 0.0, 0.0)
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
+
+
+class Gaze(Model):
+    """Eyes that hold and jump.
+
+    Attributes:
+        neck_gain: share of the head's yaw and pitch that the eyes turn against (vestibulo-ocular).
+        dead_zone_deg: gaze is held until its target is this far away.
+        recentre_deg: how far the eyes may be turned from their target by compensating, then they jump back.
+        settle_ms: the target has to be away for this long before the eyes follow.
+        pause_ms: shortest hold between two jumps.
+        full_yaw_deg, full_pitch_deg: the eye's angle for a channel of 1.
+    """
+
+    neck_gain: Share = 1.0
+    dead_zone_deg: Positive = 1.5
+    recentre_deg: Positive = 12.0
+    settle_ms: NonNegative = 40.0
+    pause_ms: NonNegative = 120.0
+    full_yaw_deg: Positive = 30.0
+    full_pitch_deg: Positive = 20.0
+
+
+class Idle(Model):
+    """Small motion where the listener gives none. 0 leaves a kind out.
+
+    Attributes:
+        blinks_per_minute: wanted in all, those of the listener counted.
+        head_deg: half the swing of yaw; pitch and roll swing less.
+        glance_deg: how far the eyes wander, for a head that is given no gaze.
+        still_deg_s: a head or eyes slower than this are not being moved by the listener.
+        fade_s: how long the listener has to be still before idle motion is back in full.
+    """
+
+    blinks_per_minute: Annotated[float, Field(ge=0, le=60)] = 14.0
+    head_deg: Annotated[float, Field(ge=0, le=10)] = 1.2
+    glance_deg: Annotated[float, Field(ge=0, le=15)] = 3.0
+    still_deg_s: Positive = 3.0
+    fade_s: Positive = 3.0
+
+
+class Person(Model):
+    """Looking at whom the head listens to, and away as people do.
+
+    Attributes:
+        head_share: of the direction to a person, what the neck turns; the eyes keep the rest. A head that is given no
+            gaze turns its neck all the way.
+        look_away: how often the head looks away, people being 1; 0 is never.
+    """
+
+    head_share: Share = 0.6
+    look_away: Annotated[float, Field(ge=0, le=2)] = 1.0
+
+
+class Life(Model):
+    """All are optional; a section that is left out does nothing."""
+
+    gaze: Gaze | None = None
+    idle: Idle | None = None
+    person: Person | None = None
+
+
+class FollowingJoint(Model):
+    """One joint of the URDF: its value is `offset` + `scale` x our joint's angle [rad].
+
+    `scale` is 1 or -1 for a joint that turns as ours does, metres per radian for one that slides.
+    """
+
+    joint: Annotated[str, Field(min_length=1)]
+    scale: Finite = 1.0
+    offset: Finite = 0.0
+
+
+class RobotDescription(Model):
+    """A URDF file, beside the head's file or anywhere, or the name of a shipped head that looks the same.
+
+    Attributes:
+        packages: where the folders of `package://NAME/...` lie, from the head's folder on.
+        joints: our joint -> joint of the URDF; one that is not named here drives the joint of its own name.
+    """
+
+    file: Annotated[str, Field(min_length=1)]
+    packages: dict[str, str] = Field(default_factory=dict)
+    joints: dict[Name, FollowingJoint] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, value: Any) -> Any:
+        """`urdf: FILE`, and `jaw: JawJoint` under joints."""
+        if isinstance(value, str):
+            return {"file": value}
+        if isinstance(value, dict) and isinstance(joints := value.get("joints"), dict):
+            long = {name: {"joint": given} if isinstance(given, str) else given for name, given in joints.items()}
+            return {**value, "joints": long}
+        return value
 
 
 class Head(Model):
@@ -88,6 +195,23 @@ def load_head(name: str) -> Head:
     head = load(Head, file)
     head._folder = folder
     return head
+
+
+def description_problems(description: RobotDescription | None, joints: Collection[str]) -> list[str]:
+    """Return the joints of the description that the head has not, and those of the URDF that two of ours would move."""
+    if description is None:
+        return []
+    known = ", ".join(joints)
+    found = [
+        f"urdf.joints: {name!r} is not a joint of this head ({known})"
+        for name in description.joints
+        if name not in joints
+    ]
+    owner: dict[str, str] = {}
+    for name, follows in description.joints.items():
+        if owner.setdefault(follows.joint, name) != name:
+            found.append(f"urdf.joints.{name}.joint = {follows.joint!r} already follows {owner[follows.joint]}")
+    return found
 
 
 def expanded(raw: Any) -> Any:
