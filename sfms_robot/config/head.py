@@ -6,6 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, load
@@ -17,6 +18,7 @@ from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
 from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.safety_rules import Faults, Safety
 from sfms_robot.data import find
+from sfms_robot.frames import Doubles
 
 VERSION: Final = 1  # of a head's file
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -56,6 +58,11 @@ class Gaze(Model):
     pause_ms: NonNegative = 120.0
     full_yaw_deg: Positive = 30.0
     full_pitch_deg: Positive = 20.0
+
+    @property
+    def full_rad(self) -> Doubles:
+        """Return the eye's yaw and pitch (2,) for a channel of 1."""
+        return np.radians([self.full_yaw_deg, self.full_pitch_deg])
 
 
 class Idle(Model):

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Doubles
-from sfms_robot.retarget.kinematics import reach_limit, rotations, split
+from sfms_robot.retarget.kinematics import reach_limit, split
 from sfms_robot.retarget.kinematics.neck import Ranges, Solved, checked
 from sfms_robot.retarget.kinematics.stewart import Platform
+from sfms_robot.signals import rotations
 
 MIN_STIFFNESS: Final = 0.02  # share of the stiffness (determinant) at home
 DEAD_CENTRE: Final = 0.999  # a crank turns at most some 22 times as fast as in the middle of its stroke

@@ -16,8 +16,9 @@ import numpy as np
 
 from sfms_robot.config.kinematics import SerialNeck, Split
 from sfms_robot.frames import Doubles
-from sfms_robot.retarget.kinematics import differential, rotations, split
+from sfms_robot.retarget.kinematics import differential, split
 from sfms_robot.retarget.kinematics.neck import Ranges, Solved, checked
+from sfms_robot.signals import rotations
 
 EXACT_RAD: Final = 1e-9
 EXACT_M: Final = 1e-9
