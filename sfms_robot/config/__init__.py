@@ -1,6 +1,6 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices.
 
-Every name is loaded when it is first used: to read a listener's file does not build the models of a head's.
+Every name is loaded when it is first used, so that a program that reads a listener's file builds no models of a head.
 """
 
 from importlib import import_module
