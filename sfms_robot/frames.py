@@ -46,6 +46,8 @@ CHANNEL_INDEX: Final[Mapping[str, int]] = {name: index for index, name in enumer
 POSE: Final = slice(0, 6)
 SHAPES: Final = slice(6, 58)
 MOTION_DIM: Final = len(CHANNELS)  # 58
+YAW_PITCH: Final = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
+BLINKS: Final = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
 SMILE_CORNERS: Final = ("mouthSmileLeft", "mouthSmileRight")  # of the mouth: what tells a smile
 
 # Columns of each motion space a listener may work in (`signals.spaces`); arkit58 is a motion array itself.

@@ -8,7 +8,6 @@ on loopback nor encrypted needs `--insecure`.
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import re
 import threading
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
+from sfms_robot.origin import is_loopback
 
 if TYPE_CHECKING:
     import zenoh
@@ -129,10 +129,7 @@ def _check_secure(config: zenoh.Config, file: Path) -> None:
 def _is_secure(endpoint: str) -> bool:
     protocol, _, address = endpoint.partition("/")
     host = re.split("[?#]", address)[0].rpartition(":")[0].strip("[]")
-    try:
-        return protocol in SAFE or host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return protocol in SAFE or host == "localhost" or is_loopback(host)
 
 
 def serve_session(config: zenoh.Config) -> zenoh.Session:

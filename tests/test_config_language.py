@@ -10,7 +10,7 @@ import yaml
 
 from sfms_robot.config import Expression, Head, Joint, LimitClass, Region, load, parse
 from sfms_robot.config.check import check_head
-from sfms_robot.config.life import Gaze, Idle
+from sfms_robot.config.head import Gaze, Idle
 from sfms_robot.config.mapping import Coupling, Fold
 from sfms_robot.config.schema import text
 from sfms_robot.config.yaml_file import read

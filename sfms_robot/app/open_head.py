@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import FirmwareMap, Head, Joint, load_head
-from sfms_robot.config.register_rules import check_registers
+from sfms_robot.config.safety_rules import check_registers
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import Doubles

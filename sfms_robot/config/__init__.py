@@ -1,6 +1,6 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices.
 
-Every name is loaded when it is first used: whoever reads a listener's file does not build the models of a head's.
+Every name is loaded when it is first used, so that a program that reads a listener's file builds no models of a head.
 """
 
 from importlib import import_module
@@ -8,36 +8,48 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from sfms_robot.config.arig import Arig, Diffusion
-    from sfms_robot.config.arig_training import (
-        ArigPhase,
-        ArigTraining,
-        GroupWeights,
-        Stage,
-        load_training,
-        parse_training,
-    )
     from sfms_robot.config.base import Model, load, parse
     from sfms_robot.config.calmness import Calmness
-    from sfms_robot.config.camera_mount import CameraMount
-    from sfms_robot.config.firmware import FirmwareMap, Register, load_firmware_map, map_files, variant
-    from sfms_robot.config.head import Head, load_head
-    from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
-    from sfms_robot.config.life import Gaze, Idle, Life, Person
+    from sfms_robot.config.firmware import FirmwareMap, load_firmware_map, map_files, variant
+    from sfms_robot.config.head import (
+        CameraMount,
+        FollowingJoint,
+        Gaze,
+        Head,
+        Idle,
+        Life,
+        Person,
+        RobotDescription,
+        load_head,
+    )
+    from sfms_robot.config.joint import Joint, LimitClass
     from sfms_robot.config.listener import (
         ChannelGroup,
         Listener,
         NodCourse,
-        Sampling,
         Sfms,
         SmileCourse,
     )
     from sfms_robot.config.listener_kinds import load_listener, parse_listener
-    from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
+    from sfms_robot.config.mapping import Coupling, Expression, Region
     from sfms_robot.config.named_bus import Bus
-    from sfms_robot.config.recipe import Baseline, Dense, Grouped, Recipe
-    from sfms_robot.config.robot_description import FollowingJoint, RobotDescription
     from sfms_robot.config.safety_rules import Faults, LoadRule, Safety, Threshold
-    from sfms_robot.config.training import Phase, PredictorTraining, TokenizerTraining, Training
+    from sfms_robot.config.training import (
+        ArigPhase,
+        ArigTraining,
+        Baseline,
+        Dense,
+        Grouped,
+        GroupWeights,
+        Phase,
+        PredictorTraining,
+        Recipe,
+        Stage,
+        TokenizerTraining,
+        Training,
+        load_training,
+        parse_training,
+    )
     from sfms_robot.data import find
 
 __all__ = [
@@ -55,7 +67,6 @@ __all__ = [
     "Expression",
     "Faults",
     "FirmwareMap",
-    "Fold",
     "FollowingJoint",
     "Gaze",
     "GroupWeights",
@@ -63,7 +74,6 @@ __all__ = [
     "Head",
     "Idle",
     "Joint",
-    "JointDefaults",
     "Life",
     "LimitClass",
     "Listener",
@@ -74,10 +84,8 @@ __all__ = [
     "PredictorTraining",
     "Recipe",
     "Region",
-    "Register",
     "RobotDescription",
     "Safety",
-    "Sampling",
     "Sfms",
     "NodCourse",
     "SmileCourse",
@@ -101,29 +109,49 @@ __all__ = [
 # Module -> what comes from there.
 _NAMES: Final = {
     "config.arig": ("Arig", "Diffusion"),
-    "config.arig_training": ("ArigPhase", "ArigTraining", "GroupWeights", "Stage", "load_training", "parse_training"),
     "config.base": ("Model", "load", "parse"),
     "config.calmness": ("Calmness",),
-    "config.camera_mount": ("CameraMount",),
-    "config.firmware": ("FirmwareMap", "Register", "load_firmware_map", "map_files", "variant"),
-    "config.head": ("Head", "load_head"),
-    "config.joint": ("Joint", "JointDefaults", "LimitClass"),
-    "config.life": ("Gaze", "Idle", "Life", "Person"),
-    "config.listener": ("ChannelGroup", "Listener", "NodCourse", "Sampling", "Sfms", "SmileCourse"),
+    "config.firmware": ("FirmwareMap", "load_firmware_map", "map_files", "variant"),
+    "config.head": (
+        "CameraMount",
+        "FollowingJoint",
+        "Gaze",
+        "Head",
+        "Idle",
+        "Life",
+        "Person",
+        "RobotDescription",
+        "load_head",
+    ),
+    "config.joint": ("Joint", "LimitClass"),
+    "config.listener": ("ChannelGroup", "Listener", "NodCourse", "Sfms", "SmileCourse"),
     "config.listener_kinds": ("load_listener", "parse_listener"),
-    "config.mapping": ("Coupling", "Expression", "Fold", "Region"),
+    "config.mapping": ("Coupling", "Expression", "Region"),
     "config.named_bus": ("Bus",),
-    "config.recipe": ("Baseline", "Dense", "Grouped", "Recipe"),
-    "config.robot_description": ("FollowingJoint", "RobotDescription"),
     "config.safety_rules": ("Faults", "LoadRule", "Safety", "Threshold"),
-    "config.training": ("Phase", "PredictorTraining", "TokenizerTraining", "Training"),
+    "config.training": (
+        "ArigPhase",
+        "ArigTraining",
+        "Baseline",
+        "Dense",
+        "Grouped",
+        "GroupWeights",
+        "Phase",
+        "PredictorTraining",
+        "Recipe",
+        "Stage",
+        "TokenizerTraining",
+        "Training",
+        "load_training",
+        "parse_training",
+    ),
     "data": ("find",),
 }
 _MODULE_OF: Final = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name from its module (PEP 562)."""
+    """Load a name from its module (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"sfms_robot.{_MODULE_OF[name]}"), name)

@@ -15,19 +15,14 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from sfms_robot.config.base import UNKNOWN_KEY, Name, one_line
 from sfms_robot.config.consistency import problems, rates, wiring
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Head, load_head
-from sfms_robot.config.inheritance import expanded
+from sfms_robot.config.head import Head, RobotDescription, description_problems, expanded, load_head
 from sfms_robot.config.joint import Joint, LimitClass
 from sfms_robot.config.kinematics import Kinematics
 from sfms_robot.config.kinematics import problems as neck_problems
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
-from sfms_robot.config.migration import migrated
 from sfms_robot.config.named_bus import Bus
 from sfms_robot.config.overlay import load_overlay
-from sfms_robot.config.register_rules import register_problems
-from sfms_robot.config.robot_description import RobotDescription
-from sfms_robot.config.robot_description import problems as description_problems
-from sfms_robot.config.safety_rules import Safety
+from sfms_robot.config.safety_rules import Safety, register_problems
 from sfms_robot.config.yaml_file import read
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
@@ -79,7 +74,7 @@ def _problems(raw: Any) -> list[str]:
     if not isinstance(raw, dict):
         return [f"a head is a table of {', '.join(Head.model_fields)}"]
     try:
-        full = expanded(migrated(raw))
+        full = expanded(raw)
     except ValueError as error:
         return [str(error)]
     found: list[str] = []

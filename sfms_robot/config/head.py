@@ -2,30 +2,141 @@
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal
 
+import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
-from sfms_robot.config.base import Model, Name, parse
-from sfms_robot.config.camera_mount import CameraMount
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, load
 from sfms_robot.config.consistency import problems, rates, wiring
-from sfms_robot.config.inheritance import expanded
 from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
-from sfms_robot.config.kinematics import Kinematics
+from sfms_robot.config.kinematics import Kinematics, Triple
 from sfms_robot.config.kinematics import problems as neck_problems
-from sfms_robot.config.life import Life
 from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
-from sfms_robot.config.migration import VERSION, former_words, migrated
 from sfms_robot.config.named_bus import Bus
-from sfms_robot.config.robot_description import RobotDescription
-from sfms_robot.config.robot_description import problems as description_problems
 from sfms_robot.config.safety_rules import Faults, Safety
-from sfms_robot.config.yaml_file import read
 from sfms_robot.data import find
+from sfms_robot.frames import Doubles
 
-logger = logging.getLogger(__name__)
+VERSION: Final = 1  # of a head's file
+Share = Annotated[float, Field(ge=0, le=1)]
+NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # what a twin does not take over
+
+
+class CameraMount(Model):
+    """A camera and where it looks; axes are the head's, x forward, y left, z up.
+
+    Attributes:
+        on: `head` moves with the neck; `base` stays.
+        at_m: its place, from the middle of the head at home.
+        rpy_deg: how it is turned, roll, pitch (+ down) and yaw (+ left); zero looks ahead.
+    """
+
+    on: Literal["head", "base"]
+    at_m: Triple = (0.0, 0.0, 0.0)
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
+
+
+class Gaze(Model):
+    """Eyes that hold and jump.
+
+    Attributes:
+        neck_gain: share of the head's yaw and pitch that the eyes turn against (vestibulo-ocular).
+        dead_zone_deg: gaze is held until its target is this far away.
+        recentre_deg: how far the eyes may be turned from their target by compensating, then they jump back.
+        settle_ms: the target has to be away for this long before the eyes follow.
+        pause_ms: shortest hold between two jumps.
+        full_yaw_deg, full_pitch_deg: the eye's angle for a channel of 1.
+    """
+
+    neck_gain: Share = 1.0
+    dead_zone_deg: Positive = 1.5
+    recentre_deg: Positive = 12.0
+    settle_ms: NonNegative = 40.0
+    pause_ms: NonNegative = 120.0
+    full_yaw_deg: Positive = 30.0
+    full_pitch_deg: Positive = 20.0
+
+    @property
+    def full_rad(self) -> Doubles:
+        """Return the eye's yaw and pitch (2,) for a channel of 1."""
+        return np.radians([self.full_yaw_deg, self.full_pitch_deg])
+
+
+class Idle(Model):
+    """Small motion where the listener gives none. 0 leaves a kind out.
+
+    Attributes:
+        blinks_per_minute: wanted in all, those of the listener counted.
+        head_deg: half the swing of yaw; pitch and roll swing less.
+        glance_deg: how far the eyes wander, for a head that is given no gaze.
+        still_deg_s: a head or eyes slower than this are not being moved by the listener.
+        fade_s: how long the listener has to be still before idle motion is back in full.
+    """
+
+    blinks_per_minute: Annotated[float, Field(ge=0, le=60)] = 14.0
+    head_deg: Annotated[float, Field(ge=0, le=10)] = 1.2
+    glance_deg: Annotated[float, Field(ge=0, le=15)] = 3.0
+    still_deg_s: Positive = 3.0
+    fade_s: Positive = 3.0
+
+
+class Person(Model):
+    """Looking at whom the head listens to, and away as people do.
+
+    Attributes:
+        head_share: of the direction to a person, what the neck turns; the eyes keep the rest. A head that is given no
+            gaze turns its neck all the way.
+        look_away: how often the head looks away, people being 1; 0 is never.
+    """
+
+    head_share: Share = 0.6
+    look_away: Annotated[float, Field(ge=0, le=2)] = 1.0
+
+
+class Life(Model):
+    """All are optional; a section that is left out does nothing."""
+
+    gaze: Gaze | None = None
+    idle: Idle | None = None
+    person: Person | None = None
+
+
+class FollowingJoint(Model):
+    """One joint of the URDF: its value is `offset` + `scale` x our joint's angle [rad].
+
+    `scale` is 1 or -1 for a joint that turns as ours does, metres per radian for one that slides.
+    """
+
+    joint: Annotated[str, Field(min_length=1)]
+    scale: Finite = 1.0
+    offset: Finite = 0.0
+
+
+class RobotDescription(Model):
+    """A URDF file, beside the head's file or anywhere, or the name of a shipped head that looks the same.
+
+    Attributes:
+        packages: where the folders of `package://NAME/...` lie, from the head's folder on.
+        joints: our joint -> joint of the URDF; one that is not named here drives the joint of its own name.
+    """
+
+    file: Annotated[str, Field(min_length=1)]
+    packages: dict[str, str] = Field(default_factory=dict)
+    joints: dict[Name, FollowingJoint] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, value: Any) -> Any:
+        """`urdf: FILE`, and `jaw: JawJoint` under joints."""
+        if isinstance(value, str):
+            return {"file": value}
+        if isinstance(value, dict) and isinstance(joints := value.get("joints"), dict):
+            long = {name: {"joint": given} if isinstance(given, str) else given for name, given in joints.items()}
+            return {**value, "joints": long}
+        return value
 
 
 class Head(Model):
@@ -63,7 +174,7 @@ class Head(Model):
     @model_validator(mode="before")
     @classmethod
     def _expanded(cls, value: Any) -> Any:
-        return expanded(migrated(value))
+        return expanded(value)
 
     @model_validator(mode="after")
     def _consistent(self) -> Head:
@@ -85,12 +196,63 @@ class Head(Model):
 
 
 def load_head(name: str) -> Head:
-    """A head by shipped name or folder. Words of an older version are taken, and each is told in the log."""
+    """Return a head by shipped name or folder. Raises ConfigError."""
     folder = find("heads", name, "head.yaml")
     file = folder / "head.yaml"
-    raw = read(file)
-    for line in former_words(raw):
-        logger.warning("%s: %s", file, line)
-    head = parse(Head, raw, file)
+    head = load(Head, file)
     head._folder = folder
     return head
+
+
+def description_problems(description: RobotDescription | None, joints: Collection[str]) -> list[str]:
+    """Return the joints of the description that the head has not, and those of the URDF that two of ours would move."""
+    if description is None:
+        return []
+    known = ", ".join(joints)
+    found = [
+        f"urdf.joints: {name!r} is not a joint of this head ({known})"
+        for name in description.joints
+        if name not in joints
+    ]
+    owner: dict[str, str] = {}
+    for name, follows in description.joints.items():
+        if owner.setdefault(follows.joint, name) != name:
+            found.append(f"urdf.joints.{name}.joint = {follows.joint!r} already follows {owner[follows.joint]}")
+    return found
+
+
+def expanded(raw: Any) -> Any:
+    """Return a head's plain data with `joint_defaults` and `mirror_of` filled into its joints.
+
+    A mirrored drive is the same drive with left and right exchanged. Channels that end in Left or Right change places;
+    roll, yaw and y, which have one channel for both sides, change sign. A joint whose plus points to the same side of
+    the head as that of its twin (pan, say) is of the opposite sense: its drive, and its range, are negated as well.
+
+    A value of the wrong type stays as it is, for the models to refuse. Raises ValueError for a newer version.
+    """
+    if not isinstance(raw, dict):
+        return raw
+    version = raw.get("version")
+    if isinstance(version, int) and version > VERSION:
+        raise ValueError(f"version = {version} is of a newer sfms-robot; this one reads version {VERSION}")
+    if not isinstance(raw.get("joints"), dict):
+        return raw
+    defaults = raw.get("joint_defaults")
+    shared = defaults if isinstance(defaults, dict) else {}
+    written = raw["joints"]
+    joints = {name: {**shared, **joint} if isinstance(joint, dict) else joint for name, joint in written.items()}
+    for name, joint in written.items():
+        named = joint.get("mirror_of") if isinstance(joint, dict) else None
+        if isinstance(named, str) and isinstance(twin := written.get(named), dict):
+            joints[name] = {**_seen_in_mirror({**shared, **twin}, joint.get("mirror_sense")), **joint}
+    return {**raw, "joints": joints}
+
+
+def _seen_in_mirror(twin: dict[str, Any], sense: Any) -> dict[str, Any]:
+    out = {key: value for key, value in twin.items() if key not in NOT_SHARED}
+    if sense != "opposite":  # a servo on the other side of the head turns the other way for the same motion
+        return {**out, "sign": -1 if out.get("sign", 1) == 1 else 1}
+    for key, other in (("min_deg", "max_deg"), ("max_deg", "min_deg"), ("rest_deg", "rest_deg")):
+        if isinstance(twin.get(other), (int, float)):
+            out[key] = -twin[other]
+    return out

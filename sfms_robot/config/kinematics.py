@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
+from sfms_robot.config.joint import Joint
 from sfms_robot.config.mapping import Fold
 
 AxisName = Literal["roll", "pitch", "yaw"]
@@ -163,28 +164,8 @@ def _distinct(joints: tuple[str, ...]) -> None:
             raise ValueError(f"joint {joint!r} is used twice")
 
 
-class Ranged(Protocol):
-    """What a neck needs to know of a joint."""
-
-    @property
-    def min_rad(self) -> float: ...
-
-    @property
-    def max_rad(self) -> float: ...
-
-
-class Placed(Ranged, Protocol):
-    """What has to agree with the neck."""
-
-    @property
-    def rest_deg(self) -> float: ...
-
-    @property
-    def drive(self) -> object: ...
-
-
 def problems(
-    kinematics: Kinematics, joints: Mapping[str, Placed | None], folds: Sequence[Fold | None] = ()
+    kinematics: Kinematics, joints: Mapping[str, Joint | None], folds: Sequence[Fold | None] = ()
 ) -> list[str]:
     """Everything in which the neck and the head's joints do not agree, one line each; parts wrong alone are None."""
     found = []
@@ -202,7 +183,7 @@ def problems(
     return found
 
 
-def _home(name: str, joint: Placed) -> list[str]:
+def _home(name: str, joint: Joint) -> list[str]:
     if not joint.min_rad <= 0.0 <= joint.max_rad:
         return [f"joints.{name}: its range leaves out 0, where the neck stands at home"]
     if joint.rest_deg != 0:

@@ -290,8 +290,4 @@ def preset_groups(space: str, wanted: dict[str, Any]) -> dict[str, Any]:
 def _part(channel: str) -> str:
     if channel not in BLENDSHAPES:
         return "neck"
-    return (
-        next((part for part in ("brow", "eye") if channel.startswith(part)), "mouth")
-        .replace("brow", "brows")
-        .replace("eye", "eyes")
-    )
+    return "brows" if channel.startswith("brow") else "eyes" if channel.startswith("eye") else "mouth"

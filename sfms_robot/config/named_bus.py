@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema
@@ -13,12 +12,10 @@ from sfms_robot.plugins import plugins
 
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
 BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
-FORMER_FAMILIES: Final[Mapping[str, str]] = {"dynamixel": "dynamixel2"}  # as 0.1.0 called them
 HIGHEST_RATE_HZ: Final = 1000.0
 
 
 def _family(name: str) -> str:
-    name = FORMER_FAMILIES.get(name, name)
     if name in BUS_FAMILIES:
         return name
     known = [*BUS_FAMILIES, *plugins(BUS_GROUP)]

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from sfms_robot.config.base import Model
-from sfms_robot.config.head import load_head
-from sfms_robot.config.inheritance import NOT_SHARED
+from sfms_robot.config.head import NOT_SHARED, load_head
 from sfms_robot.config.joint import Joint
 from sfms_robot.config.overlay import CALIBRATE, FIT, head_hash, layered, load_overlay
 from sfms_robot.config.yaml_file import read

@@ -1,15 +1,25 @@
-"""How gentle a joint is, and what happens when its servo reports a fault: `safety` and `faults` of a head's file."""
+"""How gentle a joint is, and what happens when its servo reports a fault: `safety` and `faults` of a head's file.
+
+And what a file may write into a servo, or expect to find stored there, judged from the firmware map.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import re
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from pydantic import Field, StrictInt, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, Positive
+from sfms_robot.errors import ConfigError
+
+if TYPE_CHECKING:  # tables of registers, which a head's model does not need
+    from sfms_robot.config.firmware import FirmwareMap
 
 FaultPolicy = Literal["hold", "limp", "reduce", "reboot_and_ease_in"]
 MEASURED_FAULTS = ("input voltage", "overheating")  # those a threshold may be given for
+_HARMLESS: Final = re.compile(r"(\w+_)?gain|profile_\w+|acceleration|punch|led|c?cw_compliance_(margin|slope)")
 
 
 class LoadRule(Model):
@@ -33,7 +43,7 @@ class Safety(Model):
         halt: in an emergency stop, once the joint stands: torque off, or kept. By default joints of the neck, which
             bear its weight, keep it.
         warm_C, hot_C: temperature from which the joint moves half as far, and from which it stays at rest.
-        registers: raw values written before torque comes on: gains, profiles and the like (`register_rules`).
+        registers: raw values written before torque comes on: gains, profiles and the like (`is_harmless`).
         stored: raw values that have to be stored in the servo; compared before torque comes on, never written.
     """
 
@@ -79,3 +89,48 @@ class Faults(Model):
             if name not in MEASURED_FAULTS:
                 raise ValueError(f"thresholds.{name} is about nothing that is measured ({', '.join(MEASURED_FAULTS)})")
         return self
+
+
+def is_harmless(table: FirmwareMap, name: str) -> bool:
+    """Return whether a run may write this register unasked: one in RAM that cannot hurt.
+
+    `safety.registers` is written before torque comes on, in every run, without a question. So it holds only values
+    that are lost with the supply and cannot hurt: gains, profiles, compliance, LED. Id, direction and range are stored
+    for good; a head may say under `safety.stored` which values it expects, and a run compares and never writes them.
+    Goals, torque, modes and limits are the run's own.
+    """
+    register = table.registers[name]
+    return register.access == "RW" and register.area == "RAM" and _HARMLESS.fullmatch(name) is not None
+
+
+def register_problems(safety: Safety, table: FirmwareMap) -> Iterator[tuple[str, int, str, list[str]]]:
+    """Yield key, value, what is wrong with it, and the valid choices."""
+    harmless = [name for name in table.registers if is_harmless(table, name)]
+    stored = [name for name, row in table.registers.items() if row.area == "EEPROM"]
+    for key, given, choices in (("registers", safety.registers, harmless), ("stored", safety.stored, stored)):
+        for name, value in given.items():
+            register = table.registers.get(name)
+            if register is None:
+                yield f"{key}.{name}", value, f"is no register of {table.model}", choices
+            elif name not in choices:
+                yield f"{key}.{name}", value, _refusal(key, name, table), choices
+            elif not register.low <= value <= register.high:
+                yield f"{key}.{name}", value, f"does not fit {table.model}", [f"{register.low}..{register.high}"]
+
+
+def _refusal(key: str, name: str, table: FirmwareMap) -> str:
+    if key == "stored":
+        return f"is forgotten when {table.model} is switched off, nothing is stored there"
+    if table.registers[name].area == "EEPROM":
+        return (
+            f"would be stored in {table.model} for good: set it once with `sfms-robot servo write`, "
+            f"and let stored.{name} compare it; a run writes only"
+        )
+    return f"of {table.model} is not the file's to set; it may set"
+
+
+def check_registers(head: str, joints: Mapping[str, tuple[Safety, FirmwareMap]]) -> None:
+    """Raise ConfigError for the first value of `joints` that a run must not write, or that cannot be stored."""
+    for joint, (safety, table) in joints.items():
+        for key, value, problem, choices in register_problems(safety, table):
+            raise ConfigError.at(head, f"joints.{joint}.safety.{key}", value, problem, choices)

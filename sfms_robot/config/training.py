@@ -1,14 +1,23 @@
-"""How listeners are trained: what every phase of training shares, and the two phases of SFMS."""
+"""How listeners are trained: what every phase of training shares, the two phases of SFMS, and the one of ARIG.
+
+The tokenizers of the comparison tables come last.
+"""
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from sfms_robot.config.base import Model, Name, NonNegative, Positive
-from sfms_robot.config.listener import Count, Sfms, Share
+from sfms_robot.config.arig import Arig
+from sfms_robot.config.base import Model, Name, NonNegative, Positive, parse
+from sfms_robot.config.listener import Count, Sfms, Share, check_heads
+from sfms_robot.config.yaml_file import read
+from sfms_robot.errors import ConfigError
 
+HALVINGS = 3  # of time, in a grouped tokenizer: 8 frames to a code
 _RESUMABLE = frozenset({"checkpoint_every", "checkpoint_minutes", "patience"})
 
 
@@ -115,3 +124,180 @@ class Training(Model):
                 choices = ", ".join(self.listener.groups)
                 raise ValueError(f"predictor.group_weights: {name!r} is not a group of the listener ({choices})")
         return self
+
+
+class Stage(Model):
+    """A part of the curriculum.
+
+    Attributes:
+        share: of all steps.
+        speaking, listening, interaction: how its windows are drawn from the sets of these names, as weights. A set that
+            the data lack is left out.
+    """
+
+    share: Annotated[float, Field(gt=0, le=1)]
+    speaking: NonNegative = 0.0
+    listening: NonNegative = 0.0
+    interaction: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _draws(self) -> Stage:
+        if not self.speaking + self.listening + self.interaction:
+            raise ValueError("a stage needs a weight above 0 (speaking, listening, interaction)")
+        return self
+
+
+class GroupWeights(Model):
+    """What the mean loss of a group of channels weighs (`learning.arig.losses.GROUPS`), whatever their number."""
+
+    head: NonNegative = 1.0
+    lids: NonNegative = 1.0
+    brows: NonNegative = 1.0
+    mouth: NonNegative = 1.0
+
+    @model_validator(mode="after")
+    def _weighs(self) -> GroupWeights:
+        if not self.head + self.lids + self.brows + self.mouth:
+            raise ValueError("a group needs a weight above 0 (head, lids, brows, mouth)")
+        return self
+
+
+class ArigPhase(Phase):
+    """The training of an ARIG listener.
+
+    Attributes:
+        window_frames: frames of one sample; its first one begins a stream, so context reaches no further back.
+        draws: noise levels per frame in equation (3): the sampler is small beside what its condition costs.
+        state_weight: of the states' cross-entropy (3.3); coarse_weight: of the coarse motion's squared error (3.4);
+            equation (3) weighs 1. The paper gives no weights.
+        history_noise: most that the past motion is off by, in standard deviations: in a stream it is the model's own.
+        speaking_noise: likewise of jaw and mouth while the agent speaks: what it says decides them, not what they did.
+        state_noise: share of previous states that are drawn by lot. A stream that goes on from its own best guess needs
+            it: true ones would be copied, and it has none. One that draws its states (events) is taught with true ones.
+        group_weights: of groups of channels in equation (3); None: every channel counts the same, which is the paper.
+        event_windows: share of windows in which an event other than a blink is under way, every kind as often as any
+            other, for listeners that are told of them: smiles are rare.
+        drop_audio, drop_face: share of windows in which the user is not heard, not seen; drop_agent: of those in which
+            the agent says nothing, that have no agent's track.
+        quiet_room: share of windows in which what the user's microphone has besides speech is weaker, down to that of a
+            gate that is shut; silent_user: share in which it has nothing at all. No recording is as silent as that.
+        gain_db: most that either track is louder or softer; colour_db: most that its bands are, smoothly from low to
+            high, as another microphone has it; grain_db: deviation of every band of every row.
+        stages: the curriculum, in order; shares add up to 1.
+    """
+
+    window_frames: Annotated[int, Field(ge=2)] = 96
+    draws: Count = 4
+    state_weight: NonNegative = 0.1
+    coarse_weight: NonNegative = 0.5
+    history_noise: NonNegative = 0.3
+    speaking_noise: NonNegative = 1.0
+    state_noise: Share = 0.8
+    group_weights: GroupWeights | None = None
+    event_windows: Share = 0.0
+    drop_audio: Share = 0.1
+    drop_face: Share = 0.3
+    drop_agent: Share = 0.5
+    quiet_room: Share = 0.0
+    silent_user: Share = 0.0
+    gain_db: NonNegative = 6.0
+    colour_db: NonNegative = 6.0
+    grain_db: NonNegative = 2.0
+    stages: Annotated[tuple[Stage, ...], Field(min_length=1)] = (
+        Stage(share=0.15, speaking=1.0),
+        Stage(share=0.35, speaking=0.2, listening=0.8),
+        Stage(share=0.5, speaking=0.15, listening=0.5, interaction=0.35),
+    )
+
+    @model_validator(mode="after")
+    def _whole(self) -> ArigPhase:
+        total = sum(stage.share for stage in self.stages)
+        if abs(total - 1) > 1e-6:
+            raise ValueError(f"shares of the stages add up to {total:g}, not 1")
+        return self
+
+    def stage(self, step: int) -> Stage:
+        """The stage of a step; the last one from the end of its shares on."""
+        done = 0.0
+        for stage in self.stages:
+            done += stage.share
+            if step < round(done * self.steps):
+                return stage
+        return self.stages[-1]
+
+
+class ArigTraining(Model):
+    """How an ARIG listener is trained: `configs/training/arig.yaml`."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    listener: Arig
+    training: ArigPhase
+
+
+def load_training(file: Path) -> Training | ArigTraining:
+    """Read a training file of any kind of listener. Raises ConfigError."""
+    return parse_training(read(file), file)
+
+
+def parse_training(raw: Any, file: Path | str) -> Training | ArigTraining:
+    """Validate plain data of a training file. Raises ConfigError."""
+    listener = raw.get("listener") if isinstance(raw, dict) else None
+    kind = str(listener.get("kind")) if isinstance(listener, dict) else ""
+    if kind == "arig":
+        return parse(ArigTraining, raw, file)
+    if kind == "sfms":
+        return parse(Training, raw, file)
+    raise ConfigError.at(file, "listener.kind", kind, "is not a kind of listener", ("sfms", "arig"))
+
+
+class Baseline(Model):
+    """The common part of the dense and the grouped tokenizer: transformer encoder, codes, transformer decoder.
+
+    Attributes:
+        quantizer: a fixed grid (fsq), or as many learned vectors of `code_dims` dimensions (vq).
+        levels: multiply to the codes of a codebook.
+        layers: transformer blocks of the encoder, and as many of the decoder.
+    """
+
+    window_frames: Annotated[int, Field(ge=1)] = 48
+    quantizer: Literal["fsq", "vq"]
+    levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
+    code_dims: Count = 8
+    width: Count = 64
+    layers: Count = 2
+    heads: Count = 4
+
+    @property
+    def codes(self) -> int:
+        return math.prod(self.levels)
+
+    @model_validator(mode="after")
+    def _heads_fit(self) -> Baseline:
+        check_heads(self.heads, width=self.width)
+        return self
+
+
+class Dense(Baseline):
+    """Every frame has its code (Dense-FSQ, VQ-only)."""
+
+    kind: Literal["dense"] = "dense"
+
+
+class Grouped(Baseline):
+    """Every 8 frames have one code (Learning2Listen)."""
+
+    kind: Literal["grouped"] = "grouped"
+
+    @model_validator(mode="after")
+    def _whole_groups(self) -> Grouped:
+        if self.window_frames % 2**HALVINGS:
+            raise ValueError(f"window_frames {self.window_frames} is not a multiple of {2**HALVINGS}")
+        return self
+
+
+class Recipe(Model):
+    """One tokenizer of the comparison tables and how it is trained; its keyframes are for an sfms tokenizer alone."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    model: Annotated[Sfms | Dense | Grouped, Field(discriminator="kind")]
+    training: TokenizerTraining

@@ -17,7 +17,8 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, POSE, SHAPES, Doubles, Floats
 from sfms_robot.signals.action_units import FAU_VALUE, FULL, WITHOUT_SHAPE, blendshapes_of
 from sfms_robot.signals.flame import FlameMatrix
-from sfms_robot.signals.spaces import SPACES, decode, encode, limitation, turned_by
+from sfms_robot.signals.rotations import rotation
+from sfms_robot.signals.spaces import SPACES, decode, encode, limitation
 
 CONVERTIBLE: Final = ("arkit58", "deca56", "faceverse58", "seamless27")
 _ANGLES: Final = slice(0, 3)  # of a pose: roll, pitch, yaw
@@ -140,7 +141,7 @@ def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
     back = encode(ours, name)[:, SPACES[name].rotation].astype(np.float64)
 
     def turns(rows: Doubles) -> Rotation:
-        return Rotation.from_matrix(turned_by(rows)) if SPACES[name].euler else Rotation.from_rotvec(rows)
+        return Rotation.from_matrix(rotation(rows)) if SPACES[name].euler else Rotation.from_rotvec(rows)
 
     apart: Doubles = (turns(filed[:, columns]) * turns(back).inv()).magnitude()
     return apart

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfms_robot.corpora.compose.acting import Score, act
 from sfms_robot.corpora.compose.motions import Motions
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
+from sfms_robot.frames import FRAME_HZ, FRAME_S, YAW_PITCH, Doubles, Floats, ListenerEvent
 from sfms_robot.signals.events import MOTION_EVENTS, find_gaze_shifts
 from sfms_robot.signals.eye_angles import directions
 from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, head_part
@@ -30,7 +30,6 @@ SIZES: Final[Mapping[str, tuple[float, ...]]] = {
 }
 EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])  # an eye's yaw and pitch for a channel of 1
 _EYES: Final = list(EYE_CHANNELS)
-_HEAD: Final = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
 
 def gaze_rad(motion: Floats) -> Doubles:
     """Motion (N, 58) -> where head and eyes together look (N, 2), yaw and pitch."""
-    return np.asarray(motion[:, _HEAD] + directions(motion, EYES_RAD).mean(axis=1), np.float64)
+    return np.asarray(motion[:, YAW_PITCH] + directions(motion, EYES_RAD).mean(axis=1), np.float64)
 
 
 def gaze_shifts(motion: Floats) -> list[float]:

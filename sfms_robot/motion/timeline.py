@@ -33,7 +33,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats, Plan
+from sfms_robot.frames import BLINKS, CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats, Plan
 from sfms_robot.signals.minimum_jerk import ease
 
 BLEND_FRAMES = 2
@@ -45,7 +45,6 @@ LEAD_S = 0.25  # the limit of a lead before anything is measured
 FALL, RISE = 0.25, 0.02  # how fast the limit follows, seconds a second: it stays with the shortest that was left
 _EVEN = 1e-3  # frames count as evenly spaced within this share of a frame
 _FARTHEST = 1e6  # m or rad
-_BLINKS = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
 _JAW_OPEN = CHANNEL_INDEX["jawOpen"]
 
 
@@ -178,8 +177,8 @@ class PlanTimeline:
         asked_s = instants_s - curve.delay_s
         around_s = np.concatenate([asked_s, asked_s - self._widening_s, asked_s + self._widening_s])
         motion = _motion(curve, around_s)
-        blinks = motion[:, _BLINKS].reshape(3, len(asked_s), -1).max(axis=0)
-        motion[: len(asked_s), _BLINKS] = np.maximum(blinks, self._near(curve, asked_s))
+        blinks = motion[:, BLINKS].reshape(3, len(asked_s), -1).max(axis=0)
+        motion[: len(asked_s), BLINKS] = np.maximum(blinks, self._near(curve, asked_s))
         held = bool(played_s > curve.knots.times_s[-1])
         eased = now_s - curve.delay_s - curve.made_at_s > STALL_S
         return motion.astype(np.float32).take(which, axis=0), replace(
@@ -192,7 +191,7 @@ class PlanTimeline:
         nearest = times_s.searchsorted(asked_s + self._widening_s, side="right") - 1
         frame = np.maximum(nearest, 0)
         near = np.abs(times_s[frame] - asked_s) <= self._widening_s
-        blinks: Doubles = curve.knots.values[frame, _BLINKS]
+        blinks: Doubles = curve.knots.values[frame, BLINKS]
         return blinks * (near & (nearest >= 0) & (asked_s - curve.made_at_s < STALL_S))[:, None]
 
 
@@ -213,7 +212,7 @@ def _distinct(times_s: Doubles) -> tuple[Doubles, NDArray[np.intp]]:
 def _blend(before: Doubles, after: Doubles, share: float) -> Doubles:
     """Between two motions (58,), `share` of the later one; blinks by maximum."""
     blend = (1 - share) * before + share * after
-    blend[_BLINKS] = np.maximum(before[_BLINKS], after[_BLINKS])
+    blend[BLINKS] = np.maximum(before[BLINKS], after[BLINKS])
     return blend
 
 

@@ -69,6 +69,41 @@ class _Couplings:
             missing[..., rows] -= (there - now) * weights
 
 
+@dataclass(frozen=True)
+class Units:
+    """Joint angles (..., J) [rad] <-> joint units of the drives: -1 = min, 0 = rest, +1 = max, or rad from rest."""
+
+    rest: Doubles
+    up: Doubles
+    down: Doubles
+    low: Doubles
+    high: Doubles
+
+    @classmethod
+    def of(cls, head: Head) -> Units:
+        joints = head.joints.values()
+        rest = np.array([joint.rest_rad for joint in joints])
+        up = np.array([joint.max_rad for joint in joints]) - rest
+        down = rest - np.array([joint.min_rad for joint in joints])
+        in_rad = np.array([joint.unit == "rad" for joint in joints])
+        return cls(
+            rest,
+            np.where(in_rad | (up <= 0), 1.0, up),
+            np.where(in_rad | (down <= 0), 1.0, down),
+            -np.where(in_rad, down, down > 0),
+            np.where(in_rad, up, up > 0),
+        )
+
+    def values(self, angles_rad: Doubles) -> Doubles:
+        away = angles_rad - self.rest
+        out: Doubles = away / np.where(away > 0, self.up, self.down)
+        return out
+
+    def angles(self, values: Doubles) -> Doubles:
+        out: Doubles = self.rest + values * np.where(values > 0, self.up, self.down)
+        return out
+
+
 class ChannelMapping:
     """Implements `ports.Retargeter` for one head. A joint without a drive stays at rest.
 
@@ -81,14 +116,9 @@ class ChannelMapping:
     def __init__(self, head: Head) -> None:
         self.joints: Sequence[str] = tuple(head.joints)
         self._regions = head.regions
-        joints = list(head.joints.values())
-        self._low_rad = np.array([joint.min_rad for joint in joints])
-        self._rest_rad = np.array([joint.rest_rad for joint in joints])
-        self._high_rad = np.array([joint.max_rad for joint in joints])
-        up, down = self._high_rad - self._rest_rad, self._rest_rad - self._low_rad
-        in_rad = np.array([joint.unit == "rad" for joint in joints])
-        self._up, self._down = np.where(in_rad, 1.0, up), np.where(in_rad, 1.0, down)
-        self._high, self._low = np.where(in_rad, up, up > 0), -np.where(in_rad, down, down > 0)
+        self._units = Units.of(head)
+        self._low_rad = np.array([joint.min_rad for joint in head.joints.values()])
+        self._high_rad = np.array([joint.max_rad for joint in head.joints.values()])
 
         trees = drives(head)
         self._program = Program.of(list(trees.values()))
@@ -130,20 +160,19 @@ class ChannelMapping:
         if not knobs.neutral:
             values = self._inside(self._turned(values, knobs))
         if self._couplings is not None:
-            self._couplings.apply(values, self._low, self._high)
-        values *= np.where(values > 0, self._up, self._down)
-        angles: Doubles = values + self._rest_rad
+            self._couplings.apply(values, self._units.low, self._units.high)
+        angles = self._units.angles(values)
         np.maximum(angles, self._low_rad, out=angles)
         np.minimum(angles, self._high_rad, out=angles)
         return angles
 
     def _inside(self, values: Doubles) -> Doubles:
-        np.maximum(values, self._low, out=values)
-        np.minimum(values, self._high, out=values)
+        np.maximum(values, self._units.low, out=values)
+        np.minimum(values, self._units.high, out=values)
         return values
 
     def _turned(self, values: Doubles, knobs: Knobs) -> Doubles:
-        ends = np.where(values > 0, self._high, -self._low)
+        ends = np.where(values > 0, self._units.high, -self._units.low)
         share = np.abs(values) / np.where(ends > 0, ends, 1.0)
         turned: Doubles = values * knobs.intensity * (1.0 + (knobs.style - 1.0) * (1.0 - share))
         return turned

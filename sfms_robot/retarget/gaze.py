@@ -22,13 +22,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfms_robot.config import Gaze
-from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
-from sfms_robot.retarget.eyes import Jump
+from sfms_robot.frames import YAW_PITCH, Doubles, Floats
 from sfms_robot.retarget.gaze_target import Aim, turned
-from sfms_robot.signals.eye_angles import directions, turn
+from sfms_robot.signals.eye_angles import Jump, directions, turn
 
 ShownPose = Callable[[Floats], Doubles]  # motion (N, 58) -> the pose (N, 6) that the neck will show
-_HEAD = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class GazeHold:
         self._recentre_rad = math.radians(config.recentre_deg)
         self._settle_s = config.settle_ms / 1e3
         self._pause_s = config.pause_ms / 1e3
-        self.full_rad = np.radians([config.full_yaw_deg, config.full_pitch_deg])
+        self.full_rad = config.full_rad
 
     def step(
         self,
@@ -93,7 +91,7 @@ class GazeHold:
         else:
             _, first, which = np.unique(times_s, return_index=True, return_inverse=True)
             pose = shown_pose(motion[first])[which]
-        return self._gain * pose.take(_HEAD, axis=-1).astype(np.float64)
+        return self._gain * pose.take(YAW_PITCH, axis=-1).astype(np.float64)
 
     def _decided(self, eyes_rad: Doubles, head_rad: Doubles, times_s: Doubles, state: GazeState | None) -> GazeState:
         """The state after hearing where the listener looks at the latest of the instants."""

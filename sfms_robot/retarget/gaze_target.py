@@ -30,11 +30,10 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.config import CameraMount, Gaze, Person
-from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
+from sfms_robot.frames import YAW_PITCH, Doubles, Floats
 from sfms_robot.ports import Watched
-from sfms_robot.retarget.camera import Camera, direction_to
-from sfms_robot.retarget.eyes import Jump
-from sfms_robot.signals.eye_angles import directions
+from sfms_robot.signals.eye_angles import Jump, direction_to, directions
+from sfms_robot.signals.rotations import rotation
 
 MEDIAN_S: Final = 0.4
 DEAD_ZONE_RAD: Final = math.radians(3.0)
@@ -50,7 +49,6 @@ AWAY_RAD: Final = math.radians(5.0)
 BACK_RAD: Final = math.radians(3.0)
 COUNTED_S: Final = 60.0  # over which the listener's own looks aside are counted
 _QUANTILES: Final = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)
-_HEAD: Final = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class Aim:
 def turned(motion: Floats, aim: Aim) -> Floats:
     """Motion (N, 58) with the head's part of the aim; a copy."""
     out = motion.copy()
-    out[:, _HEAD] += aim.head_rad.astype(np.float32)
+    out[:, YAW_PITCH] += aim.head_rad.astype(np.float32)
     return out
 
 
@@ -159,12 +157,40 @@ class AimState:
     draws: int = 1
 
 
+class Camera:
+    """Places (..., 3) [m] in the camera's frame (x out of its lens, y left, z up) <-> in that of the base.
+
+    The frame of the head's base has its origin in the middle of the head at home, and stays while the neck moves. A
+    camera on the head goes with `pose` (6,), which the neck shows at that instant, so turning the neck does not move
+    the person; a camera on the base does not use it.
+    """
+
+    def __init__(self, mount: CameraMount) -> None:
+        self.on_head = mount.on == "head"
+        self._at_m = np.array(mount.at_m)
+        self._turned = rotation(np.radians(mount.rpy_deg))
+
+    def to_base(self, place_m: Floats | Doubles, pose: Doubles) -> Doubles:
+        mounted: Doubles = np.asarray(place_m, np.float64) @ self._turned.T + self._at_m
+        if not self.on_head:
+            return mounted
+        moved: Doubles = mounted @ rotation(pose[:3]).T + pose[3:]
+        return moved
+
+    def from_base(self, place_m: Floats | Doubles, pose: Doubles) -> Doubles:
+        mounted = np.asarray(place_m, np.float64)
+        if self.on_head:
+            mounted = (mounted - pose[3:]) @ rotation(pose[:3])
+        seen: Doubles = (mounted - self._at_m) @ self._turned
+        return seen
+
+
 class GazeTarget:
     """Decides where to look. `gaze` None: a head without eyes; `camera` None: a place cannot be told."""
 
     def __init__(self, config: Person, gaze: Gaze | None, camera: CameraMount | None, seed: int) -> None:
         self.camera = Camera(camera) if camera else None
-        self._full_rad = np.radians([gaze.full_yaw_deg, gaze.full_pitch_deg]) if gaze else np.zeros(2)
+        self._full_rad = gaze.full_rad if gaze else np.zeros(2)
         self._eyeless = gaze is None
         self._neck = gaze is None or gaze.neck_gain > 0
         self._share = 1.0 if gaze is None else config.head_share
@@ -212,7 +238,7 @@ class GazeTarget:
 
     def _counted(self, listener: Floats, dt_s: float, watched: Watched, state: AimState) -> AimState:
         """The state after seeing where the listener looks, one row (58,)."""
-        looks_rad = listener[_HEAD].astype(np.float64)
+        looks_rad = listener[YAW_PITCH].astype(np.float64)
         if not self._eyeless:
             looks_rad = looks_rad + directions(listener, self._full_rad).mean(axis=0)
         away = math.hypot(*looks_rad) > (BACK_RAD if state.listener_away else AWAY_RAD)

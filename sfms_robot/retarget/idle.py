@@ -17,14 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfms_robot.config import Idle
-from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
-from sfms_robot.retarget.eyes import Jump
-from sfms_robot.signals.eye_angles import directions, turn
+from sfms_robot.frames import BLINKS, CHANNEL_INDEX, Doubles, Floats
+from sfms_robot.signals.eye_angles import Jump, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
 
 ENOUGH = 0.8  # a listener with this share of the wanted blinks gets none added
 CLOSING_S, CLOSED_S, OPENING_S = 0.08, 0.04, 0.18  # a spontaneous blink, whole and a little slow for lid servos
-_BLINKS = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
 _HEAD = slice(CHANNEL_INDEX["roll"], CHANNEL_INDEX["yaw"] + 1)
 _SWING = np.array([0.35, 0.6, 1.0])  # roll, pitch, yaw, as shares of head_deg
 _HZ = np.array([[0.05, 0.11, 0.17], [0.06, 0.13, 0.21], [0.04, 0.09, 0.19]])
@@ -122,7 +120,7 @@ class IdleFiller:
             return out
         opening = ease((since_s - CLOSING_S - CLOSED_S) / OPENING_S)
         lid = (ease(since_s / CLOSING_S) - opening).astype(np.float32)
-        out[:, _BLINKS] = np.maximum(out[:, _BLINKS], lid[:, None])
+        out[:, BLINKS] = np.maximum(out[:, BLINKS], lid[:, None])
         return out
 
     def _faded(self, before: float, moved_rad: float, dt_s: float) -> float:
@@ -133,7 +131,7 @@ class IdleFiller:
         wanted = self._blinks_per_s
         if not wanted:
             return state
-        blink, level = state.blink, float(motion[0, _BLINKS].max())
+        blink, level = state.blink, float(motion[0, BLINKS].max())
         onset = level > _BLINK_ON and not blink.closed
         closed = level > (_BLINK_OFF if blink.closed else _BLINK_ON)
         rate = blink.rate * math.exp(-dt_s * wanted / 5) + (wanted / 5 if onset else 0.0)
@@ -141,7 +139,7 @@ class IdleFiller:
         clock = 0.0 if onset else blink.clock + dt_s * wanted * lacking
         seen_s = state.now_s if closed else blink.seen_s
         blink = replace(blink, rate=rate, clock=clock, closed=closed, seen_s=seen_s)
-        clear = state.now_s - seen_s >= _CLEAR_S and float(motion[:, _BLINKS].max()) < _BLINK_OFF
+        clear = state.now_s - seen_s >= _CLEAR_S and float(motion[:, BLINKS].max()) < _BLINK_OFF
         if clock < blink.due_at or not clear:
             return replace(state, blink=blink)
         draws = state.draws + 1

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, POSE, SHAPES, Doubles, Floats
-from sfms_robot.signals.eye_angles import directions, turn
+from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Doubles, Floats
+from sfms_robot.signals.eye_angles import direction_to, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.25  # listener -> face
@@ -36,7 +36,6 @@ EYES_S: Final = 0.1  # a saccade of 30 degrees
 HEAD_S: Final = 0.6  # a head turn that follows it
 HEAD_SHARE: Final = 0.6  # of the direction; the eyes keep the rest
 LARGEST_POSE: Final = np.array([math.pi, math.pi, math.pi, 1.0, 1.0, 1.0])  # rad, m
-_AXES: Final = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
 _NEVER_S: Final = -math.inf
 
 Bools = NDArray[np.bool_]
@@ -170,7 +169,7 @@ class Puppet:
 
     def __init__(self, gaze: Gaze | None = None, blind: frozenset[str] = frozenset()) -> None:
         gaze = gaze or Gaze()
-        self._full_rad = np.radians([gaze.full_yaw_deg, gaze.full_pitch_deg])
+        self._full_rad = gaze.full_rad
         eyeless = [{"eyeLookOutLeft", "eyeLookInLeft"} <= blind, {"eyeLookUpLeft", "eyeLookDownLeft"} <= blind]
         stiff = ["yaw" in blind, "pitch" in blind]
         self._head_share = np.where(stiff, 0.0, np.where(eyeless, 1.0, HEAD_SHARE))
@@ -206,7 +205,7 @@ class Puppet:
         point = np.array([x_m, y_m, z_m], np.float64)
         if not np.isfinite(point).all() or math.hypot(*point) < 0.01:
             raise InputError(f"look_at({x_m:g}, {y_m:g}, {z_m:g}) is no point in front of a head, in metres")
-        direction_rad = np.array([math.atan2(y_m, x_m), -math.atan2(z_m, math.hypot(x_m, y_m))])
+        direction_rad = direction_to(point)
         checked_s = _checked_seconds(seconds)
         with self._lock:
             self._asked = replace(self._asked, direction_rad=direction_rad, look_s=checked_s)
@@ -255,8 +254,8 @@ class Puppet:
     def _looking(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
         """`motion` (N, 58) with head and eyes turned, in place."""
         turned = piece.head.directions_rad(times_s) * self._head_share
-        motion[:, _AXES] += (piece.head.ramp.at(times_s) * (turned - motion[:, _AXES])).astype(np.float32)
-        wanted = piece.eyes.directions_rad(times_s) - self._gain * motion[:, _AXES]
+        motion[:, YAW_PITCH] += (piece.head.ramp.at(times_s) * (turned - motion[:, YAW_PITCH])).astype(np.float32)
+        wanted = piece.eyes.directions_rad(times_s) - self._gain * motion[:, YAW_PITCH]
         both = directions(motion, self._full_rad)  # (N, eye, axis)
         middle = both.mean(axis=1)
         turn(motion, both + (piece.eyes.ramp.at(times_s) * (wanted - middle))[:, None], self._full_rad)

@@ -22,7 +22,7 @@ from scipy.optimize import lsq_linear
 from sfms_robot.config import Expression, Head
 from sfms_robot.config.drives import drives
 from sfms_robot.frames import MOTION_DIM, SHAPES, Doubles, Floats
-from sfms_robot.retarget.channel_mapping import ChannelMapping
+from sfms_robot.retarget.channel_mapping import ChannelMapping, Units
 
 FLATTEST, STEEPEST = 0.2, 8.0  # slope of a response: no curve multiplies a motion by more than 5
 _KNOTS: Final = 9  # from rest to each end, closer together near rest
@@ -33,42 +33,6 @@ _LEAST_SAMPLES: Final = 50
 _FULL_WEIGHT: Final = 20  # samples in a bin from which on more do not count more
 _SMOOTH: Final = 0.002  # price of a change of slope
 _PLAIN: Final = 0.002  # price of a slope other than 1: decides where nothing was seen
-
-
-@dataclass(frozen=True)
-class Units:
-    """Joint angles (..., J) [rad] <-> joint units of the drives: -1 = min, 0 = rest, +1 = max, or rad from rest."""
-
-    rest: Doubles
-    up: Doubles
-    down: Doubles
-    low: Doubles
-    high: Doubles
-
-    @classmethod
-    def of(cls, head: Head) -> Units:
-        joints = head.joints.values()
-        rest = np.array([joint.rest_rad for joint in joints])
-        up = np.array([joint.max_rad for joint in joints]) - rest
-        down = rest - np.array([joint.min_rad for joint in joints])
-        in_rad = np.array([joint.unit == "rad" for joint in joints])
-        ones = np.ones(len(rest))
-        return cls(
-            rest,
-            np.where(in_rad | (up <= 0), ones, up),
-            np.where(in_rad | (down <= 0), ones, down),
-            -np.where(in_rad, down, down > 0),
-            np.where(in_rad, up, up > 0),
-        )
-
-    def values(self, angles_rad: Doubles) -> Doubles:
-        away = angles_rad - self.rest
-        out: Doubles = away / np.where(away > 0, self.up, self.down)
-        return out
-
-    def angles(self, values: Doubles) -> Doubles:
-        out: Doubles = self.rest + values * np.where(values > 0, self.up, self.down)
-        return out
 
 
 def looks_like(head: Head, shapes: Floats | Doubles) -> Doubles:

@@ -36,10 +36,8 @@ class HeadLife:
     """
 
     def __init__(self, config: Life, seed: int, camera: CameraMount | None = None) -> None:
-        eyes = config.gaze or Gaze()
-        full_rad = np.radians([eyes.full_yaw_deg, eyes.full_pitch_deg])
         self._gaze = GazeHold(config.gaze) if config.gaze else None
-        self._idle = IdleFiller(config.idle, full_rad, seed) if config.idle else None
+        self._idle = IdleFiller(config.idle, (config.gaze or Gaze()).full_rad, seed) if config.idle else None
         self._target = GazeTarget(config.person, config.gaze, camera, seed) if config.person else None
 
     def start(self) -> LifeState:

@@ -13,7 +13,7 @@ from functools import cache
 from importlib.metadata import EntryPoint
 from typing import Any, Final
 
-from sfms_robot.config.named_bus import BUS_GROUP, FORMER_FAMILIES
+from sfms_robot.config.named_bus import BUS_GROUP
 from sfms_robot.errors import ConfigError
 from sfms_robot.plugins import plug_in, plugin_error, plugins
 
@@ -134,19 +134,13 @@ def servo_families() -> Mapping[str, BusFamily]:
 
 
 def family_named(name: str) -> BusFamily:
-    """Return a family by its name, or by that of version 0.1.0.
+    """Return a family by its name.
 
     Raises ConfigError with the choices, or with the error of the plug-in that brings it.
     """
     known = families()
-    name = current_name(name)
     if name not in known:
         if entry := plugins(BUS_GROUP).get(name):
             return _family_of(entry)
         raise ConfigError.at("buses", "family", name, "is unknown", known)
     return known[name]
-
-
-def current_name(name: str) -> str:
-    """The name as it is said now."""
-    return FORMER_FAMILIES.get(name, name)

@@ -18,8 +18,8 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import CHANNEL_INDEX, Doubles, FaceFrame, Floats
-from sfms_robot.signals.eye_angles import directions
+from sfms_robot.frames import BLINKS, YAW_PITCH, Doubles, FaceFrame, Floats
+from sfms_robot.signals.eye_angles import direction_to, directions
 
 HALF_RAD: Final = math.radians(10.0)  # attention 0.5: about twice what a gaze from a face tracker scatters
 SLOPE_RAD: Final = math.radians(2.0)
@@ -31,8 +31,6 @@ NEUTRAL_RAD_S: Final = math.radians(0.3)
 SETTLE_S: Final = 4.0
 FORGET_S: Final = 10.0  # whoever comes after so long is somebody else
 _FULL_RAD: Final = np.radians([30.0, 20.0])  # an eye's yaw and pitch for a channel of 1
-_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
-_HEAD: Final = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
 
 
 @dataclass(frozen=True)
@@ -72,29 +70,28 @@ def attend(
     before = AttentionState(open_s=face.time_s) if first else state
     dt_s = 0.0 if before.time_s is None else face.time_s - before.time_s
     motion = face.motion
-    closed = float(motion[_BLINKS].mean()) > CLOSED
+    closed = float(motion[BLINKS].mean()) > CLOSED
     eyes_rad = before.eyes_rad if closed else directions(motion, _FULL_RAD).mean(axis=0)
-    gaze_rad = motion[_HEAD] + eyes_rad - _to_camera(place_m)
+    gaze_rad = motion[YAW_PITCH] + eyes_rad - _to_camera(place_m)
     neutral_rad, seen_s, open_s = before.neutral_rad, before.seen_s, before.open_s
     if not closed:
         neutral_rad = _learnt(neutral_rad, gaze_rad, dt_s, seen_s)
         seen_s, open_s = seen_s + dt_s, face.time_s
     looks = _at(float(np.hypot(*(gaze_rad - neutral_rad)))) if face.time_s - open_s <= BLINK_S else 0.0
     attention = looks if first else looks + (before.attention - looks) * math.exp(-dt_s / SMOOTH_S)
-    turns = before.turns or bool(motion[_HEAD].any() or directions(motion, _FULL_RAD).any())
+    turns = before.turns or bool(motion[YAW_PITCH].any() or directions(motion, _FULL_RAD).any())
     after = AttentionState(face.time_s, seen_s, neutral_rad, eyes_rad, open_s, attention, turns)
     return attention if turns else None, after
 
 
 def _to_camera(place_m: Floats | None) -> Doubles:
-    """Yaw and pitch (2,) with which a person at that place looks into the camera; that of its axis if unknown.
+    """Return yaw and pitch (2,) with which a person at that place looks into the camera; that of its axis if unknown.
 
-    Who stands at the camera's left turns to their own left, and who is above it looks down.
+    A person at the camera's left turns to their own left, and one above it looks down.
     """
     if place_m is None:
         return np.zeros(2)
-    x, y, z = (float(value) for value in place_m)
-    return np.array([math.atan2(y, x), math.atan2(z, math.hypot(x, y))])
+    return direction_to(np.asarray(place_m, np.float64)) * [1.0, -1.0]
 
 
 def _learnt(neutral_rad: Doubles, gaze_rad: Doubles, dt_s: float, seen_s: float) -> Doubles:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfms_robot.frames import CHANNEL_INDEX, SMILE_CORNERS
+from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS
 from sfms_robot.signals.peaks import band_pass, find_peaks, half_widths
 
 Event = tuple[float, float, float]
@@ -105,13 +105,12 @@ class EventKind:
     whole: bool
 
 
-_LIDS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
 _CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
 
 # What counts as a nod, a blink, a smile of a face: for the report, for callbacks, for whoever asks.
 MOTION_EVENTS: Final[Mapping[str, EventKind]] = {
     "nod": EventKind(lambda motion: motion[..., CHANNEL_INDEX["pitch"]], find_nods, whole=True),
-    "blink": EventKind(lambda motion: motion[..., _LIDS].max(axis=-1), find_blinks, whole=True),
+    "blink": EventKind(lambda motion: motion[..., BLINKS].max(axis=-1), find_blinks, whole=True),
     "smile": EventKind(lambda motion: motion[..., _CORNERS].mean(axis=-1), find_smiles, whole=False),
 }
 

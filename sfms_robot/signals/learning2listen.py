@@ -1,6 +1,6 @@
-"""How Learning2Listen prepares its data, and how FaceVerse turns angles into a rotation. Offline only.
+"""How Learning2Listen prepares its data. Offline only.
 
-Sources: evonneng/learning2listen @ a0825d58 and LizhenWangT/FaceVerse @ a012b634 (BSD-2-Clause): definitions only.
+Source: evonneng/learning2listen @ a0825d58: definitions only.
 
 Its mel rows, made anew from sound: `signals.mel` is what our listeners hear, causal, natural log, a row every 10 ms.
 L2L ships power, and a row count of four a frame at 30 fps. As Boese0601/Dyadic-Interaction-Modeling @ 9fc92f72 makes it
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfms_robot.frames import AUDIO_HZ, Doubles, Floats
-from sfms_robot.signals.mel import FFT, HOP, MEL_BINS, ROWS_PER_FRAME, WINDOW
+from sfms_robot.signals.mel import FFT, HOP, MEL_BINS, ROWS_PER_FRAME, WINDOW, triangles
 
 STD_EPS: Final = 1e-10
 BILATERAL_RADIUS: Final = 2  # cv2's d = 5
@@ -75,21 +75,6 @@ def _reflected(index: NDArray[np.int_], size: int) -> NDArray[np.int_]:
     return inside
 
 
-def faceverse_rotation(euler: ArrayLike) -> Doubles:
-    """Angles (..., 3) x, y, z [rad] -> R (..., 3, 3) = Rz Ry Rx. A neutral head has x near pi."""
-    x, y, z = np.moveaxis(np.asarray(euler, dtype=np.float64), -1, 0)
-    zero, one = np.zeros_like(x), np.ones_like(x)
-
-    def stacked(*rows: tuple[Doubles, ...]) -> Doubles:
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-    rx = stacked((one, zero, zero), (zero, np.cos(x), -np.sin(x)), (zero, np.sin(x), np.cos(x)))
-    ry = stacked((np.cos(y), zero, np.sin(y)), (zero, one, zero), (-np.sin(y), zero, np.cos(y)))
-    rz = stacked((np.cos(z), -np.sin(z), zero), (np.sin(z), np.cos(z), zero), (zero, zero, one))
-    rotation: Doubles = rz @ ry @ rx
-    return rotation
-
-
 def l2l_mel(samples: Floats, frames: int) -> Floats:
     """(n,) mono 16 kHz -> (4 frames, 128) mel power of the whole recording, whatever its length."""
     padded = np.pad(samples.astype(np.float64), FFT // 2)
@@ -129,6 +114,4 @@ def _filters() -> Doubles:
     """(128, 257) triangles in Hz between points equally spaced in mel, each of area 1 per Hz."""
     edges = _hz(np.linspace(0.0, _mel(AUDIO_HZ / 2), MEL_BINS + 2))
     bins = np.linspace(0, AUDIO_HZ / 2, FFT // 2 + 1)
-    low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
-    triangles = np.maximum(0.0, np.minimum((bins - low) / (centre - low), (high - bins) / (high - centre)))
-    return np.asarray(triangles * 2.0 / (high - low))
+    return np.asarray(triangles(edges, bins) * 2.0 / (edges[2:, None] - edges[:-2, None]))

@@ -66,6 +66,12 @@ def _mel(hz: Doubles | float) -> Doubles:
     return np.asarray(2595.0 * np.log10(1.0 + np.asarray(hz, dtype=np.float64) / 700.0))
 
 
+def triangles(edges: Doubles, places: Doubles) -> Doubles:
+    """Return filters (K, N) at `places` (N,): each rises to 1 and falls to 0 over three of the edges (K + 2,)."""
+    low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
+    return np.maximum(0.0, np.minimum((places - low) / (centre - low), (high - places) / (high - centre)))
+
+
 def _filters() -> Doubles:
     """(128, 257) triangles equally spaced in mel, each at least one FFT bin wide so that none is empty."""
     edges_hz = 700.0 * (10 ** (np.linspace(_mel(20.0), _mel(AUDIO_HZ / 2), MEL_BINS + 2) / 2595.0) - 1.0)
@@ -77,7 +83,6 @@ def _filters() -> Doubles:
     return np.asarray(np.clip(np.minimum(rise, fall), 0.0, None))
 
 
-_WITHIN: Final = np.arange(WINDOW)
 _HANN: Final = np.hanning(WINDOW + 1)[:-1]
 _FILTERS: Final = _filters()
 _FILTER, _BINS = np.nonzero(_FILTERS)  # where filters are not 0, one after the other

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, Doubles, Floats
+from sfms_robot.signals.mel import triangles
 
 DIM: Final = 78
 CEPSTRA: Final = 13
@@ -80,8 +81,7 @@ def _filters(rate_hz: int, fft: int) -> Doubles:
     """(23, fft / 2) triangles equally spaced in mel from 20 Hz up; the bin at half the rate takes no part."""
     edges = np.linspace(_mel(LOW_HZ), _mel(rate_hz / 2), MEL_BINS + 2)
     bins = _mel(np.arange(fft // 2) * rate_hz / fft)
-    low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
-    return np.maximum(0.0, np.minimum((bins - low) / (centre - low), (high - bins) / (high - centre)))
+    return triangles(edges, bins)
 
 
 def _mel(hz: Doubles | float) -> Doubles:

@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike
 from sfms_robot.errors import InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
 from sfms_robot.signals.audio import energy_db
-from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
-from sfms_robot.signals.echo_filter import BLOCK
+from sfms_robot.signals.echo import BLOCK, ECHO_LATENCY_SAMPLES, EchoCanceller
 from sfms_robot.signals.motor_noise import STILL_RAD_S, MotorNoise, total_speed
 from sfms_robot.signals.speech_probability import SpeechProbability
 

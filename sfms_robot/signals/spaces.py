@@ -20,6 +20,7 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats, reorder
 from sfms_robot.signals.flame import FlameMatrix
+from sfms_robot.signals.rotations import rotation as rotation_of
 
 LOCKED: Final = 1e-7  # cosine of an angle about y from which x and z cannot be told apart
 JAW_FULL_OPEN_RAD: Final = np.radians(25.0)  # jaw angle shown as jawOpen 1, as the timeline has it
@@ -144,7 +145,7 @@ def encode(
     values = np.asarray(motion, dtype=np.float64)
     rest = rest_of(space) if neutral is None else np.asarray(neutral, dtype=np.float64)
     axes, upright = _at_rest(space, *rest[known.rotation].tolist())
-    whole = axes.T @ turned_by(values[:, POSE][:, :3]) @ upright
+    whole = axes.T @ rotation_of(values[:, POSE][:, :3]) @ upright
     out = np.tile(rest, (len(values), 1))
     if known.euler:
         out[:, known.rotation] = angles_of(whole)
@@ -200,29 +201,18 @@ def _at_rest(space: str, *rotation: float) -> tuple[Doubles, Doubles]:
 def _rotations(space: Space, values: Doubles) -> Doubles:
     """(N, 3) as the space writes them -> (N, 3, 3)."""
     if space.euler:
-        return turned_by(values)
+        return rotation_of(values)
     from scipy.spatial.transform import Rotation
 
     turns: Doubles = Rotation.from_rotvec(values).as_matrix()
     return turns
 
 
-def turned_by(angles_rad: Doubles) -> Doubles:
-    """Angles (N, 3) about the fixed axes x, y, z -> R = Rz Ry Rx (N, 3, 3).
-
-    scipy's own answer in a tenth of its time: every frame of a stream asks for it.
-    """
-    (sx, sy, sz), (cx, cy, cz) = np.sin(angles_rad).T, np.cos(angles_rad).T
-    rows = [
-        [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
-        [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
-        [-sy, cy * sx, cy * cx],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
-
-
 def angles_of(turns: Doubles) -> Doubles:
-    """The inverse, y within a quarter turn; where that is whole and x and z are one, all of it is given to x."""
+    """Return the angles (N, 3) about the fixed axes x, y, z of rotations Rz Ry Rx (N, 3, 3), y within a quarter turn.
+
+    Where y is a whole quarter turn, x and z are one turn, and all of it is given to x.
+    """
     level = np.hypot(turns[:, 0, 0], turns[:, 1, 0])
     y = np.arctan2(-turns[:, 2, 0], level)
     x = np.arctan2(turns[:, 2, 1], turns[:, 2, 2])

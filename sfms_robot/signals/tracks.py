@@ -24,7 +24,17 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, FRAME_HZ, MOTION_DIM, POSE_CHANNELS, Doubles, Floats
+from sfms_robot.frames import (
+    BLENDSHAPES,
+    BLINKS,
+    CHANNEL_INDEX,
+    CHANNELS,
+    FRAME_HZ,
+    MOTION_DIM,
+    POSE_CHANNELS,
+    Doubles,
+    Floats,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +87,6 @@ _TIME_COLUMNS: Final = {
     "time_ms": 1e-3,
 }
 _SHAPE_BY_KEY: Final = {name.lower(): name for name in BLENDSHAPES}
-_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
 _LONGEST_GAP_S: Final = 0.25  # rows further apart than this have a lost face between them
 _USUAL_STEP_S: Final = (1e-3, 2.0)  # beyond these a time column is in another unit
 _SHAPE_RANGE: Final = (-0.5, 2.0)  # a tracker may overshoot 0..1, and is clipped; percent or another unit is refused
@@ -187,8 +196,8 @@ def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
     first = np.searchsorted(times_s, grid_s - interval_s + _TIME_EPS_S)
     end = np.searchsorted(times_s, grid_s + _TIME_EPS_S)
     for row in np.flatnonzero((end > first) & np.isfinite(out[:, 0])):
-        window = track.motion[first[row] : end[row], _BLINKS]
-        out[row, _BLINKS] = np.fmax(out[row, _BLINKS], np.fmax.reduce(window, axis=0))
+        window = track.motion[first[row] : end[row], BLINKS]
+        out[row, BLINKS] = np.fmax(out[row, BLINKS], np.fmax.reduce(window, axis=0))
     return out.astype(np.float32)
 
 

@@ -22,7 +22,8 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import BLENDSHAPES, CHANNELS, MOTION_DIM, POSE, SHAPES, Doubles, Floats
-from sfms_robot.signals.spaces import angles_of, turned_by
+from sfms_robot.signals.rotations import rotation
+from sfms_robot.signals.spaces import angles_of
 
 REMEMBERED_S: Final = 120.0
 AWAY_S: Final = 10.0
@@ -89,7 +90,7 @@ def _relative(motion: Floats, rest: Floats) -> Floats:
     """The pose seen from the resting one, R0^T R, and the shapes above their resting level."""
     out = np.zeros(MOTION_DIM, dtype=np.float32)
     both: Doubles = np.stack([rest[POSE], motion[POSE]]).astype(np.float64)
-    at_rest, now = turned_by(both[:, :3])
+    at_rest, now = rotation(both[:, :3])
     out[POSE][:3] = angles_of((at_rest.T @ now)[None])[0]
     out[POSE][3:] = at_rest.T @ (both[1, 3:] - both[0, 3:])
     level = rest[SHAPES]

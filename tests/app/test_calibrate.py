@@ -41,7 +41,7 @@ DAY = date(2026, 5, 17)
 LIMIT = {"speed_deg_s": 90, "acceleration_deg_s2": 900, "jerk_deg_s3": 9000}
 
 
-def written(folder: Path, family: str = "dynamixel", model: str = "xl330-m288", zero: int = 2048, **more) -> str:
+def written(folder: Path, family: str = "dynamixel2", model: str = "xl330-m288", zero: int = 2048, **more) -> str:
     """A head of a jaw that rests at its lower end and a brow that rests between its ends."""
     joint = {"bus": "main", "model": model, "zero_ticks": zero, "limits": "slow"}
     raw = {

@@ -14,7 +14,8 @@ from sfms_robot.config.overlay import load_overlay, overlay_file
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.tracker import Skin, skin_motion
 from sfms_robot.frames import SHAPES
-from sfms_robot.retarget.response_fit import Units, asked, fit, fitted_drives, looks_like, rms
+from sfms_robot.retarget.channel_mapping import Units
+from sfms_robot.retarget.response_fit import asked, fit, fitted_drives, looks_like, rms
 
 
 def recorded_shapes():

@@ -103,7 +103,7 @@ def test_a_head_without_kinematics_and_a_neck_of_joints_it_lacks_are_told(poses,
     head = """
 name: stalk
 description: one joint
-buses: {main: {family: dynamixel, baud: 1000000}}
+buses: {main: {family: dynamixel2, baud: 1000000}}
 limits: {slow: {speed_deg_s: 60, acceleration_deg_s2: 600, jerk_deg_s3: 6000}}
 joints:
   pan: {bus: main, id: 1, model: xl330-m288, zero_ticks: 2048, min_deg: 10, rest_deg: 10, max_deg: 60, limits: slow}

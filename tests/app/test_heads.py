@@ -18,8 +18,8 @@ def head_of(**more) -> Head:
         "name": "two",
         "description": "two joints",
         "buses": {
-            "face": {"family": "dynamixel", "baud": 1_000_000},
-            "neck": {"family": "dynamixel", "baud": 57600, "rate_hz": 25},
+            "face": {"family": "dynamixel2", "baud": 1_000_000},
+            "neck": {"family": "dynamixel2", "baud": 57600, "rate_hz": 25},
         },
         "limits": {"slow": {"speed_deg_s": 90, "acceleration_deg_s2": 900, "jerk_deg_s3": 9000}},
         "joints": {"jaw": {"bus": "face", **joint}, "yaw": {"bus": "neck", **joint}},

@@ -5,9 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
-from sfms_robot.motion.chase import StopChase
+from sfms_robot.motion.chase import Bound, Stop, StopChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
-from sfms_robot.motion.stop import Bound, Stop
 from sfms_robot.runtime.loop import difference
 
 DT_S = 0.01

@@ -6,7 +6,8 @@ import pytest
 from sfms_robot.config import load_head
 from sfms_robot.config.drives import drives
 from sfms_robot.frames import BLENDSHAPES
-from sfms_robot.retarget.response_fit import FLATTEST, STEEPEST, Units, asked, fit, fitted_drives, rms
+from sfms_robot.retarget.channel_mapping import Units
+from sfms_robot.retarget.response_fit import FLATTEST, STEEPEST, asked, fit, fitted_drives, rms
 
 RNG = np.random.default_rng(3)
 ONE = np.ones(1)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import POSE_CHANNELS
-from sfms_robot.retarget.kinematics import rotations
+from sfms_robot.signals import rotations
 
 turns = st.floats(-3.0, 3.0)
 seeds = st.integers(0, 2**32 - 1)

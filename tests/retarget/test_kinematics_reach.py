@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
 from sfms_robot.config.kinematics import BodyYaw, StewartPlatform
-from sfms_robot.retarget.kinematics import Stewart, build_neck, rotations
-from sfms_robot.retarget.kinematics.reach_limit import nearest
+from sfms_robot.retarget.kinematics import Stewart, build_neck
+from sfms_robot.retarget.kinematics.platform import nearest
+from sfms_robot.signals import rotations
 
 HEAD = load_head("reachy_mini")
 CONFIG = HEAD.kinematics

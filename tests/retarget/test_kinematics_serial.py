@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from sfms_robot.config import parse
 from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.errors import ConfigError
-from sfms_robot.retarget.kinematics import Serial, rotations
+from sfms_robot.retarget.kinematics import Serial
+from sfms_robot.signals import rotations
 
 AXES = ("roll", "pitch", "yaw")
 seeds = st.integers(0, 2**32 - 1)

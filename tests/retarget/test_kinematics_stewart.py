@@ -9,7 +9,8 @@ from published import rows
 from sfms_robot.config import load_head
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.errors import ConfigError
-from sfms_robot.retarget.kinematics import Stewart, build_neck, rotations
+from sfms_robot.retarget.kinematics import Stewart, build_neck
+from sfms_robot.signals import rotations
 
 HEAD = load_head("reachy_mini")
 CONFIG = HEAD.kinematics

@@ -18,7 +18,7 @@ def head_of(joints, **parts) -> Head:
     raw = {
         "name": "test",
         "description": "",
-        "buses": {"main": {"family": "dynamixel", "baud": 1000000}},
+        "buses": {"main": {"family": "dynamixel2", "baud": 1000000}},
         "limits": {"any": {"speed_deg_s": 1, "acceleration_deg_s2": 1, "jerk_deg_s3": 1}},
         "joint_defaults": {
             "bus": "main", "model": "m", "zero_ticks": 2048, "min_deg": -10, "max_deg": 10, "limits": "any",

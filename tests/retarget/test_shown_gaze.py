@@ -11,8 +11,8 @@ from sfms_robot.data import head_names
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.kinematics.rotations import rotation
 from sfms_robot.signals.eye_angles import directions
+from sfms_robot.signals.rotations import rotation
 
 FULL_RAD = np.radians([30.0, 20.0])
 HEADS = {name: load_head(name) for name in head_names()}

@@ -26,10 +26,6 @@ def test_every_bus_of_a_shipped_head_has_a_family():
             family_named(bus.family)
 
 
-def test_name_of_an_older_head_means_dynamixel2():
-    assert family_named("dynamixel") is family_named("dynamixel2")
-
-
 def test_unknown_family_is_refused_with_those_there_are():
     with pytest.raises(ConfigError, match="herkulex.*is unknown.*dynamixel2.*ssc32"):
         family_named("herkulex")

@@ -10,7 +10,8 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, SHAPES
 from sfms_robot.signals.bounded import bounded_least_squares
 from sfms_robot.signals.flame import FlameMatrix, read_matrix
-from sfms_robot.signals.spaces import JAW_FULL_OPEN_RAD, SPACES, angles_of, decode, encode, turned_by
+from sfms_robot.signals.rotations import rotation
+from sfms_robot.signals.spaces import JAW_FULL_OPEN_RAD, SPACES, angles_of, decode, encode
 
 RNG = np.random.default_rng(5)
 MATRIX = RNG.normal(size=(52, 50))
@@ -35,9 +36,9 @@ ANGLE = st.floats(-np.pi, np.pi)
 
 @given(st.lists(st.tuples(ANGLE, ANGLE, ANGLE), min_size=1, max_size=5))
 def test_rotations_are_those_of_scipy(angles):
-    turns = turned_by(np.array(angles))
+    turns = rotation(np.array(angles))
     assert turns == pytest.approx(Rotation.from_euler("xyz", angles).as_matrix(), abs=1e-12)
-    assert turned_by(angles_of(turns)) == pytest.approx(turns, abs=1e-7)
+    assert rotation(angles_of(turns)) == pytest.approx(turns, abs=1e-7)
 
 
 @given(ANGLE, st.floats(-1.57, 1.57), ANGLE)
@@ -49,10 +50,10 @@ def test_angles_are_those_of_scipy(x, y, z):
 
 @pytest.mark.parametrize("quarter", [-np.pi / 2, np.pi / 2])
 def test_a_quarter_turn_about_y_leaves_one_angle_for_two(quarter):
-    turn = turned_by(np.array([[0.5, quarter, 0.2]]))
+    turn = rotation(np.array([[0.5, quarter, 0.2]]))
     found = angles_of(turn)
     assert found[0, 2] == 0
-    assert turned_by(found) == pytest.approx(turn, abs=1e-12)
+    assert rotation(found) == pytest.approx(turn, abs=1e-12)
 
 
 def test_faceverse_and_back_is_the_same_face():

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE, SHAPES
-from sfms_robot.signals.spaces import angles_of, turned_by
+from sfms_robot.signals.rotations import rotation
+from sfms_robot.signals.spaces import angles_of
 from sfms_robot.sources import neutral
 
 SMILE, JAW = CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["jawOpen"]
@@ -76,7 +77,7 @@ def test_a_held_expression_never_goes_whole():
 
 def test_a_pose_is_told_from_the_resting_one_as_rotations_are():
     at_rest, turn = np.array([0.1, -0.2, 0.6]), np.array([0.0, 0.3, 0.0])
-    rest_matrix, turn_matrix = turned_by(np.stack([at_rest, turn]))
+    rest_matrix, turn_matrix = rotation(np.stack([at_rest, turn]))
     seen = angles_of((rest_matrix @ turn_matrix)[None])[0]
     _, state = follow([motion(at_rest)] * 10 * HZ)
     (out,), _ = follow([motion(seen)], 10, state)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, SHAPES
-from sfms_robot.signals.spaces import turned_by
+from sfms_robot.signals.rotations import rotation
 from sfms_robot.sources.vmc import VmcDecoder, angles_of_unity, elements, open_vmc, parse_message
 
 LEVEL = (0.0, 0.0, 0.0)
@@ -132,7 +132,7 @@ def test_a_turn_about_each_of_unitys_axes(axis, pose):
 def test_any_rotation_turns_our_axes_as_it_turns_unitys(seed):
     """R_ours = A R A^T, A a reflection: it takes left-handed axes to right-handed ones."""
     turn = Rotation.random(random_state=np.random.RandomState(seed))
-    ours = turned_by(np.array([angles_of_unity(tuple(turn.as_quat()))]))[0]
+    ours = rotation(np.array([angles_of_unity(tuple(turn.as_quat()))]))[0]
     assert ours == pytest.approx(UNITY_TO_OURS @ turn.as_matrix() @ UNITY_TO_OURS.T, abs=1e-6)
 
 

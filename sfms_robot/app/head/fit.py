@@ -21,7 +21,8 @@ from sfms_robot.config.overlay import FitLayer, Fitted, head_hash, layered, load
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.tracker import Skin, Tracker
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
-from sfms_robot.retarget.response_fit import Response, Units, fit, fitted_drives, looks_like, rms
+from sfms_robot.retarget.channel_mapping import Units
+from sfms_robot.retarget.response_fit import Response, fit, fitted_drives, looks_like, rms
 from sfms_robot.signals.tracks import Track, read_track, write_track
 
 FACE_FILES: Final = ("face.csv", "face.csv.gz")

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.config.recipe import HALVINGS
+from sfms_robot.config.training import HALVINGS
 from sfms_robot.evaluation.baselines.dense import DenseTokenizer
 
 KERNEL = 5

@@ -27,13 +27,12 @@ from sfms_robot.evaluation.metrics.react_metrics import (
     reactface_frd,
     synchrony_lags,
 )
-from sfms_robot.signals.learning2listen import faceverse_rotation, l2l_bilateral, l2l_mean_std
+from sfms_robot.signals.learning2listen import l2l_bilateral, l2l_mean_std
 
 __all__ = [
     "ccc",
     "cluster_centres",
     "dtw",
-    "faceverse_rotation",
     "frc",
     "frd",
     "frdiv",

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import assert_never
 
-from sfms_robot.config.kinematics import Kinematics, Ranged, SerialNeck, StewartPlatform
+from sfms_robot.config.joint import Joint
+from sfms_robot.config.kinematics import Kinematics, SerialNeck, StewartPlatform
 from sfms_robot.retarget.kinematics.neck import Neck, Solved
 from sfms_robot.retarget.kinematics.platform import Stewart
 from sfms_robot.retarget.kinematics.serial import Serial
@@ -13,7 +14,7 @@ from sfms_robot.retarget.kinematics.serial import Serial
 __all__ = ["Neck", "Serial", "Solved", "Stewart", "build_neck"]
 
 
-def build_neck(config: Kinematics, joints: Mapping[str, Ranged]) -> Neck:
+def build_neck(config: Kinematics, joints: Mapping[str, Joint]) -> Neck:
     """A head's neck from its section and joints. Raises ConfigError where its home is out of reach."""
     ranges = {name: (joints[name].min_rad, joints[name].max_rad) for name in config.joints()}
     if isinstance(config, SerialNeck):

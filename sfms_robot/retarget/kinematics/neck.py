@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import Doubles
 
-Ranges = Mapping[str, tuple[float, float]]  # joint -> min, max [rad]
+Range = tuple[float, float]  # min, max [rad]
+Ranges = Mapping[str, Range]
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,13 @@ class Neck(Protocol):
         """The joints (J,) for one pose (6,) after `dt_s`, and the memory after it."""
 
 
+def low_pass(angle_rad: float, before_rad: float, cutoff_hz: float, dt_s: float) -> float:
+    """Return one step of a one-pole low-pass, exact for an angle that holds still during `dt_s`."""
+    return float(before_rad + (1.0 - np.exp(-2.0 * np.pi * cutoff_hz * dt_s)) * (angle_rad - before_rad))
+
+
 def checked(poses: Doubles) -> Doubles:
-    """The poses as float64 (..., 6). Raises ValueError for another shape or a value that is not finite."""
+    """Return the poses as float64 (..., 6). Raises ValueError for another shape or a value that is not finite."""
     out = np.asarray(poses, dtype=np.float64)
     if out.shape[-1:] != (6,):
         raise ValueError(f"a pose is (..., 6), not {out.shape}")

@@ -8,7 +8,7 @@ one direction loose, the same cranks would fit but the head could only have fall
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -17,14 +17,19 @@ from numpy.typing import NDArray
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Doubles
-from sfms_robot.retarget.kinematics import reach_limit, rotations, split
-from sfms_robot.retarget.kinematics.neck import Ranges, Solved, checked
+from sfms_robot.retarget.kinematics.neck import Ranges, Solved, checked, low_pass
 from sfms_robot.retarget.kinematics.stewart import Platform
+from sfms_robot.signals import rotations
 
 MIN_STIFFNESS: Final = 0.02  # share of the stiffness (determinant) at home
 DEAD_CENTRE: Final = 0.999  # a crank turns at most some 22 times as fast as in the middle of its stroke
 ROUNDING_RAD: Final = 1e-9  # so that a pose right at a limit is still within it, seen from a turned body
 HOME: Final = np.zeros(6)
+BLOCK: Final = 500  # poses at a time, for the memory that their pieces take
+PIECES: Final = 32
+PASSES: Final = 6  # to a billionth of the way: 32 ** 6 = 2 ** 30
+
+Reachable = Callable[[Doubles], NDArray[np.bool_]]  # poses (n, 6) -> (n,)
 
 
 class Stewart:
@@ -81,7 +86,7 @@ class Stewart:
     def step(self, pose: Doubles, dt_s: float, memory: Doubles) -> tuple[Doubles, Doubles]:
         wanted, slow = checked(pose), memory
         if self._body is not None and self._body.low_pass_hz is not None:
-            slow = np.array([split.low_pass(float(wanted[2]), float(memory[0]), self._body.low_pass_hz, dt_s)])
+            slow = np.array([low_pass(float(wanted[2]), float(memory[0]), self._body.low_pass_hz, dt_s)])
         return self._solved(wanted, self._body_yaw(wanted[2], slow[0])).angles_rad, slow
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
@@ -100,7 +105,7 @@ class Stewart:
     def _solved(self, poses: Doubles, body: Doubles) -> Solved:
         shape = poses.shape[:-1]
         wanted = rotations.seen_from(body, poses).reshape(-1, 6)
-        given, reached = reach_limit.nearest(wanted, self.reachable)
+        given, reached = nearest(wanted, self.reachable)
         cranks = np.clip(self.geometry.inverse(given), self._low, self._high)  # a border pose may round past its end
         angles = cranks.reshape(*shape, 6)
         if self.turns_body:
@@ -110,3 +115,34 @@ class Stewart:
         reached = reached.reshape(shape)
         shown = np.where(reached[..., None], poses, rotations.seen_from(-body, given.reshape(poses.shape)))
         return Solved(angles, reached, missing_rad.reshape(shape), missing_m.reshape(shape), shown)
+
+
+def nearest(poses: Doubles, reachable: Reachable) -> tuple[Doubles, NDArray[np.bool_]]:
+    """Return the nearest poses (n, 6) that can be reached, straight back toward home, and which were reached (n,).
+
+    Home, the zero pose, is inside the reach. Along the straight line home -> wanted pose (in roll, pitch, yaw, x, y, z)
+    the border is the first place where the reach ends; it is found by cutting the line into pieces and keeping the
+    first one that leaves. The answer depends on the wanted pose alone and changes continuously with it as long as the
+    reach is star-shaped about home, so a pose that moves smoothly in and out of reach gives a smooth one, with nothing
+    to remember. A pose that can be reached comes back as it is, even where the line to it leaves the reach for a while.
+    """
+    reached = reachable(poses)
+    out = poses.copy()
+    beyond = np.flatnonzero(~reached)
+    for first in range(0, beyond.size, BLOCK):
+        some = beyond[first : first + BLOCK]
+        out[some] *= _share(poses[some], reachable)[:, None]
+    return out, reached
+
+
+def _share(poses: Doubles, reachable: Reachable) -> Doubles:
+    """Return how much (n,) of each pose (n, 6) lies before the border, 0..1."""
+    start, width = np.zeros(len(poses)), 1.0
+    ends = np.arange(1, PIECES + 1) / PIECES
+    for _ in range(PASSES):
+        shares = start[:, None] + width * ends  # (n, pieces)
+        inside = reachable((shares[..., None] * poses[:, None]).reshape(-1, 6)).reshape(shares.shape)
+        whole = np.where(inside.all(axis=1), PIECES - 1, np.argmin(inside, axis=1))  # pieces before the leaving one
+        width /= PIECES
+        start = start + width * whole
+    return start

@@ -2,7 +2,7 @@
 
 R = R(first axis) R(second) R(third), from the base to the head. Three axes take any rotation. Two take what is left of
 it when the missing axis is put last and dropped: a pan-tilt neck keeps the direction of the face and loses the roll.
-One takes the turn about it that leaves least. Then each axis goes to its joint, to two joints in series (`split`), or
+One takes the turn about it that leaves least. Then each axis goes to its joint, to two joints in series (`shared`), or
 pitch and roll together to a differential. Translation is not for such a neck: all of it is residual.
 """
 
@@ -16,8 +16,8 @@ import numpy as np
 
 from sfms_robot.config.kinematics import SerialNeck, Split
 from sfms_robot.frames import Doubles
-from sfms_robot.retarget.kinematics import differential, rotations, split
-from sfms_robot.retarget.kinematics.neck import Ranges, Solved, checked
+from sfms_robot.retarget.kinematics.neck import Range, Ranges, Solved, checked, low_pass
+from sfms_robot.signals import rotations
 
 EXACT_RAD: Final = 1e-9
 EXACT_M: Final = 1e-9
@@ -59,7 +59,7 @@ class Serial:
         angles, slow = self._axis_angles(wanted), memory.copy()
         for column, place in self._splits:
             if place.crossover_hz is not None:
-                slow[column] = split.low_pass(angles[column], memory[column], place.crossover_hz, dt_s)
+                slow[column] = low_pass(angles[column], memory[column], place.crossover_hz, dt_s)
         return self._joint_angles(angles, slow), slow
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
@@ -96,16 +96,16 @@ class Serial:
         for column, place in self._splits:
             angle = angles[..., column]
             low = slow[..., column] if place.lower_share is None else place.lower_share * angle
-            parts = split.shared(angle, low, self._ranges[place.lower], self._ranges[place.upper])
+            parts = shared(angle, low, self._ranges[place.lower], self._ranges[place.upper])
             for joint, part in zip((place.lower, place.upper), parts, strict=True):
                 out[..., self._column[joint]] = part
         if (pair := self._config.differential) is not None:
             order = self._config.order
             pitch, roll = angles[..., order.index("pitch")], angles[..., order.index("roll")]
-            servos = differential.servo_angles(pitch, roll, pair.pitch_gain, pair.roll_gain)
+            servos = servo_angles(pitch, roll, pair.pitch_gain, pair.roll_gain)
             low, high = np.array([self._ranges[pair.left], self._ranges[pair.right]]).T
             columns = [self._column[pair.left], self._column[pair.right]]
-            out[..., columns] = differential.within(servos, low, high)
+            out[..., columns] = shrunk(servos, low, high)
         return out
 
     def _rotation(self, joints: Doubles) -> Doubles:
@@ -120,7 +120,45 @@ class Serial:
                 pair = self._config.differential
                 assert pair is not None  # an axis without a joint has the differential
                 servos = joints[..., [self._column[pair.left], self._column[pair.right]]]
-                both = differential.axis_angles(servos, pair.pitch_gain, pair.roll_gain)
+                both = axis_angles(servos, pair.pitch_gain, pair.roll_gain)
                 angle = both[("pitch", "roll").index(name)]
             turns.append(rotations.about(axis, angle))
         return reduce(np.matmul, turns)
+
+
+def shared(total_rad: Doubles, lower_rad: Doubles, lower: Range, upper: Range) -> tuple[Doubles, Doubles]:
+    """Return both joints' angles inside their ranges, from the total (...) and the lower joint's part (...).
+
+    What one joint cannot take the other does, so the sum is the total wherever both together can.
+    """
+    below = np.clip(lower_rad, *lower)
+    above = np.clip(total_rad - below, *upper)
+    return np.clip(total_rad - above, *lower), above
+
+
+def servo_angles(pitch_rad: Doubles, roll_rad: Doubles, pitch_gain: float, roll_gain: float) -> Doubles:
+    """Return left and right (..., 2) of a differential, from pitch and roll (...).
+
+    left = a pitch + b roll, right = a pitch - b roll.
+    """
+    pitch, roll = pitch_gain * pitch_rad, roll_gain * roll_rad
+    return np.stack([pitch + roll, pitch - roll], axis=-1)
+
+
+def axis_angles(servos_rad: Doubles, pitch_gain: float, roll_gain: float) -> tuple[Doubles, Doubles]:
+    """Return pitch and roll (...) of a differential, from left and right (..., 2)."""
+    left, right = servos_rad[..., 0], servos_rad[..., 1]
+    return (left + right) / (2 * pitch_gain), (left - right) / (2 * roll_gain)
+
+
+def shrunk(servos_rad: Doubles, low_rad: Doubles, high_rad: Doubles) -> Doubles:
+    """Return both servos (..., 2) shrunk by one factor until both are in range (2,), which holds 0.
+
+    One factor keeps pitch : roll as asked, where clipping each servo would turn a nod into a tilt.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over = np.where(servos_rad > high_rad, high_rad / servos_rad, 1.0)
+        under = np.where(servos_rad < low_rad, low_rad / servos_rad, 1.0)
+    factor = np.minimum(over, under).min(axis=-1, keepdims=True)
+    out: Doubles = np.clip(servos_rad * factor, low_rad, high_rad)
+    return out

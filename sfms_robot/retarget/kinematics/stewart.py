@@ -18,7 +18,7 @@ import numpy as np
 
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.frames import Doubles
-from sfms_robot.retarget.kinematics import rotations
+from sfms_robot.signals import rotations
 
 MAX_STEPS = 60
 SHORTEST_STEP = 1e-3

@@ -136,14 +136,3 @@ def test_the_bilateral_filter_equals_the_loop_over_a_circle_of_pixels():
                 total, weights = total + np.exp(-far) * value, weights + np.exp(-far)
         expected[clip, frame, channel] = total / weights
     np.testing.assert_allclose(metrics.l2l_bilateral(x), expected, rtol=1e-10)
-
-
-def test_faceverse_rotation_is_zyx_and_a_rotation():
-    angles = RNG.uniform(-3, 3, (10, 3))
-    rotation = metrics.faceverse_rotation(angles)
-    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (10, 1, 1)), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(rotation), 1.0)
-    quarter = metrics.faceverse_rotation([0.0, 0.0, np.pi / 2])
-    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-    both = metrics.faceverse_rotation([np.pi / 2, 0.0, np.pi / 2])
-    np.testing.assert_allclose(both @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # x first, then z
