@@ -28,7 +28,7 @@ import numpy as np
 
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
-from sfms_robot.listeners.spectral_lines import as_cosines, set_in, sum_of_lines
+from sfms_robot.listeners.sway import as_cosines, set_in, sum_of_lines
 
 FILE: Final = "idle_motion.safetensors"  # in a listener's folder; without it a listener has none
 BANDS_HZ: Final = (0.04, 0.4, 0.75, 1.25, 2.0, 3.0, 5.0, 8.0)  # edges

@@ -55,7 +55,6 @@ from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.inbox import MOST_WAITING
-from sfms_robot.listeners.lateness import Lateness
 from sfms_robot.signals.quantiles import Quantiles
 
 START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
@@ -394,3 +393,38 @@ class _Child:
             code = self._process.wait()
         self._messages.put(("error", f"the listener process died (exit code {code})", 0.0))
         self.ended = True
+
+
+# --- Lateness ---------------------------------------------------------------------------------------------------------
+#
+# A listener on a computer that is too slow answers, and always too late to be shown.
+
+LATE_S: Final = 1.0
+
+
+class Lateness:
+    """A judge of plans: in time to be shown, or not.
+
+    Attributes:
+        lasting: for `LATE_S` every plan has come after the last of its own frames. The first one in time ends it.
+    """
+
+    def __init__(self) -> None:
+        self.lasting = False
+        self._since_s: float | None = None  # of the first late one in a row
+
+    def named(self, state: str) -> str:
+        """Return "late" for a listening state whose plans are never in time, else `state`."""
+        return "late" if self.lasting and state == "listening" else state
+
+    def came(self, plan: Plan, now_s: float) -> None:
+        """Take a plan that arrived at `now_s`, by the clock of its frames."""
+        if now_s <= plan.times_s[-1]:
+            if self.lasting:
+                log.warning("the listener's plans are in time again")
+            self.lasting, self._since_s = False, None
+            return
+        self._since_s = now_s if self._since_s is None else self._since_s
+        if not self.lasting and now_s - self._since_s >= LATE_S:
+            log.warning("the listener's plans come too late to be shown: the head goes on without them")
+            self.lasting = True

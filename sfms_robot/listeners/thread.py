@@ -16,8 +16,7 @@ from typing import Any, Final
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.listeners.inbox import MOST_WAITING, Inbox, calmed
-from sfms_robot.listeners.lateness import Lateness
-from sfms_robot.listeners.process import HUNG_S
+from sfms_robot.listeners.process import HUNG_S, Lateness
 from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
 

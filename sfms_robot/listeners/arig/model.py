@@ -55,8 +55,7 @@ from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
 from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
 from sfms_robot.listeners.arig.pmp import Progressive
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST
-from sfms_robot.listeners.head_channels import head_channels
-from sfms_robot.listeners.sway import BANDS
+from sfms_robot.listeners.sway import BANDS, head_channels
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 

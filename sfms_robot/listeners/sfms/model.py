@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
-from sfms_robot.listeners.head_channels import head_channels
 from sfms_robot.listeners.sfms.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms.inpainter import Inpainter
 from sfms_robot.listeners.sfms.neighbours import Around
@@ -17,7 +16,7 @@ from sfms_robot.listeners.sfms.predictor import Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork
 from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
-from sfms_robot.listeners.sway import BANDS
+from sfms_robot.listeners.sway import BANDS, head_channels
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
 
