@@ -38,10 +38,8 @@ from sfms_robot.frames import (
 )
 from sfms_robot.listeners.engine import Engine, RunsOnEngine
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
-from sfms_robot.listeners.sfms.courses import ToldCourse
-from sfms_robot.listeners.sfms.draw import Sampler, Seen
+from sfms_robot.listeners.sfms.draw import Reach, Sampler, Seen, ToldCourse
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
-from sfms_robot.listeners.sfms.reachable import Reach
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.sway import HEAD, HeadSway
 from sfms_robot.signals.control import COLUMNS

@@ -5,8 +5,7 @@ import torch
 from tiny_sfms import tiny_listener
 
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED
-from sfms_robot.listeners.sfms.predictor import Context, LastKeyframes, last_keyframes
-from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
+from sfms_robot.listeners.sfms.predictor import Context, LastKeyframes, SpeakerEncoder, last_keyframes
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)
 
