@@ -107,7 +107,7 @@ class ClockOffset:
         self._samples: deque[ClockSample] = deque()  # delays rise: the first is the best
 
     def observe(self, sent_s: float, their_came_s: float, their_sent_s: float, came_s: float) -> None:
-        """An exchange: the four times of the module's text, in their order."""
+        """An exchange: the four times of the section's text, in their order."""
         sample = ClockSample(
             came_s,
             ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2,

@@ -7,7 +7,7 @@ heads do (Shinozuka's spectral representation of a stationary process),
 
     x(t) = size * sum over lines l of  2^1/2 M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l in R^S
 
-of which every line is one cosine a channel (`spectral_lines`).
+of which every line is one cosine a channel.
 
 `LINES` frequencies drawn from each of the `BANDS_HZ`, `M M^T` of each band what heads do together there: who leans
 forward also comes down. Over the lines of a band sum a a^T + b b^T = 1: which way a head goes is by lot, how far it

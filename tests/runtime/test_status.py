@@ -7,7 +7,7 @@ import pytest
 
 from sfms_robot.frames import FaceFrame, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.runtime.status import RunStatus
+from sfms_robot.runtime.observers import RunStatus
 
 JOINTS = ("neck_yaw", "jaw")
 

@@ -1,11 +1,11 @@
 """Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and six answers.
 
     exact          the mask with the least error of linear interpolation, by dynamic programming
-    penalised      as many as pay: least error plus a cost per keyframe, by dynamic programming (`penalised`)
+    penalised      as many as pay: least error plus a cost per keyframe, by dynamic programming (`place_penalised`)
     static         evenly, centred
     static_paper   at every floor(N / k)-th frame, the paper's baseline, which leaves the window's end to extrapolation
     learned_paper  the paper's: one look of the score network, Gumbel top-k by Algorithm 1
-    learned        ours: conditional scores, asked again at each of the k steps, then swept over (`choice`)
+    learned        ours: conditional scores, asked again at each of the k steps, then swept over (`choose`, `sweep`)
 
 Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T, but `penalised`.
 """
@@ -227,7 +227,7 @@ def place_penalised(
         costs: (G,) of a keyframe, above 0, in squared units of the motion summed over a group's channels.
         member: (G, C), 1 where a channel belongs to a group.
         max_gap: at most this many frames from one keyframe to the next and to both ends; None for no bound.
-        ramp: see the module's text; None for straight lines all the way.
+        ramp: see the section's text; None for straight lines all the way.
     """
     t = motion.shape[1]
     gap = t if max_gap is None else min(max_gap, t)

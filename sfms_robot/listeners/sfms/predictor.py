@@ -1,6 +1,6 @@
 """Listening head prediction (IV-C): 40 frames of both people -> classes of the next 8 frames, per channel group.
 
-Class 0 is transition, class 1 + i the keyframe code i. The speaker has a gated dual encoder (`speaker`), the listener's
+Class 0 is transition, class 1 + i the keyframe code i. The speaker has a gated dual encoder (`SpeakerEncoder`), the listener's
 own tokens an encoder of their own, and a decoder asks both from all future frames at once: the paper's parallel
 prediction. Beyond the paper, a `sequential` predictor ends in a small network that is told which keyframes precede each
 frame, so that frames drawn one after another agree; the transformers still run once per plan. And one that is told of

@@ -16,7 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sfms_robot.config.arig import EVENT_STATES, STATES
 from sfms_robot.listeners.arig.parts import (
+    CrossAttention,
     FeedForward,
     LayerNorm,
     Linear,
@@ -28,6 +30,7 @@ from sfms_robot.listeners.arig.parts import (
     split_heads,
 )
 from sfms_robot.listeners.arig.rotary import rates
+from sfms_robot.listeners.arig.sojourns import QUANTILES
 from sfms_robot.listeners.layers import exported_attention
 
 
@@ -252,3 +255,132 @@ def _rotated(x: Tensor, rotary: Tensor) -> Tensor:
     first, second = x.chunk(2, dim=-1)
     cosine, sine = rotary.unbind(0)
     return torch.addcmul(x * cosine, torch.cat([second, first], dim=-1), sine)
+
+
+# --- Conversation states understanding (3.3) --------------------------------------------------------------------------
+#
+# Which of seven states the agent is in, and a feature of it. Voice activity alone has four patterns; which state a
+# pattern means depends on the conversation (figure 3):
+#
+#     agent    user     states
+#     speaks   silent   speaking
+#     speaks   speaks   receiving feedback, interrupted
+#     silent   speaks   listening, giving feedback
+#     silent   silent   thinking (its own pause), waiting (the other's)
+#
+# The figure itself is not in the text at hand; giving feedback, where it is a word and not a nod, is speech of both.
+# The paper's stream continues from its most probable state. A listener with events departs from it twice, see
+# `sojourns`.
+
+
+class StateUnderstanding(Part):
+    """The previous state asks voice activity and cis-token what the state is now.
+
+    With events its states are `EVENT_STATES`, and it also has what is known of them from the data: `durations` (7, 33),
+    quantiles of how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for those that there are while
+    agent and user are silent or speak.
+    """
+
+    durations: Tensor
+    possible: Tensor
+
+    def __init__(self, width: int, hidden: int, heads: int, events: bool = False) -> None:
+        super().__init__()
+        states = len(EVENT_STATES if events else STATES)
+        if events:
+            self.register_buffer("durations", torch.ones(len(STATES), QUANTILES))
+            self.register_buffer("possible", torch.ones(2, 2, len(STATES)))
+        self.previous = nn.Embedding(states, width)
+        self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
+        self.look = CrossAttention(width, hidden, heads, slots=3)
+        self.norm = LayerNorm(width)
+        self.classify = Linear(width, states)
+
+    def condition(self, cis: Tensor, voiced: Tensor) -> Tensor:
+        """cis (N, D), voiced (N, 2) bool: agent now, user one frame before -> keys (N, 3, 2D)."""
+        told = torch.where(voiced[..., None], self.voices[:, 1], self.voices[:, 0])  # (N, 2, D)
+        return self.look.keys(torch.cat([told, cis[:, None]], dim=1))
+
+    def forward(self, keys: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
+        """`condition` (N, 3, 2D) and previous states (N,) -> state feature (N, D) and logits (N, S) of S states."""
+        feature = self.norm(self.look(self.previous(previous), keys))
+        return feature, self.classify(feature)
+
+    def roll(self, keys: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        """Every frame's own answer becomes the next one's question: as a stream runs.
+
+        keys (B, T, 3, 2D), first (B,) -> features (B, T, D), logits (B, T, S).
+        """
+        features, logits, state = [], [], first
+        for frame in keys.unbind(dim=1):
+            feature, scores = self(frame, state)
+            state = scores.argmax(-1)
+            features.append(feature)
+            logits.append(scores)
+        return torch.stack(features, dim=1), torch.stack(logits, dim=1)
+
+
+# --- Progressive motion prediction (3.4) ------------------------------------------------------------------------------
+#
+# Coarse motion from sound, fine motion from context and state, continuity. The outcome z conditions the sampler of
+# the final motion (`sampler`).
+
+
+class Progressive(Part):
+    """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions.
+
+    What happens (`events`, beyond the paper) is one token more of the second.
+    """
+
+    def __init__(
+        self, width: int, hidden: int, heads: int, sounds: int, motions: int, states: bool, events: bool = False
+    ) -> None:
+        super().__init__()
+        self.coarse = CrossAttention(width, hidden, heads, sounds)
+        self.fine = CrossAttention(width, hidden, heads, 2 + states + events)
+        self.temporal = CrossAttention(width, hidden, heads, motions)
+        self.norm = LayerNorm(width)
+
+    def forward(
+        self,
+        last: Tensor,
+        sound_keys: Tensor,
+        motion_keys: Tensor,
+        sound: Tensor,
+        cis: Tensor,
+        state: Tensor | None,
+        events: Tensor | None = None,
+    ) -> Tensor:
+        """`coarse` motion, then `refine`: everything of the frame to be made, N of them.
+
+        `last` (N, D) is the embedded motion of the frame before: the query of the coarse motion. `sound_keys`
+        (N, 3, 2D) are `coarse.keys` of the agent's sounds, the newest that of the frame itself. The rest: `refine`.
+        """
+        return self.refine(self.coarse(last, sound_keys), motion_keys, sound, cis, state, events)
+
+    def refine(
+        self,
+        outline: Tensor,
+        motion_keys: Tensor,
+        sound: Tensor,
+        cis: Tensor,
+        state: Tensor | None,
+        events: Tensor | None = None,
+    ) -> Tensor:
+        """Fine motion.
+
+        Args:
+            outline: (N, D) coarse motion.
+            motion_keys: (N, 5, 2D) `temporal.keys` of the agent's motions before the frame.
+            sound: (N, D) embedded sound of the agent in the frame itself.
+            cis: (N, D).
+            state: (N, D) feature, or None without state guidance.
+            events: (N, D) embedded control rows, or None without events.
+
+        Returns:
+            z (N, D).
+        """
+        tokens = [token for token in (cis, state, sound, events) if token is not None]
+        x = self.fine(outline, self.fine.keys(torch.stack(tokens, dim=1)))
+        out: Tensor = self.norm(self.temporal(x, motion_keys))
+        return out
