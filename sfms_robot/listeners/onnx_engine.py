@@ -25,6 +25,8 @@ from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.engine import Array, Engine, EngineName, one_of
 from sfms_robot.listeners.graph_folder import Graph, GraphFolder, has_graphs, read_graphs
 
+log = logging.getLogger(__name__)
+
 KEPT: Final = 4096  # numbers of a tensor that streams may ask for: scales, not weights
 ROWS: Final = 64  # of a weight that are rounded at a time: what the cache holds takes half as long
 FULL, HALF = 127, 64  # older x86 processors add pairs of products in 16 bits, where whole integers do not fit
@@ -149,8 +151,6 @@ def _onnxruntime() -> Any:
 
 def available() -> bool:
     """Whether onnxruntime is installed. Does not import it."""
-    from importlib.util import find_spec
-
     return find_spec("onnxruntime") is not None
 
 
@@ -185,8 +185,6 @@ def whole_integers() -> bool:
 # `auto` is onnx where onnxruntime is installed and the folder has graphs that fit, torch elsewhere. The loading
 # process (`process_child`) measures whether one thread or all free cores are faster. No probe imports torch only to
 # find that it is slower: that costs two seconds and 200 MB.
-
-log = logging.getLogger(__name__)
 
 
 def engine_of(

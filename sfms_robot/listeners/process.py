@@ -125,14 +125,15 @@ class ListenerProcess:
         """
         began_s = self._clock()
         while self._state == "starting" and self._clock() - began_s <= limit_s:
-            kind, value, number = self._child.next(_LOOK_S)
-            if kind != "error":
-                self._take(kind, value, number, began_s)
-            elif value is not None:
+            message = self._child.message(_LOOK_S)
+            if message is None:
+                if not self._child.ended:  # one that ended has left a message why
+                    self._supervise(self._clock())
+            elif message[0] == "error":
                 self.close()
-                raise ModelError(value)
-            elif not self._child.ended:  # one that ended has left a message why
-                self._supervise(self._clock())
+                raise ModelError(message[1])
+            else:
+                self._take(*message, began_s)
         if self._state in ("starting", "given up"):
             self.close()
             raise ModelError(f"the listener process was not loaded after {limit_s:g} s")
@@ -300,7 +301,7 @@ class ListenerProcess:
 
 
 class _Child:
-    """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
+    """One interpreter and its two threads; nothing here blocks except `close`, and `message` with a limit."""
 
     def __init__(self, name: str, seed: int, calmness: Calmness | None, engine: EngineName) -> None:
         self._process = start_child("sfms_robot.listeners.process_child:main")
@@ -334,9 +335,10 @@ class _Child:
             self._urgent.append(value)
             self._changed.notify()
 
-    def message(self) -> tuple[str, Any, float] | None:
+    def message(self, limit_s: float = 0.0) -> tuple[str, Any, float] | None:
+        """Return the next message, or None when none comes within `limit_s`."""
         try:
-            return self._messages.get_nowait()
+            return self._messages.get(timeout=limit_s)
         except queue.Empty:
             return None
 
@@ -346,13 +348,6 @@ class _Child:
             return int(Path(f"/proc/{self._process.pid}/schedstat").read_text().split()[0])
         except (OSError, ValueError):
             return 0
-
-    def next(self, limit_s: float) -> tuple[str, Any, float]:
-        """The next message; ("error", None, 0) when none comes in time."""
-        try:
-            return self._messages.get(timeout=limit_s)
-        except queue.Empty:
-            return "error", None, 0.0
 
     def kill(self) -> None:
         """Returns at once, also where the child is stopped; the reader sees to the rest."""

@@ -1,6 +1,7 @@
-"""Interactive behaviour understanding (3.2): what both people did, a chunk at a time, and over a long range.
+"""The modules of ARIG: interactive behaviours (3.2), conversation states (3.3) and progressive motion (3.4).
 
-Short range: the last c behaviours of both tracks, read anew for every frame in the light of the newest sounds, become
+Interactive behaviour understanding: the motion and sound of both people, a chunk at a time, and over a long range.
+Short range: the last c behaviours of both tracks, read again for every frame in the light of the newest sounds, become
 one summary. Long range: summaries of whole chunks, and that of the chunk in progress, which every frame refreshes
 until the chunk is full; a causal decoder makes the cis-token of them. A token sees the w - 1 chunks before its own, in
 every layer, so what a stream keeps is w - 1 keys and values per layer: those of whole chunks never change.
@@ -29,7 +30,7 @@ from sfms_robot.listeners.arig.parts import (
     modulated,
     split_heads,
 )
-from sfms_robot.listeners.arig.rotary import rates
+from sfms_robot.listeners.arig.rotary import rotary
 from sfms_robot.listeners.arig.sojourns import QUANTILES
 from sfms_robot.listeners.layers import exported_attention
 
@@ -191,25 +192,14 @@ class ContextLayer(Part):
 class LongRange(nn.Module):
     """Causal decoder over the context cache -> cis-token."""
 
-    rates: Tensor
-    signs: Tensor
-
     def __init__(self, width: int, hidden: int, heads: int, layers: int, chunk: int, capacity: int) -> None:
         super().__init__()
-        self.chunk, self.capacity = chunk, capacity
-        half = width // heads // 2
-        self.register_buffer("rates", torch.from_numpy(rates(width // heads)), persistent=False)
-        self.register_buffer("signs", torch.ones(2 * half).index_fill(0, torch.arange(half), -1.0), persistent=False)
+        self.chunk, self.capacity, self.head_width = chunk, capacity, width // heads
         self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(layers))
         self.norm = LayerNorm(width)
 
     def _layers(self) -> list[ContextLayer]:
         return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
-
-    def rotary(self, chunks: Tensor) -> Tensor:
-        """`rotary.rotary` as a tensor."""
-        angles = chunks[:, None] * self.rates
-        return torch.stack([angles.cos(), angles.sin() * self.signs]).float()
 
     def forward(self, summaries: Tensor) -> Tensor:
         """Summaries (B, T, D) of every frame from the start of a stream -> cis-tokens (B, T, D).
@@ -222,9 +212,10 @@ class LongRange(nn.Module):
         whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
         behind = of[:, None] - of[whole]
         seen = (behind > 0) & (behind < self.capacity)  # (T, S)
-        rotary, x = self.rotary(of), summaries
+        x, turned = summaries, torch.from_numpy(rotary(of.numpy(force=True), self.head_width))
+        turned = turned.transpose(0, 1).to(x.device)
         for layer in self._layers():
-            own = layer.project(x, rotary)
+            own = layer.project(x, turned)
             x = layer(x, own, (own[1][:, :, whole], own[2][:, :, whole]), seen)
         out: Tensor = self.norm(x)
         return out

@@ -1,10 +1,11 @@
 """Listening head prediction (IV-C): 40 frames of both people -> classes of the next 8 frames, per channel group.
 
-Class 0 is transition, class 1 + i the keyframe code i. The speaker has a gated dual encoder (`SpeakerEncoder`), the listener's
-own tokens an encoder of their own, and a decoder asks both from all future frames at once: the paper's parallel
-prediction. Beyond the paper, a `sequential` predictor ends in a small network that is told which keyframes precede each
-frame, so that frames drawn one after another agree; the transformers still run once per plan. And one that is told of
-events reads what each frame, past or to come, belongs to: a row of `signals.control` joins the tokens of the frame.
+Class 0 is transition, class 1 + i the keyframe code i. The speaker has a gated dual encoder (`SpeakerEncoder`), the
+listener's own tokens an encoder of their own, and a decoder asks both from all future frames at once: the paper's
+parallel prediction. Beyond the paper, a `sequential` predictor ends in a small network that is told which keyframes
+precede each frame, so that frames drawn one after another agree; the transformers still run once per plan. And one that
+is told of events reads what each frame, past or to come, belongs to: a row of `signals.control` joins the tokens of the
+frame.
 
 Shapes: B batch, P past frames, H future frames, G channel groups, D digits of a code, W width, V classes, K columns.
 """
@@ -12,7 +13,7 @@ Shapes: B batch, P past frames, H future frames, G channel groups, D digits of a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -48,25 +49,12 @@ class Context:
     tokens: Tensor
     control: Tensor
 
-    @property
-    def parts(self) -> tuple[Tensor, ...]:
-        """All of them, in this order."""
-        return tuple(getattr(self, field.name) for field in fields(self))
-
 
 class LastKeyframes(NamedTuple):
     """The last two keyframes of every group, the newer first: tokens (..., G, 2), 0 for none yet, and their frames."""
 
     tokens: Tensor
     at: Tensor
-
-    def then(self, drawn: Tensor, frame: Tensor | int) -> LastKeyframes:
-        """After the tokens (..., G) `drawn` for `frame`, a number."""
-        drawn = drawn[..., None]
-        key = drawn > 0
-        newer = torch.cat([drawn, self.tokens[..., :1]], dim=-1)
-        newer_at = torch.cat([torch.zeros_like(self.at[..., :1]) + frame, self.at[..., :1]], dim=-1)
-        return LastKeyframes(torch.where(key, newer, self.tokens), torch.where(key, newer_at, self.at))
 
 
 def last_keyframes(tokens: Tensor) -> LastKeyframes:
