@@ -1,6 +1,6 @@
 """`--status [PORT]`: how the run is, as one JSON document over HTTP, on loopback only.
 
-    GET http://127.0.0.1:PORT/     the document of `runtime.status`, whole, as it is at that moment
+    GET http://127.0.0.1:PORT/     the document of `runtime.observers`, whole, as it is at that moment
 
 Read only: who can read it can change nothing.
 """
