@@ -141,7 +141,7 @@ class Answer(BaseHTTPRequestHandler):
 
 
 def status_server(wanted: str) -> LoopbackServer:
-    """Bind the port of `--status [PORT]`: how a run is, as one JSON document (`runtime.status`). Read only.
+    """Bind the port of `--status [PORT]`: how a run is, as one JSON document (`runtime.observers`). Read only.
 
     `wanted`: a port, "0" for any that is free, or `AUTO`. Raises ConfigError for what is no port, PortError for one
     that is in use.

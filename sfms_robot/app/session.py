@@ -41,10 +41,10 @@ from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.halt_switches import halt_signals, halt_switch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
+from sfms_robot.runtime.observers import RunStatus
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.runtime.service_notify import NotifyingObserver, ServiceManager
-from sfms_robot.runtime.status import RunStatus
 from sfms_robot.sources.registry import open_source, split_kind
 
 logger = logging.getLogger(__name__)

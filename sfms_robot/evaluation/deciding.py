@@ -18,14 +18,14 @@ from sfms_robot.corpora.compose.ami import Person
 from sfms_robot.corpora.meeting_evidence import meeting_evidence
 from sfms_robot.evaluation.listener_meetings import SHIFT_S
 from sfms_robot.evaluation.reference_hazard import mute
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
 from sfms_robot.learning.events.event_trainer import scene_of
-from sfms_robot.listeners.events.chance import of_instants
 from sfms_robot.listeners.events.evidence import Ints, heard_in
 from sfms_robot.listeners.events.hazards import STEP_FRAMES
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, DecideMemory, EventModel
 from sfms_robot.listeners.events.sensing import Sensed, scene_in
 from sfms_robot.listeners.events.whole import hazards_in, most_in, steps_in
+from sfms_robot.listeners.lots import Use, uniforms_of
 
 
 def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) -> tuple[Doubles, Doubles]:
@@ -69,7 +69,7 @@ def decisions(
 def _decided(
     model: EventModel, heard: Doubles, seed: int, calmness: Calmness | None, steps: Ints, most: Doubles
 ) -> tuple[ListenerEvent, ...]:
-    draws = of_instants(seed, steps)[:, model.draws]
+    draws = uniforms_of(seed, steps, Use.EVENT, len(EVENT_KINDS))[:, model.draws]
     frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
     memory, found = model.start(seed, calmness).decided, list[ListenerEvent]()
     at, look_back = 0, math.inf  # the frame from which on a look aside is over

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, ListenerEvent
-from sfms_robot.listeners.head_channels import head_channels
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import BANDS, BANDS_HZ
+from sfms_robot.listeners.sway import BANDS, BANDS_HZ, head_channels
 
 CUT_HZ: Final = 1.0
 HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head

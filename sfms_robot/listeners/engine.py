@@ -6,13 +6,14 @@ A stream asks networks by name: arrays in, arrays out, nothing kept. An engine h
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ModelError
+from sfms_robot.frames import Floats
 
 Array = NDArray[Any]
 EngineName = Literal["auto", "torch", "onnx"]
@@ -55,6 +56,11 @@ class RunsOnEngine:
 
     engine: Engine
 
+    def standardise(self, motion: Floats) -> Floats:
+        """Return motion (..., C) of the motion space in the units of the model."""
+        tensors = self.engine.tensors
+        return np.asarray((motion - tensors["motion_mean"]) / tensors["motion_std"], np.float32)
+
     @property
     def model(self) -> Any:
         """The torch model behind it. Raises ModelError where it runs on another engine."""
@@ -68,6 +74,11 @@ class RunsOnEngine:
         """See `Engine`. Itself."""
         self.engine.build_graphs()
         return self
+
+
+def stacked(parts: Sequence[Array]) -> Array:
+    """Return (N, ...) of N arrays (...), not to be changed: a single one is not copied."""
+    return parts[0][None] if len(parts) == 1 else np.stack(parts)
 
 
 def one_of(array: Array, streams: int) -> Array:

@@ -13,7 +13,7 @@ beginning. What has been decided is never taken back. Between plans frames are k
 the next plan could it be told.
 
 The model of motion learned from people who sat before a camera. A face further from that than any camera follows
-(upside down, far off) is not one that it is shown; events judge it against its own last second (`events.face_signs`).
+(upside down, far off) is not one that it is shown; events judge it against its own last second (`events.sensing`).
 
 Laws: `step_many` of several streams is each one's `step`; a plan tells each event once; with nothing decided the eyes
 look at the person; memory holds what is still under way, no more.

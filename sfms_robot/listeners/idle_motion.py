@@ -28,7 +28,8 @@ import numpy as np
 
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
-from sfms_robot.listeners.spectral_lines import as_cosines, set_in, sum_of_lines
+from sfms_robot.listeners.checkpoint import read_weights, write_tensors
+from sfms_robot.listeners.sway import as_cosines, set_in, sum_of_lines
 
 FILE: Final = "idle_motion.safetensors"  # in a listener's folder; without it a listener has none
 BANDS_HZ: Final = (0.04, 0.4, 0.75, 1.25, 2.0, 3.0, 5.0, 8.0)  # edges
@@ -137,27 +138,13 @@ class IdleMotion:
         return IdleStream(frequency, sizes, phase, self.loadings.astype(np.float64), rest)
 
     def save(self, file: Path) -> None:
-        """Raises ModelError where it cannot be written."""
-        from safetensors import SafetensorError
-        from safetensors.numpy import save_file
-
-        tensors = {name: getattr(self, name) for name in _TENSORS}
-        try:
-            save_file({name: np.ascontiguousarray(value, np.float32) for name, value in tensors.items()}, file)
-            file.chmod(0o644)
-        except (OSError, SafetensorError) as error:
-            raise ModelError(f"{file}: cannot be written: {error}") from error
+        """Write the tensors to `file`. Raises ModelError if it cannot be written."""
+        write_tensors(file, {name: np.ascontiguousarray(getattr(self, name), np.float32) for name in _TENSORS})
 
     @classmethod
     def load(cls, file: Path) -> IdleMotion:
-        """Raises ModelError when the file is none, cut off, of another shape, not finite or larger than faces idle."""
-        from safetensors import SafetensorError
-        from safetensors.numpy import load_file
-
-        try:
-            found = load_file(file)
-        except (OSError, SafetensorError) as error:
-            raise ModelError(f"{file}: not a readable safetensors file: {error}") from error
+        """Read `file`. Raises ModelError if it is missing, cut off, of another shape, or moves a face too far."""
+        found = read_weights(file)
         if set(found) != {*_TENSORS}:
             raise ModelError(f"{file}: holds {', '.join(sorted(found))}, not {', '.join(_TENSORS)}")
         loadings, amplitude, spread, held, shown = (found[name] for name in _TENSORS)
@@ -169,8 +156,6 @@ class IdleMotion:
                 f"{held.shape}, shown {shown.shape}; idle motion has (K, {_COUNT}), ({BANDS}, K), one number and twice "
                 f"({KNOTS}, {_COUNT})"
             )
-        if not all(np.isfinite(value).all() for value in found.values()):
-            raise ModelError(f"{file}: holds values that are not finite")
         steps = np.diff(np.stack([held, shown]).astype(np.float64), axis=1)
         if steps.min() < 0 or (steps[1] > STEEPEST * steps[0] + _ROUNDING).any():
             raise ModelError(f"{file}: a map of where a face rests falls, or is steeper than {STEEPEST:g}")

@@ -7,19 +7,25 @@ what it takes to read its weights. Those are rounded per output row as they are 
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot import config
 from sfms_robot.errors import MissingExtra, ModelError
 from sfms_robot.frames import Floats
-from sfms_robot.listeners.engine import Array, one_of
-from sfms_robot.listeners.graph_folder import Graph, GraphFolder
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.engine import Array, Engine, EngineName, one_of
+from sfms_robot.listeners.graph_folder import Graph, GraphFolder, has_graphs, read_graphs
+
+log = logging.getLogger(__name__)
 
 KEPT: Final = 4096  # numbers of a tensor that streams may ask for: scales, not weights
 ROWS: Final = 64  # of a weight that are rounded at a time: what the cache holds takes half as long
@@ -145,8 +151,6 @@ def _onnxruntime() -> Any:
 
 def available() -> bool:
     """Whether onnxruntime is installed. Does not import it."""
-    from importlib.util import find_spec
-
     return find_spec("onnxruntime") is not None
 
 
@@ -174,3 +178,55 @@ def whole_integers() -> bool:
     except OSError:
         return False
     return "avx512_vnni" in flags or "avx_vnni" in flags
+
+
+# --- Choice of an engine ----------------------------------------------------------------------------------------------
+#
+# `auto` is onnx where onnxruntime is installed and the folder has graphs that fit, torch elsewhere. The loading
+# process (`process_child`) measures whether one thread or all free cores are faster. No probe imports torch only to
+# find that it is slower: that costs two seconds and 200 MB.
+
+
+def engine_of(
+    folder: Path,
+    settings: config.Listener,
+    wanted: EngineName,
+    torch_engine: Callable[[], Engine],
+    precision: str = "fp32",
+    threads: int | None = None,
+) -> Engine:
+    """The engine of a listener's folder, loaded.
+
+    Args:
+        torch_engine: makes that of torch, with the folder's weights.
+        precision: of large layers: fp32, int8, or auto, which is int8 where there are graphs of it.
+        threads: None for one, and with torch for as many as it uses.
+
+    Raises ModelError, and ConfigError where what `wanted` needs is not installed.
+    """
+    graphs = _graphs(folder, settings, wanted, precision)
+    if graphs is not None:
+        file = folder / checkpoint.WEIGHTS
+        return OnnxEngine(folder, graphs, lambda: checkpoint.stored_tensors(file, graphs.wanted), threads or 1)
+    if find_spec("torch") is None:
+        raise MissingExtra(f"{folder}: no graphs for engine onnx, and torch is not installed: pip install torch")
+    engine = torch_engine()
+    if threads is not None:
+        engine.set_threads(threads)
+    return engine
+
+
+def _graphs(folder: Path, settings: config.Listener, wanted: EngineName, precision: str) -> GraphFolder | None:
+    """The graphs to run; None for torch."""
+    if wanted == "torch" or (wanted == "auto" and not (available() and has_graphs(folder))):
+        return None
+    try:
+        graphs = read_graphs(folder, settings, integers=precision != "fp32")
+    except ModelError as error:
+        if wanted == "onnx" or find_spec("torch") is None:
+            raise
+        log.warning("torch in place of onnx: %s", error)
+        return None
+    if precision == "int8" and not any(graph.integers for graph in graphs.graphs.values()):
+        raise ModelError(f"{folder}: precision int8, and no graphs in 8 bits: sfms-robot export --int8 {folder}")
+    return graphs

@@ -6,7 +6,8 @@ from sfms_robot.config.calmness import Calmness
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote import RemoteListener
-from sfms_robot.network import LOCAL, Router
+from sfms_robot.listeners.zenoh_link import ZenohLink
+from sfms_robot.network import LOCAL, Router, check_name
 from sfms_robot.plugins import REMOTE
 
 NamedFeed = ListenerProcess | RemoteListener
@@ -23,6 +24,5 @@ def open_feed(
     """
     if not name.startswith(REMOTE):
         return ListenerProcess(name, seed, calmness, engine)
-    from sfms_robot.listeners.zenoh_link import connect_listener  # zenoh: only for who has its extra
-
-    return connect_listener(name, seed, calmness, router)
+    served = check_name(name.removeprefix(REMOTE), "listener")
+    return RemoteListener(served, ZenohLink(served, router), seed, calmness)

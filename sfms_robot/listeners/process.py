@@ -55,7 +55,6 @@ from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.inbox import MOST_WAITING
-from sfms_robot.listeners.lateness import Lateness
 from sfms_robot.signals.quantiles import Quantiles
 
 START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
@@ -126,14 +125,15 @@ class ListenerProcess:
         """
         began_s = self._clock()
         while self._state == "starting" and self._clock() - began_s <= limit_s:
-            kind, value, number = self._child.next(_LOOK_S)
-            if kind != "error":
-                self._take(kind, value, number, began_s)
-            elif value is not None:
+            message = self._child.message(_LOOK_S)
+            if message is None:
+                if not self._child.ended:  # one that ended has left a message why
+                    self._supervise(self._clock())
+            elif message[0] == "error":
                 self.close()
-                raise ModelError(value)
-            elif not self._child.ended:  # one that ended has left a message why
-                self._supervise(self._clock())
+                raise ModelError(message[1])
+            else:
+                self._take(*message, began_s)
         if self._state in ("starting", "given up"):
             self.close()
             raise ModelError(f"the listener process was not loaded after {limit_s:g} s")
@@ -301,7 +301,7 @@ class ListenerProcess:
 
 
 class _Child:
-    """One interpreter, and the two threads that talk to it; nothing here blocks but `next` and `close`."""
+    """One interpreter and its two threads; nothing here blocks except `close`, and `message` with a limit."""
 
     def __init__(self, name: str, seed: int, calmness: Calmness | None, engine: EngineName) -> None:
         self._process = start_child("sfms_robot.listeners.process_child:main")
@@ -335,9 +335,10 @@ class _Child:
             self._urgent.append(value)
             self._changed.notify()
 
-    def message(self) -> tuple[str, Any, float] | None:
+    def message(self, limit_s: float = 0.0) -> tuple[str, Any, float] | None:
+        """Return the next message, or None when none comes within `limit_s`."""
         try:
-            return self._messages.get_nowait()
+            return self._messages.get(timeout=limit_s)
         except queue.Empty:
             return None
 
@@ -347,13 +348,6 @@ class _Child:
             return int(Path(f"/proc/{self._process.pid}/schedstat").read_text().split()[0])
         except (OSError, ValueError):
             return 0
-
-    def next(self, limit_s: float) -> tuple[str, Any, float]:
-        """The next message; ("error", None, 0) when none comes in time."""
-        try:
-            return self._messages.get(timeout=limit_s)
-        except queue.Empty:
-            return "error", None, 0.0
 
     def kill(self) -> None:
         """Returns at once, also where the child is stopped; the reader sees to the rest."""
@@ -394,3 +388,38 @@ class _Child:
             code = self._process.wait()
         self._messages.put(("error", f"the listener process died (exit code {code})", 0.0))
         self.ended = True
+
+
+# --- Lateness ---------------------------------------------------------------------------------------------------------
+#
+# A listener on a computer that is too slow answers, and always too late to be shown.
+
+LATE_S: Final = 1.0
+
+
+class Lateness:
+    """A judge of plans: in time to be shown, or not.
+
+    Attributes:
+        lasting: for `LATE_S` every plan has come after the last of its own frames. The first one in time ends it.
+    """
+
+    def __init__(self) -> None:
+        self.lasting = False
+        self._since_s: float | None = None  # of the first late one in a row
+
+    def named(self, state: str) -> str:
+        """Return "late" for a listening state whose plans are never in time, else `state`."""
+        return "late" if self.lasting and state == "listening" else state
+
+    def came(self, plan: Plan, now_s: float) -> None:
+        """Take a plan that arrived at `now_s`, by the clock of its frames."""
+        if now_s <= plan.times_s[-1]:
+            if self.lasting:
+                log.warning("the listener's plans are in time again")
+            self.lasting, self._since_s = False, None
+            return
+        self._since_s = now_s if self._since_s is None else self._since_s
+        if not self.lasting and now_s - self._since_s >= LATE_S:
+            log.warning("the listener's plans come too late to be shown: the head goes on without them")
+            self.lasting = True

@@ -32,7 +32,7 @@ def load_listener(
     Args:
         graphs: ready to run at full speed, which takes torch another second; else `build_graphs` is still to be called.
         calmness: how often a listener that decides events does what.
-        engine: what its networks are computed by (`engine_choice`); auto: onnx where it can be, else torch.
+        engine: what its networks are computed by (`onnx_engine`); auto: onnx where it can be, else torch.
         threads: that its networks may use; None: one, and with torch as many as it is set to.
 
     Raises ConfigError or ModelError.

@@ -18,13 +18,12 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import FRAME_HZ, ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.listeners.clock_offset import ClockOffset
 from sfms_robot.listeners.jitter_buffer import JitterBuffer
 from sfms_robot.listeners.remote_messages import (
     Interface,
@@ -75,6 +74,65 @@ class Link(Protocol):
         """What came since the last call, each with its age [s], in the order of coming."""
 
     def close(self) -> None: ...
+
+
+# --- Clock offset -----------------------------------------------------------------------------------------------------
+#
+# The clock of a server relative to ours, and the delay of a round trip (as in NTP: RFC 5905, section 8). A message
+# leaves at t1 of our clock and arrives at t2 of the server's; its answer leaves at t3 of the server's and arrives at
+# t4 of ours:
+#
+#     offset = ((t2 - t1) + (t3 - t4)) / 2        delay = (t4 - t1) - (t3 - t2)
+#
+# The offset is wrong by half the difference between the two ways, at most by delay / 2, so the sample with the least
+# delay of the last seconds is used. Clocks drift apart, so an old sample is dropped.
+
+WINDOW_S: Final = 10.0
+SET_S: Final = 1.0  # an offset so far from the one believed: a clock was set, or the server is another one
+
+
+@dataclass(frozen=True)
+class ClockSample:
+    """One exchange, complete at `at_s` of our clock; seconds."""
+
+    at_s: float
+    offset_s: float
+    delay_s: float
+
+
+class ClockOffset:
+    """Remembers the samples of `WINDOW_S` that could still become the best one."""
+
+    def __init__(self) -> None:
+        self._samples: deque[ClockSample] = deque()  # delays rise: the first is the best
+
+    def observe(self, sent_s: float, their_came_s: float, their_sent_s: float, came_s: float) -> None:
+        """An exchange: the four times of the section's text, in their order."""
+        sample = ClockSample(
+            came_s,
+            ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2,
+            max(0.0, (came_s - sent_s) - (their_sent_s - their_came_s)),
+        )
+        if self._samples and abs(sample.offset_s - self._samples[0].offset_s) > SET_S + sample.delay_s:
+            self._samples.clear()
+        while self._samples and self._samples[-1].delay_s >= sample.delay_s:
+            self._samples.pop()
+        self._samples.append(sample)
+        while came_s - self._samples[0].at_s > WINDOW_S:
+            self._samples.popleft()
+
+    def forget(self) -> None:
+        """Another server."""
+        self._samples.clear()
+
+    @property
+    def best(self) -> ClockSample | None:
+        """The sample that is believed; None before the first."""
+        return self._samples[0] if self._samples else None
+
+    def theirs(self, our_s: float) -> float | None:
+        """A time of our clock by theirs; None while nothing is known of it."""
+        return None if self.best is None else our_s + self.best.offset_s
 
 
 class RemoteListener:

@@ -284,6 +284,12 @@ def parse_words(data: bytes) -> Join | Welcome | Refusal | Notice:
 
 
 _KINDS: Final[Mapping[str, Any]] = {"join": Join, "welcome": Welcome, "refusal": Refusal, "notice": Notice}
+# Of the fields of all kinds.
+_TYPES: Final[Mapping[str, type]] = {
+    **dict.fromkeys(("client", "stream", "server", "listener", "reason", "kind"), str),
+    **dict.fromkeys(("seed", "horizon", "hop", "frames"), int),
+    "final": bool,
+}
 
 
 def _interface(told: Mapping[str, Any]) -> Interface:
@@ -293,16 +299,7 @@ def _interface(told: Mapping[str, Any]) -> Interface:
 
 
 def _check_words(said: Join | Welcome | Refusal | Notice) -> None:
-    kinds: tuple[tuple[object, type], ...]
-    if isinstance(said, Join):
-        kinds = ((said.client, str), (said.seed, int))
-    elif isinstance(said, Welcome):
-        kinds = ((said.stream, str), (said.server, str), (said.listener, str), (said.horizon, int), (said.hop, int))
-    elif isinstance(said, Refusal):
-        kinds = ((said.reason, str), (said.final, bool))
-    else:
-        kinds = ((said.kind, str), (said.frames, int))
-    if not all(isinstance(value, kind) for value, kind in kinds):
+    if not all(isinstance(value, _TYPES.get(name, object)) for name, value in vars(said).items()):
         raise PacketError(f"a {type(said).__name__.lower()} with a value of another type")
     if isinstance(said, Join) and said.seed < 0:
         raise PacketError(f"join: seed: expected 0 or more, got {said.seed}")

@@ -7,7 +7,7 @@ heads do (Shinozuka's spectral representation of a stationary process),
 
     x(t) = size * sum over lines l of  2^1/2 M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l in R^S
 
-of which every line is one cosine a channel (`spectral_lines`).
+of which every line is one cosine a channel.
 
 `LINES` frequencies drawn from each of the `BANDS_HZ`, `M M^T` of each band what heads do together there: who leans
 forward also comes down. Over the lines of a band sum a a^T + b b^T = 1: which way a head goes is by lot, how far it
@@ -25,15 +25,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
-from sfms_robot.frames import FRAME_S, Doubles, Floats
-from sfms_robot.listeners.head_channels import head_channels, lateral_channels, shifting_channels
+from sfms_robot.frames import FRAME_S, LATERAL_POSE, POSE_CHANNELS, Doubles, Floats
 from sfms_robot.listeners.lots import Use, normals, uniforms
-from sfms_robot.listeners.spectral_lines import as_cosines, set_in, sum_of_lines
 
 BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1
@@ -126,3 +125,58 @@ def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
 def _parts(lines: Doubles) -> tuple[Doubles, Doubles, Doubles]:
     """Frequencies, sizes, phases of lines (..., 3, L, S)."""
     return lines[..., 0, :, :], lines[..., 1, :, :], lines[..., 2, :, :]
+
+
+# --- Spectral lines ---------------------------------------------------------------------------------------------------
+#
+# A line a cos 2 pi f t + b sin 2 pi f t is one cosine, |(a, b)| cos(2 pi f t - atan2(b, a)), and is kept as such.
+# Idle motion (`idle_motion`) is a sum of lines too.
+
+EASE_S: Final = 3.0
+
+
+def as_cosines(a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
+    """Size and phase [rad] of lines with the factors a of the cosine and b of the sine."""
+    return np.hypot(a, b), np.arctan2(b, a)
+
+
+def sum_of_lines(times_s: NDArray[np.floating], frequency: Doubles, size: Doubles, phase: Doubles) -> Doubles:
+    """Lines (..., L, K), frequency [rad/s], at times (T, 1) of all, (..., T, 1) of each, or (..., T, K), where every
+    column goes by a clock of its own -> (..., T, K).
+    """
+    turn = times_s[..., None, :] * frequency[..., None, :, :]  # (..., T, L, K)
+    turn -= phase[..., None, :, :]
+    waves: Doubles = size[..., None, :, :] * np.cos(turn, out=turn)
+    return np.asarray(waves.sum(-2))
+
+
+def set_in(times_s: NDArray[np.floating]) -> Doubles:
+    """0 before a stream begins, 1 from `EASE_S` on, smooth in between."""
+    begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
+    return np.asarray(begun**2 * (3 - 2 * begun))
+
+
+# --- Channels of the head ---------------------------------------------------------------------------------------------
+
+# Channels of any motion space that turn or move the head, and those of them that a mirror turns around.
+HEAD = frozenset(
+    {*POSE_CHANNELS, *(f"{part}_{axis}" for part in ("rotation", "translation", "head") for axis in "xyz")}
+)
+
+LATERAL = frozenset((*LATERAL_POSE, "rotation_y", "rotation_z", "translation_x", "head_y", "head_z"))
+SHIFTING = frozenset(("x", "y", "z", *(f"translation_{axis}" for axis in "xyz")))
+
+
+def head_channels(channels: Sequence[str]) -> list[int]:
+    """Which of the channels move the head."""
+    return [index for index, name in enumerate(channels) if name in HEAD]
+
+
+def lateral_channels(channels: Sequence[str]) -> list[int]:
+    """Which of the `head_channels` a mirror turns around, by their place among those."""
+    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in LATERAL]
+
+
+def shifting_channels(channels: Sequence[str]) -> list[int]:
+    """Which of the `head_channels` move the head without turning it, by their place among those."""
+    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in SHIFTING]

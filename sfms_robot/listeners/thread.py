@@ -11,17 +11,15 @@ import queue
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 from sfms_robot.config.calmness import Calmness
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.listeners.inbox import MOST_WAITING, Inbox, calmed
-from sfms_robot.listeners.lateness import Lateness
-from sfms_robot.listeners.process import HUNG_S
+from sfms_robot.listeners.process import CLOSE_LIMIT_S, HUNG_S, Lateness
 from sfms_robot.ports import Listener
 from sfms_robot.signals.quantiles import Quantiles
 
-CLOSE_LIMIT_S: Final = 0.2
 log = logging.getLogger(__name__)
 
 

@@ -15,10 +15,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.config.calmness import Calmness
-from sfms_robot.listeners.remote import RemoteListener
-from sfms_robot.network import LOCAL, Connection, Router, check_name, session_config
-from sfms_robot.plugins import REMOTE as PREFIX
+from sfms_robot.network import LOCAL, Connection, Router, session_config
 
 if TYPE_CHECKING:
     import zenoh
@@ -38,17 +35,6 @@ def up_key(name: str, stream: str) -> str:
 
 def down_key(name: str, stream: str) -> str:
     return f"{ROOT}/{name}/{stream}/down"
-
-
-def connect_listener(
-    listener: str, seed: int, calmness: Calmness | None = None, router: Router = LOCAL
-) -> RemoteListener:
-    """Return the feed of zenoh/NAME, which connects from now on.
-
-    Raises ConfigError, MissingExtra.
-    """
-    name = check_name(listener.removeprefix(PREFIX), "listener")
-    return RemoteListener(name, ZenohLink(name, router), seed, calmness)
 
 
 class ZenohLink:

@@ -34,12 +34,11 @@ from sfms_robot.ports import (
     Timeline,
 )
 from sfms_robot.runtime.clock import tick_times
-from sfms_robot.runtime.fade import Fade
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.heat import Heat, HeatGuard, temperatures_C
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
-from sfms_robot.runtime.presence import Presence
+from sfms_robot.runtime.presence import Fade, Presence
 from sfms_robot.runtime.safety import EASE_S, come_to_rest
 from sfms_robot.runtime.states import RunState, Situation, following
 from sfms_robot.signals.minimum_jerk import ease

@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from sfms_robot.frames import SpeakerFrame
+from sfms_robot.frames import Doubles, SpeakerFrame
 from sfms_robot.ports import Watched
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.voice_activity import Ear
 
 GONE_S: Final = 10.0  # neither seen nor heard for so long
@@ -70,3 +71,31 @@ class Presence:
     def speaking(self, now_s: float) -> bool:
         """Whether the robot's own voice is being played."""
         return now_s - self.watched.said_s <= TURN_GAP_S
+
+
+# --- Fade -------------------------------------------------------------------------------------------------------------
+#
+# How much of the listener's answer shows: all of it while a person is there, none without.
+
+FADE_S: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Fade:
+    """A share that goes smoothly from `before` to `after`, from `since_s` on for `FADE_S`."""
+
+    before: float = 0.0
+    after: float = 0.0
+    since_s: float = 0.0
+
+    def at(self, times_s: Doubles) -> Doubles:
+        """(N,) at (N,) instants."""
+        share: Doubles = self.before + (self.after - self.before) * ease((times_s - self.since_s) / FADE_S)
+        return share
+
+    def toward(self, share: float, times_s: Doubles) -> Fade:
+        """Goes to `share`, beginning at the latest of the instants (N,): none that was played before changes."""
+        if share == self.after:
+            return self
+        latest = times_s.max(keepdims=True)
+        return Fade(float(self.at(latest)[0]), share, float(latest[0]))

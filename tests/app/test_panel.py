@@ -11,7 +11,7 @@ from rich.console import Console
 from sfms_robot.app.listen.panel import view
 from sfms_robot.frames import Reading, SpeakerFrame
 from sfms_robot.ports import Tick
-from sfms_robot.runtime.status import RunStatus
+from sfms_robot.runtime.observers import RunStatus
 
 JOINTS = ("neck_pitch", "jaw", "brow_left", "brow_right", "lid_left", "lid_right")
 FIGURES = {

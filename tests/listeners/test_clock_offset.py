@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.listeners.clock_offset import WINDOW_S, ClockOffset
+from sfms_robot.listeners.remote import WINDOW_S, ClockOffset
 
 
 def exchange(clock, at_s, offset_s, there_s, back_s, works_s=0.01):

@@ -11,7 +11,7 @@ from sfms_robot.frames import BLENDSHAPES, EVENT_KINDS, FRAME_S, MOTION_DIM, SHA
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.idle_motion import AFTER_SPEECH_S, BANDS, BANDS_HZ, KNOTS, IdleMotion, RestMap
-from sfms_robot.listeners.spectral_lines import EASE_S
+from sfms_robot.listeners.sway import EASE_S
 
 BROW = BLENDSHAPES.index("browInnerUp")
 

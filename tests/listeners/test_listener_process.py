@@ -135,7 +135,7 @@ def listener():
     child = ListenerProcess("sfms-small", 3)
     child.wait_loaded()
     while child.statistics()["state"] != "listening":
-        child._take(*child._child.next(60.0), 0.0)
+        child._take(*child._child.message(60.0), 0.0)
     yield child
     child.close()
 
@@ -150,7 +150,7 @@ def answered(listener, now_s):
         listener.push(frame, now_s)
     plans = []
     while not plans:
-        kind, value, number = listener._child.next(60.0)
+        kind, value, number = listener._child.message(60.0)
         plan = listener._take(kind, value, number, now_s)
         plans += [plan] if plan is not None else []
     return plans
@@ -171,14 +171,14 @@ def test_the_hop_is_chosen_when_the_source_has_settled_and_a_new_child_is_told_o
     child.choose_hop_by(lambda: 0.06, 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
+        child._take("probed", replace(child._child.message(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
         for frame in frames(SETTLED_FRAMES):
             assert child.statistics()["hop"] is None
             child.push(frame, 0.0)
         assert child.statistics()["hop"] == 1 and child.statistics()["budget_ms"]["source"] == 60
         plans = []
         while len(plans) < SETTLED_FRAMES:
-            plan = child._take(*child._child.next(60.0), 0.0)
+            plan = child._take(*child._child.message(60.0), 0.0)
             plans += [plan] if plan is not None else []
         assert [round(plan.made_at_s / FRAME_S) for plan in plans] == list(range(1, SETTLED_FRAMES + 1))
     finally:
@@ -191,14 +191,14 @@ def test_a_hop_gives_way_when_the_source_turns_out_later_than_it_was_and_never_g
     child.choose_hop_by(lambda: late_s[0], 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take("probed", replace(child._child.next(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
+        child._take("probed", replace(child._child.message(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
         for frame in frames(SETTLED_FRAMES):
             child.push(frame, 0.0)
         assert child.statistics()["hop"] == 3
         while child.statistics()["state"] != "listening":
-            child._take(*child._child.next(60.0), 0.0)
+            child._take(*child._child.message(60.0), 0.0)
         for _ in range(SETTLED_FRAMES):
-            kind, value, _ = child._child.next(60.0)
+            kind, value, _ = child._child.message(60.0)
             child._take(kind, value, 5.0, 0.0)  # whatever a plan takes on this machine
         for now_s, source_s, hop in ((REVIEW_S - 0.1, 0.06, 3), (REVIEW_S, 0.06, 1), (3 * REVIEW_S, 0.0, 1)):
             late_s[0] = source_s
@@ -206,7 +206,7 @@ def test_a_hop_gives_way_when_the_source_turns_out_later_than_it_was_and_never_g
             assert child.statistics()["hop"] == hop
         for frame in frames(3):
             child.push(frame, 0.0)
-        assert [child._child.next(60.0)[0] for _ in range(3)] == ["plan"] * 3
+        assert [child._child.message(60.0)[0] for _ in range(3)] == ["plan"] * 3
     finally:
         child.close()
 
@@ -224,7 +224,7 @@ def test_a_child_that_dies_is_started_anew_and_listens_again(listener):
     while listener.statistics()["restarts"] == 0:  # until the reading thread has seen the end of the pipe
         listener.poll(1.0)
     for kind in ("loaded", "probed", "ready"):
-        message = listener._child.next(60.0)
+        message = listener._child.message(60.0)
         assert message[0] == kind
         listener._take(*message, 1.0)
     assert answered(listener, 1.0) and listener.statistics()["state"] == "listening"
@@ -259,7 +259,7 @@ def test_a_child_that_is_stopped_in_any_phase_is_named_within_a_second_and_resta
             child.choose_hop_by(lambda: 0.06, 0.047, 0.01)  # chosen after half a second of frames
         kind = ""
         while kind != PHASES[phase]:
-            kind, value, number = child._child.next(60.0)
+            kind, value, number = child._child.message(60.0)
             child._take(kind, value, number, 0.0)
         os.kill(before := pid_of(child), signal.SIGSTOP)
         os.waitid(os.P_PID, before, os.WSTOPPED)
@@ -330,7 +330,7 @@ def test_a_child_that_hangs_while_it_loads_or_measures_is_restarted_also_where_o
 ):
     with closing(ListenerProcess(f"stuck:{where}-{how}", 0)) as child:
         while where != "load" and child.statistics()["state"] == "starting":
-            child._take(*child._child.next(60.0), 0.0)
+            child._take(*child._child.message(60.0), 0.0)
         while not stuck.exists():
             pass
         if how == "waits":
@@ -352,7 +352,7 @@ def test_frames_of_a_child_that_hangs_do_not_pile_up_and_it_goes_on_where_it_was
     caplog.set_level(logging.INFO)
     answered(listener, 0.0)
     while listener._unanswered:  # the rest of the hop
-        listener._take(*listener._child.next(60.0), 0.0)
+        listener._take(*listener._child.message(60.0), 0.0)
     os.kill(pid_of(listener), signal.SIGSTOP)
     os.waitid(os.P_PID, pid_of(listener), os.WSTOPPED)
     for frame in frames(2000):

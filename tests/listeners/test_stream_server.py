@@ -21,8 +21,7 @@ from sfms_robot.listeners.remote_messages import (
     words_message,
 )
 from sfms_robot.listeners.serving.capacity import Capacity, measure_capacity
-from sfms_robot.listeners.serving.figures import report
-from sfms_robot.listeners.serving.stream_server import DEADLINE_S, SILENT_S, StreamServer
+from sfms_robot.listeners.serving.stream_server import DEADLINE_S, SILENT_S, StreamServer, report
 
 
 def joined(server, client="a", now_s=0.0, seed=0):

@@ -7,8 +7,8 @@ import pytest
 
 from sfms_robot.frames import FaceFrame, Reading, SpeakerFrame
 from sfms_robot.ports import Tick
+from sfms_robot.runtime.observers import RunStatus
 from sfms_robot.runtime.states import RunState
-from sfms_robot.runtime.status import RunStatus
 
 JOINTS = ("neck_yaw", "jaw")
 

@@ -35,7 +35,7 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
     """Quality lost by each way of sampling (`ddim-8`: DDIM, 8 steps), on what the listener makes of `speaker`."""
     import torch
 
-    from sfms_robot.listeners.arig.diffusion import Denoiser
+    from sfms_robot.listeners.arig.sampler import Denoiser
 
     head = listener.model.head
     if not isinstance(head, Denoiser):

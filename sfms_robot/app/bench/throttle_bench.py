@@ -33,8 +33,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import Plan
-from sfms_robot.listeners.lateness import LATE_S
-from sfms_robot.listeners.process import HUNG_S
+from sfms_robot.listeners.process import HUNG_S, LATE_S
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.runtime.states import ARROWS

@@ -1,6 +1,6 @@
 """`run --fleet NAME`: a head among others, over zenoh.
 
-    sfms/NAME/state     the status document (`runtime.status`) as JSON: once a second, at every change of state, and as
+    sfms/NAME/state     the status document (`RunStatus`) as JSON: once a second, at every change of state, and as
                         the answer to a query; with a `nonce`, and `malformed`, the count of refused messages
     sfms/NAME/command   JSON, as a query that is answered {"done": command} or {"error": line}, or as a put:
                         {"command": "halt"}

@@ -36,7 +36,7 @@ class PageObserver(Observer):
         joints: names, in the order of `Tick.goals_rad`.
 
     Attributes:
-        document: how the run is, for who looks: see `runtime.status`; None: not known yet.
+        document: how the run is, for who looks: see `runtime.observers`; None: not known yet.
     """
 
     def __init__(self, page: PageProcess, joints: Sequence[str]) -> None:

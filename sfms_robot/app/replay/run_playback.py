@@ -25,8 +25,8 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.halt_switches import halt_signals
+from sfms_robot.runtime.observers import RunStatus
 from sfms_robot.runtime.safety import Interrupt, signals_to
-from sfms_robot.runtime.status import RunStatus
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from sfms_robot.child_process import cores, end_child, messages, start_child
 from sfms_robot.errors import ModelError, PacketError, RobotError
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
 from sfms_robot.listeners.serving.capacity import Capacity
-from sfms_robot.listeners.serving.figures import Figures, report
-from sfms_robot.listeners.serving.stream_server import DEADLINE_S
+from sfms_robot.listeners.serving.stream_server import DEADLINE_S, Figures, report
 
 FIGURES_LIMIT_S: Final = 2.0  # what a process says of itself is waited for, else the last that it said counts
 CLOSE_LIMIT_S: Final = 1.0

@@ -28,12 +28,12 @@ from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, some_sou
 from sfms_robot.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.learning.staged_frames import Scratch
 from sfms_robot.listeners.arig import audio_frontend, told
-from sfms_robot.listeners.arig.csu import StateUnderstanding
-from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.modules import StateUnderstanding
+from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.sojourns import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
-from sfms_robot.listeners.head_channels import lateral_channels
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import lateral_channels
 from sfms_robot.signals import mel, phase
 from sfms_robot.signals.control import control_track
 from sfms_robot.signals.events import runs

@@ -19,12 +19,12 @@ from sfms_robot.learning import corpus as dyads
 from sfms_robot.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, windows, without_gaze
 from sfms_robot.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.learning.staged_frames import Scratch
-from sfms_robot.listeners.head_channels import lateral_channels
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import lateral_channels
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
 from sfms_robot.signals.control import control_track

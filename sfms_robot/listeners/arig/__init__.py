@@ -10,7 +10,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.engine_choice import engine_of
+from sfms_robot.listeners.onnx_engine import engine_of
 from sfms_robot.listeners.space import MotionSpace
 
 if TYPE_CHECKING:

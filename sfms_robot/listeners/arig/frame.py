@@ -17,9 +17,9 @@ from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
-from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.parts import Part
+from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS
 from sfms_robot.signals.control import COLUMNS
 

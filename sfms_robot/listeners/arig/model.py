@@ -48,15 +48,11 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.listeners.arig import told
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
-from sfms_robot.listeners.arig.codes import CodeHead
-from sfms_robot.listeners.arig.csu import StateUnderstanding
-from sfms_robot.listeners.arig.diffusion import Denoiser
-from sfms_robot.listeners.arig.ibu import LongRange, Merge, ShortRange
+from sfms_robot.listeners.arig.modules import LongRange, Merge, Progressive, ShortRange, StateUnderstanding
 from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
-from sfms_robot.listeners.arig.pmp import Progressive
+from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST
-from sfms_robot.listeners.head_channels import head_channels
-from sfms_robot.listeners.sway import BANDS
+from sfms_robot.listeners.sway import BANDS, head_channels
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 

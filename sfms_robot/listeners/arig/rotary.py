@@ -5,22 +5,18 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.frames import Doubles, Floats
 
 BASE = 10_000.0
 
 
-def rates(size: int) -> Doubles:
-    """(size,) radians per chunk of a head's numbers; its halves are the two coordinates of each plane."""
-    half = size // 2
-    return np.tile(BASE ** (-np.arange(half) / half), 2)
+def rotary(chunks: NDArray[np.integer], size: int) -> Floats:
+    """Return cosines and sines (N, 2, size) of chunk numbers (N,), sines of the first half negative.
 
-
-def rotary(chunks: Doubles, size: int) -> Floats:
-    """Chunk numbers (N,) -> cosines and sines (N, 2, size), those of the first half negative.
-
-    Computed in double precision: after days of running the angles still differ by what the chunks do.
+    The halves are the two coordinates of each plane. Computed in double precision: after days of running the angles of
+    two chunks still differ.
     """
     turns, signs = _planes(size)
     angles = chunks[:, None] * turns
@@ -29,5 +25,6 @@ def rotary(chunks: Doubles, size: int) -> Floats:
 
 @lru_cache(maxsize=8)
 def _planes(size: int) -> tuple[Doubles, Doubles]:
-    """`rates`, and signs of the sines; not to be changed."""
-    return rates(size), np.where(np.arange(size) < size // 2, -1.0, 1.0)
+    """Return radians per chunk (size,), and signs of the sines; not to be changed."""
+    half = size // 2
+    return np.tile(BASE ** (-np.arange(half) / half), 2), np.where(np.arange(size) < half, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Conversational states of a stream, drawn: which comes next, and for how long (`csu` says what they are).
+"""Conversational states of a stream, drawn: which comes next, and for how long (`modules` has the table).
 
 A semi-Markov process: how long a state lasts is drawn from durations of the data, which comes next from the model's
 answer. Feedback that is seen, a nod or a smile in the other's turn, lies on top: the events decide it.
@@ -54,7 +54,7 @@ def draw_sojourn(
     another by the model's answer, of those that the voices leave; the same again where they leave no other.
 
     Args:
-        durations, possible: of `csu.StateUnderstanding`.
+        durations, possible: of `modules.StateUnderstanding`.
         logits: (S,) of the frame.
         voiced: speech of agent and user, as the model is told it.
         before: that of the frame before.

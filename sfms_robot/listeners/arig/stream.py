@@ -27,7 +27,7 @@ from sfms_robot.listeners.arig import audio_frontend
 from sfms_robot.listeners.arig.audio_frontend import AudioState
 from sfms_robot.listeners.arig.rotary import rotary
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST, Sojourn, draw_sojourn, with_feedback
-from sfms_robot.listeners.engine import Engine, RunsOnEngine
+from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.lots import Use, normals, uniforms
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.sway import HeadSway
@@ -95,6 +95,8 @@ class Heard:
 class ArigListener(RunsOnEngine):
     """`ports.BatchListener`. Holds weights only: its engine does, which runs the networks of `frame`."""
 
+    hop = horizon = 1
+
     def __init__(self, settings: config.Arig, engine: Engine, space: MotionSpace | None = None) -> None:
         """Raises ModelError for a model that hears with features nothing here computes (sound: wav2vec2)."""
         if settings.sound != "mel":
@@ -102,17 +104,8 @@ class ArigListener(RunsOnEngine):
         self.settings = settings
         self.engine = engine
         self.space = space or MotionSpace.of(settings)
-        self._scales = engine.tensors
         self.sway = HeadSway(settings, engine.tensors)
         self._noise_shape = (1, 1) if settings.discrete else (settings.diffusion.steps, len(settings.channels))
-
-    @property
-    def hop(self) -> int:
-        return 1
-
-    @property
-    def horizon(self) -> int:
-        return 1
 
     @property
     def control_frames(self) -> tuple[int, int]:
@@ -175,10 +168,6 @@ class ArigListener(RunsOnEngine):
         rows = self._rows(None if control is None else [control], 1)
         z, _, (now,) = self._conditions(self._hear([speaker], [memory]), [memory], rows)
         return z, now
-
-    def standardise(self, motion: Floats) -> Floats:
-        """Motion (..., C) of the motion space -> the units the model works in."""
-        return np.asarray((motion - self._scales["motion_mean"]) / self._scales["motion_std"], np.float32)
 
     def _stepped(
         self,
@@ -252,7 +241,7 @@ class ArigListener(RunsOnEngine):
             return before, [memory.state for memory in now]
         if not self.settings.events:
             return before, logits.argmax(-1).tolist()
-        durations, possible = self._scales["states.durations"], self._scales["states.possible"]
+        durations, possible = (self.engine.tensors[f"states.{name}"] for name in ("durations", "possible"))
         sojourns = [
             draw_sojourn(durations, possible, scores, one.voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
             for scores, one, last, own in zip(logits, heard, before, now, strict=True)
@@ -314,7 +303,7 @@ class ArigListener(RunsOnEngine):
             np.arange(room) >= room - np.minimum(chunks, room)[:, None],
             *(_stacked(memories, name) for name in remembered),
             rows,
-            *(_joined([memory.context[part] for memory in memories]) for part in range(2 * settings.context_layers)),
+            *(stacked([memory.context[part] for memory in memories]) for part in range(2 * settings.context_layers)),
         ]
 
     def _face(self, speaker: SpeakerFrame) -> tuple[Floats, bool]:
@@ -328,9 +317,4 @@ class ArigListener(RunsOnEngine):
 
 
 def _stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:
-    return _joined([getattr(part, name) for part in parts])
-
-
-def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """(N, ...) of N arrays (...); a single one is not copied."""
-    return parts[0][None] if len(parts) == 1 else np.stack(parts)
+    return stacked([getattr(part, name) for part in parts])

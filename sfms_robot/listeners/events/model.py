@@ -23,10 +23,10 @@ import numpy as np
 
 from sfms_robot.config import Calmness
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame, changed
-from sfms_robot.listeners.events import chance
 from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
 from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
 from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
+from sfms_robot.listeners.lots import Use, uniforms
 from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
 
 LEAD_FRAMES: Final = 3  # an event decided with frame n begins behind frame n + LEAD_FRAMES
@@ -163,7 +163,7 @@ class EventModel:
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
         may = _may_happen(sensed, history, now_s)
-        draws = chance.of_instant(memory.seed, sensed.frame)[self.draws]
+        draws = uniforms(memory.seed, sensed.frame, Use.EVENT, len(EVENT_KINDS))[self.draws]
         hazards, events = dict(self._never), list(self._look_back(sensed.frame, history, now_s))
         for at, kind in enumerate(self.bank.kinds):
             if kind not in may or memory.calmness.per_minute(kind) == 0:
@@ -202,10 +202,11 @@ class EventModel:
         return (ListenerEvent("gaze_shift", _begin_s(frame), until_s, shift.size, target_rad=AT_PERSON),)
 
     def shaped(self, kind: str, frame: int, seed: int) -> ListenerEvent:
-        """How long, how large, where to: by lot; no larger than a head gets within a swing."""
+        """Draw the duration, size and direction of an event; no larger than a head can get within a swing."""
         shape = self.tables.shapes[kind]
-        long, large, side, up = chance.of_event(seed, frame, kind, 4).tolist()
-        habit, pace = chance.of_habit(seed, kind, 2).tolist()
+        part = EVENT_KINDS.index(kind)
+        long, large, side, up = uniforms(seed, frame, Use.COURSE, 4, part).tolist()
+        habit, pace = uniforms(seed, 0, Use.HABIT, 2, part).tolist()
         duration_s = quantile(shape.duration_s, long)
         size = quantile(shape.size, large) * quantile(shape.habit, habit)
         size = min(max(size, shape.size[0]), shape.size[-1])

@@ -15,18 +15,31 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
-from sfms_robot.listeners.serving.batches import step_each
 from sfms_robot.ports import Listener
 
 SIZES: Final = (1, 2, 4, 8, 16, 32)
 ROUNDS: Final = 3  # plans that are measured at each size, after one that is not
 UNEVEN: Final = 1.2  # of 2 B: what the slowest of a hundred takes, measured
 _BISECTIONS: Final = 20
+
+
+# --- Batches ----------------------------------------------------------------------------------------------------------
+
+
+def step_each(
+    listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any]
+) -> list[tuple[Plan | None, Any]]:
+    """One step of each stream; in one batch where the listener knows how (`ports.BatchListener`)."""
+    together = getattr(listener, "step_each", None)
+    if together is None:
+        return [listener.step(speaker, memory) for speaker, memory in zip(speakers, memories, strict=True)]
+    found: list[tuple[Plan | None, Any]] = together(speakers, memories)
+    return found
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.engine_choice import engine_of
+from sfms_robot.listeners.onnx_engine import engine_of
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace

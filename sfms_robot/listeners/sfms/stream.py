@@ -36,15 +36,12 @@ from sfms_robot.frames import (
     SpeakerFrame,
     changed,
 )
-from sfms_robot.listeners.engine import Engine, RunsOnEngine
-from sfms_robot.listeners.head_channels import HEAD
+from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
-from sfms_robot.listeners.sfms.courses import ToldCourse
-from sfms_robot.listeners.sfms.draw import Sampler, Seen
+from sfms_robot.listeners.sfms.draw import Reach, Sampler, Seen, ToldCourse
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
-from sfms_robot.listeners.sfms.reachable import Reach
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import HeadSway
+from sfms_robot.listeners.sway import HEAD, HeadSway
 from sfms_robot.signals.control import COLUMNS
 
 _NO_FACE: Final = np.full(MOTION_DIM, np.nan, np.float32)
@@ -256,7 +253,7 @@ class SfmsListener(RunsOnEngine):
         newest = [memory.frames - 1 for memory in memories]
         window = Seen(**seen, tokens=tokens, control=told, settled=settled)
         tokens, path = self.plan(window, path, [memory.seed for memory in memories], newest)
-        sway = _stacked([memory.sway for memory in memories])
+        sway = stacked([memory.sway for memory in memories])
         plans = self._plans(times_s, self.with_sway(self.shown(path), sway, np.array(newest) + 1))
         after = [
             changed(memory, speaker=speaker, tokens=own, control=rows, path=way)
@@ -267,7 +264,7 @@ class SfmsListener(RunsOnEngine):
     def _moved_on(self, memories: Sequence[Memory]) -> tuple[Tokens, Floats, Floats]:
         """Tokens, path and control (B, ...) of now, the frames heard since the last plan further on."""
         tokens, path, control = (
-            _stacked([getattr(memory, name) for memory in memories]) for name in ("tokens", "path", "control")
+            stacked([getattr(memory, name) for memory in memories]) for name in ("tokens", "path", "control")
         )
         since = [len(memory.speaker.sounds) for memory in memories]
         if len(set(since)) == 1:
@@ -292,7 +289,7 @@ class SfmsListener(RunsOnEngine):
         if any(one.shape != (rows, self._columns) for one in told):
             shapes = ", ".join(str(one.shape) for one in told)
             raise ValueError(f"control has shape {shapes}, not {len(told)} times ({rows}, {self._columns})")
-        return _stacked(told).astype(np.float32)
+        return stacked(told).astype(np.float32)
 
     def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
         """Motion (..., N, C), standardised, of frames `first`, `first` + 1, ... -> in the model's space, with the slow
@@ -334,10 +331,6 @@ class SfmsListener(RunsOnEngine):
         """Standardised sound (N, 2R, bins) of N frames, each behind the one before it -> (N, W)."""
         return self.engine.run("hear", rows)[0]
 
-    def standardise(self, motion: Floats) -> Floats:
-        """Motion (..., C) of the model's motion space -> the units it works in."""
-        return np.asarray((motion - self._scales["motion_mean"]) / self._scales["motion_std"], np.float32)
-
     def standardise_sound(self, rows: Floats) -> Floats:
         """Rows (..., bins) of sound features, likewise."""
         return np.asarray((rows - self._scales["sound_mean"]) / self._scales["sound_std"], np.float32)
@@ -377,8 +370,8 @@ class SfmsListener(RunsOnEngine):
 
     def _faces(self, motion: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """Motion (58,) of N frames, not finite where no face is known -> (N, C) standardised, and which are known."""
-        rows = _stacked(motion)
-        known: NDArray[np.bool_] = np.isfinite(rows).all(axis=1)
+        rows = stacked(motion)
+        known: NDArray[np.bool_] = np.asarray(np.isfinite(rows).all(axis=1))
         faces = np.zeros((len(rows), self.space.dim), np.float32)
         if known.any():
             faces[known] = self.standardise(self.space.encode(rows[known]))
@@ -417,11 +410,6 @@ def _pushed(queues: Sequence[NDArray[Any]], new: NDArray[Any], counts: Sequence[
         out[row, :kept] = queue[longest - kept :]
         out[row, kept:] = new[end - (longest - kept) : end]
     return out
-
-
-def _stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """(N, ...), not to be changed: of one it is that one."""
-    return parts[0][None] if len(parts) == 1 else np.concatenate(parts).reshape(len(parts), *parts[0].shape)
 
 
 def join(tail: Floats, decoded: Floats, seam: int) -> Floats:

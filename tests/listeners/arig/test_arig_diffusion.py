@@ -4,8 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot import config
-from sfms_robot.listeners.arig.codes import CodeHead
-from sfms_robot.listeners.arig.diffusion import Denoiser, cosine_alpha_bar, steps_of
+from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser, cosine_alpha_bar, steps_of
 
 
 def denoiser(**changes) -> Denoiser:

@@ -9,8 +9,8 @@ from tiny_arig import arig_model
 
 from sfms_robot.config.arig import STATES
 from sfms_robot.listeners.arig.audio_frontend import WIDTHS
-from sfms_robot.listeners.arig.ibu import LongRange
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.modules import LongRange
 from sfms_robot.listeners.arig.parts import windows
 from sfms_robot.listeners.arig.rotary import rotary
 from sfms_robot.listeners.arig.sojourns import FIRST

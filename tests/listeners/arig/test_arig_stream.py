@@ -13,8 +13,8 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.arig import torch_engine
-from sfms_robot.listeners.arig.diffusion import Denoiser
 from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.stream import ArigListener
 
 ABLATIONS = [

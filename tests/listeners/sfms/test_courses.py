@@ -9,7 +9,7 @@ from tiny_sfms import plans_of, speech, tiny_listener, told_listener
 from sfms_robot.config import NodCourse, SmileCourse
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, SMILE_CORNERS, ListenerEvent
-from sfms_robot.listeners.sfms.courses import ToldCourse, nod_course, smile_course, smile_share
+from sfms_robot.listeners.sfms.draw import ToldCourse, nod_course, smile_course, smile_share
 from sfms_robot.signals.control import COLUMNS, control_track
 
 SMILE = ListenerEvent("smile", 0.6, 2.4, 0.5)

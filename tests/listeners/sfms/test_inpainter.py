@@ -3,8 +3,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.listeners.sfms.inpainter import Inpainter
 from sfms_robot.listeners.sfms.keyframes import KEYS_STEP, around
+from sfms_robot.listeners.sfms.model import Inpainter
 from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 

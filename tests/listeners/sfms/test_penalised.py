@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.listeners.sfms.neighbours import Neighbours
-from sfms_robot.listeners.sfms.penalised import place_penalised
-from sfms_robot.listeners.sfms.placement import place_exact
+from sfms_robot.listeners.sfms.placement import place_exact, place_penalised
 
 MEMBER = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 COST = st.floats(0.02, 20)

@@ -7,15 +7,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.listeners.sfms.choice import choose, sweep
 from sfms_robot.listeners.sfms.exact import completion_errors, mask_cost, segments
 from sfms_robot.listeners.sfms.neighbours import Neighbours
 from sfms_robot.listeners.sfms.placement import (
     Strategy,
+    choose,
     place,
     place_exact,
     place_learned,
     place_static,
+    sweep,
 )
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, stretch_errors, tracks
 

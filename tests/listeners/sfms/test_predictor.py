@@ -1,12 +1,13 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from tiny_sfms import tiny_listener
 
+from sfms_robot.listeners.sfms import keyframes
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED
-from sfms_robot.listeners.sfms.predictor import Context, LastKeyframes, last_keyframes
-from sfms_robot.listeners.sfms.speaker import SpeakerEncoder
+from sfms_robot.listeners.sfms.predictor import Context, SpeakerEncoder, last_keyframes
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)
 
@@ -110,13 +111,13 @@ def test_trails_are_the_last_two_keyframes_at_every_frame():
 
 
 def test_a_trail_grown_frame_by_frame_is_the_trail_of_the_whole():
-    tokens = torch.randint(0, 3, (4, 30, 5), generator=torch.Generator().manual_seed(0))
-    whole = last_keyframes(tokens)
-    grown = LastKeyframes(*(part[:, 9] for part in whole))
+    tokens = np.random.default_rng(0).integers(0, 3, (4, 30, 5))
+    whole = keyframes.last_keyframes(tokens)
+    grown = keyframes.LastKeyframes(*(part[:, 9] for part in whole))
     for frame in range(10, 30):
         grown = grown.then(tokens[:, frame], frame)
         for a, b in zip(grown, whole, strict=True):
-            assert torch.equal(a, b[:, frame])
+            assert np.array_equal(a, b[:, frame])
 
 
 def test_learned_vectors_take_a_parameter_where_a_grid_needs_none():

@@ -2,8 +2,8 @@ import numpy as np
 import torch
 from tiny_sfms import tiny_listener
 
+from sfms_robot.listeners.sfms.draw import Reach
 from sfms_robot.listeners.sfms.quantizer import indices_to_codes
-from sfms_robot.listeners.sfms.reachable import Reach
 
 
 def listener_with_speed(speed: float, bounded: bool = True):

@@ -1,6 +1,7 @@
-"""Interactive behaviour understanding (3.2): what both people did, a chunk at a time, and over a long range.
+"""The modules of ARIG: interactive behaviours (3.2), conversation states (3.3) and progressive motion (3.4).
 
-Short range: the last c behaviours of both tracks, read anew for every frame in the light of the newest sounds, become
+Interactive behaviour understanding: the motion and sound of both people, a chunk at a time, and over a long range.
+Short range: the last c behaviours of both tracks, read again for every frame in the light of the newest sounds, become
 one summary. Long range: summaries of whole chunks, and that of the chunk in progress, which every frame refreshes
 until the chunk is full; a causal decoder makes the cis-token of them. A token sees the w - 1 chunks before its own, in
 every layer, so what a stream keeps is w - 1 keys and values per layer: those of whole chunks never change.
@@ -16,7 +17,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sfms_robot.config.arig import EVENT_STATES, STATES
 from sfms_robot.listeners.arig.parts import (
+    CrossAttention,
     FeedForward,
     LayerNorm,
     Linear,
@@ -27,7 +30,8 @@ from sfms_robot.listeners.arig.parts import (
     modulated,
     split_heads,
 )
-from sfms_robot.listeners.arig.rotary import rates
+from sfms_robot.listeners.arig.rotary import rotary
+from sfms_robot.listeners.arig.sojourns import QUANTILES
 from sfms_robot.listeners.layers import exported_attention
 
 
@@ -188,25 +192,14 @@ class ContextLayer(Part):
 class LongRange(nn.Module):
     """Causal decoder over the context cache -> cis-token."""
 
-    rates: Tensor
-    signs: Tensor
-
     def __init__(self, width: int, hidden: int, heads: int, layers: int, chunk: int, capacity: int) -> None:
         super().__init__()
-        self.chunk, self.capacity = chunk, capacity
-        half = width // heads // 2
-        self.register_buffer("rates", torch.from_numpy(rates(width // heads)), persistent=False)
-        self.register_buffer("signs", torch.ones(2 * half).index_fill(0, torch.arange(half), -1.0), persistent=False)
+        self.chunk, self.capacity, self.head_width = chunk, capacity, width // heads
         self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(layers))
         self.norm = LayerNorm(width)
 
     def _layers(self) -> list[ContextLayer]:
         return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
-
-    def rotary(self, chunks: Tensor) -> Tensor:
-        """`rotary.rotary` as a tensor."""
-        angles = chunks[:, None] * self.rates
-        return torch.stack([angles.cos(), angles.sin() * self.signs]).float()
 
     def forward(self, summaries: Tensor) -> Tensor:
         """Summaries (B, T, D) of every frame from the start of a stream -> cis-tokens (B, T, D).
@@ -219,9 +212,10 @@ class LongRange(nn.Module):
         whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
         behind = of[:, None] - of[whole]
         seen = (behind > 0) & (behind < self.capacity)  # (T, S)
-        rotary, x = self.rotary(of), summaries
+        x, turned = summaries, torch.from_numpy(rotary(of.numpy(force=True), self.head_width))
+        turned = turned.transpose(0, 1).to(x.device)
         for layer in self._layers():
-            own = layer.project(x, rotary)
+            own = layer.project(x, turned)
             x = layer(x, own, (own[1][:, :, whole], own[2][:, :, whole]), seen)
         out: Tensor = self.norm(x)
         return out
@@ -252,3 +246,132 @@ def _rotated(x: Tensor, rotary: Tensor) -> Tensor:
     first, second = x.chunk(2, dim=-1)
     cosine, sine = rotary.unbind(0)
     return torch.addcmul(x * cosine, torch.cat([second, first], dim=-1), sine)
+
+
+# --- Conversation states understanding (3.3) --------------------------------------------------------------------------
+#
+# Which of seven states the agent is in, and a feature of it. Voice activity alone has four patterns; which state a
+# pattern means depends on the conversation (figure 3):
+#
+#     agent    user     states
+#     speaks   silent   speaking
+#     speaks   speaks   receiving feedback, interrupted
+#     silent   speaks   listening, giving feedback
+#     silent   silent   thinking (its own pause), waiting (the other's)
+#
+# The figure itself is not in the text at hand; giving feedback, where it is a word and not a nod, is speech of both.
+# The paper's stream continues from its most probable state. A listener with events departs from it twice, see
+# `sojourns`.
+
+
+class StateUnderstanding(Part):
+    """The previous state asks voice activity and cis-token what the state is now.
+
+    With events its states are `EVENT_STATES`, and it also has what is known of them from the data: `durations` (7, 33),
+    quantiles of how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for those that there are while
+    agent and user are silent or speak.
+    """
+
+    durations: Tensor
+    possible: Tensor
+
+    def __init__(self, width: int, hidden: int, heads: int, events: bool = False) -> None:
+        super().__init__()
+        states = len(EVENT_STATES if events else STATES)
+        if events:
+            self.register_buffer("durations", torch.ones(len(STATES), QUANTILES))
+            self.register_buffer("possible", torch.ones(2, 2, len(STATES)))
+        self.previous = nn.Embedding(states, width)
+        self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
+        self.look = CrossAttention(width, hidden, heads, slots=3)
+        self.norm = LayerNorm(width)
+        self.classify = Linear(width, states)
+
+    def condition(self, cis: Tensor, voiced: Tensor) -> Tensor:
+        """cis (N, D), voiced (N, 2) bool: agent now, user one frame before -> keys (N, 3, 2D)."""
+        told = torch.where(voiced[..., None], self.voices[:, 1], self.voices[:, 0])  # (N, 2, D)
+        return self.look.keys(torch.cat([told, cis[:, None]], dim=1))
+
+    def forward(self, keys: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
+        """`condition` (N, 3, 2D) and previous states (N,) -> state feature (N, D) and logits (N, S) of S states."""
+        feature = self.norm(self.look(self.previous(previous), keys))
+        return feature, self.classify(feature)
+
+    def roll(self, keys: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        """Every frame's own answer becomes the next one's question: as a stream runs.
+
+        keys (B, T, 3, 2D), first (B,) -> features (B, T, D), logits (B, T, S).
+        """
+        features, logits, state = [], [], first
+        for frame in keys.unbind(dim=1):
+            feature, scores = self(frame, state)
+            state = scores.argmax(-1)
+            features.append(feature)
+            logits.append(scores)
+        return torch.stack(features, dim=1), torch.stack(logits, dim=1)
+
+
+# --- Progressive motion prediction (3.4) ------------------------------------------------------------------------------
+#
+# Coarse motion from sound, fine motion from context and state, continuity. The outcome z conditions the sampler of
+# the final motion (`sampler`).
+
+
+class Progressive(Part):
+    """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions.
+
+    What happens (`events`, beyond the paper) is one token more of the second.
+    """
+
+    def __init__(
+        self, width: int, hidden: int, heads: int, sounds: int, motions: int, states: bool, events: bool = False
+    ) -> None:
+        super().__init__()
+        self.coarse = CrossAttention(width, hidden, heads, sounds)
+        self.fine = CrossAttention(width, hidden, heads, 2 + states + events)
+        self.temporal = CrossAttention(width, hidden, heads, motions)
+        self.norm = LayerNorm(width)
+
+    def forward(
+        self,
+        last: Tensor,
+        sound_keys: Tensor,
+        motion_keys: Tensor,
+        sound: Tensor,
+        cis: Tensor,
+        state: Tensor | None,
+        events: Tensor | None = None,
+    ) -> Tensor:
+        """`coarse` motion, then `refine`: everything of the frame to be made, N of them.
+
+        `last` (N, D) is the embedded motion of the frame before: the query of the coarse motion. `sound_keys`
+        (N, 3, 2D) are `coarse.keys` of the agent's sounds, the newest that of the frame itself. The rest: `refine`.
+        """
+        return self.refine(self.coarse(last, sound_keys), motion_keys, sound, cis, state, events)
+
+    def refine(
+        self,
+        outline: Tensor,
+        motion_keys: Tensor,
+        sound: Tensor,
+        cis: Tensor,
+        state: Tensor | None,
+        events: Tensor | None = None,
+    ) -> Tensor:
+        """Fine motion.
+
+        Args:
+            outline: (N, D) coarse motion.
+            motion_keys: (N, 5, 2D) `temporal.keys` of the agent's motions before the frame.
+            sound: (N, D) embedded sound of the agent in the frame itself.
+            cis: (N, D).
+            state: (N, D) feature, or None without state guidance.
+            events: (N, D) embedded control rows, or None without events.
+
+        Returns:
+            z (N, D).
+        """
+        tokens = [token for token in (cis, state, sound, events) if token is not None]
+        x = self.fine(outline, self.fine.keys(torch.stack(tokens, dim=1)))
+        out: Tensor = self.norm(self.temporal(x, motion_keys))
+        return out
