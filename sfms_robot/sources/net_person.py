@@ -24,8 +24,7 @@ from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.origin import token_admits
-from sfms_robot.sources.net_clock import SenderClock
-from sfms_robot.sources.net_intake import Intake
+from sfms_robot.sources.net_intake import Intake, SenderClock
 from sfms_robot.sources.net_messages import (
     FEEDS,
     MICROPHONE,

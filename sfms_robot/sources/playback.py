@@ -1,7 +1,7 @@
 """The robot's own voice, played: `--play [DEVICE]`, on a loudspeaker in a process of its own (`playback_worker`).
 
 Who plays it knows when it sounds. What is said at a time leaves the loudspeaker `delay_s` later, by the device's own
-time stamps (`playout`), and that is what everybody beside it is told: the listener's lips, the state of the run and
+time stamps (`Playout`), and that is what everybody beside it is told: the listener's lips, the state of the run and
 the echo canceller go by what leaves, not by when it was handed over. What did not leave is silence for them too.
 """
 
@@ -18,8 +18,7 @@ import numpy as np
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.sources.microphone import sound_devices
-from sfms_robot.sources.playback_worker import FLAG, PlaybackOpened, Speech, play
-from sfms_robot.sources.playout import Silence
+from sfms_robot.sources.playback_worker import FLAG, PlaybackOpened, Silence, Speech, play
 from sfms_robot.sources.sound_devices import choose_device
 from sfms_robot.sources.spoken import Spoken
 from sfms_robot.sources.worker import SourceWorker
