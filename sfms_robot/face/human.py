@@ -135,6 +135,14 @@ def _rotated(points: NDArray[np.floating], turns: NDArray[np.floating]) -> NDArr
     return np.stack([x, y, z], axis=1)
 
 
+def grid_triangles(rings: int, spokes: int) -> NDArray[np.int64]:
+    """Rings from the top down, spokes counterclockwise seen from above -> triangles that face outward."""
+    ring, spoke = np.meshgrid(np.arange(rings - 1), np.arange(spokes), indexing="ij")
+    a, b = ring * spokes + spoke, ring * spokes + (spoke + 1) % spokes
+    c, d = a + spokes, b + spokes
+    return np.concatenate([np.stack([a, c, d], axis=-1).reshape(-1, 3), np.stack([a, d, b], axis=-1).reshape(-1, 3)])
+
+
 # --- brows ------------------------------------------------------------------------------------------------------
 
 

@@ -13,8 +13,7 @@ from typing import Any, Final
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Sighting
 from sfms_robot.signals.quantiles import Quantiles
-from sfms_robot.sources.face_argument import parse_face_argument
-from sfms_robot.sources.live_face import LiveFace
+from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 from sfms_robot.sources.webcam_worker import Opened, Seen, watch
 from sfms_robot.sources.worker import SourceWorker
 
