@@ -159,9 +159,9 @@ def _collar(around: int = 64) -> tuple[Floats, NDArray[np.int64]]:
 def save(vtk: Any, window: Any, file: Path | str) -> None:
     if not Path(file).parent.is_dir():
         raise ConfigError(f"{file}: cannot be written: no folder {Path(file).parent}")
-    writer = vtk.PNGWriter()
+    image, writer = _image(vtk, window), vtk.PNGWriter()  # an output port does not keep its filter alive
     writer.SetFileName(str(file))
-    writer.SetInputConnection(_image(vtk, window).GetOutputPort())
+    writer.SetInputConnection(image.GetOutputPort())
     writer.Write()
 
 

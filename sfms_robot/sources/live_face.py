@@ -108,14 +108,11 @@ class LiveFace:
             seen_s, newest, place_m = seen[-1]
             motion = newest.copy()
             motion[_BLINKS] = np.max([each[_BLINKS] for _, each, _ in seen], axis=0)
-            self._sighting = Sighting(self._face(seen_s, motion), place_m=place_m)
+            motion[POSE] *= self._signs
+            # Learned in monotonic time: a start does not tear it apart.
+            motion, self._neutral = relative_to_rest(motion, seen_s, self._neutral)
+            self._sighting = Sighting(FaceFrame.of(seen_s - self._origin_s, motion), place_m=place_m)
         return self._sighting
-
-    def _face(self, seen_s: float, motion: Floats) -> FaceFrame:
-        motion[POSE] *= self._signs
-        # Learned in monotonic time: a start does not tear it apart.
-        motion, self._neutral = relative_to_rest(motion, seen_s, self._neutral)
-        return FaceFrame.of(seen_s - self._origin_s, motion)
 
 
 # --- a person's face at rest, learned while they are seen ---------------------------------------------------------

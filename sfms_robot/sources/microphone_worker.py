@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import queue
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Final
@@ -22,20 +22,19 @@ from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.signals.own_voice_gate import OwnVoiceGate
 from sfms_robot.sources.live_voice import LiveVoice
 from sfms_robot.sources.sound_devices import (
+    BLOCK_S,
+    DeviceStream,
     SoundDevice,
-    accepted_format,
     choose_device,
+    listed_devices,
     portaudio,
-    recording_devices,
-    why_not_opened,
+    started_stream,
 )
 
 LOST_S: Final = 0.2
 STATISTICS_S: Final = 1.0
 _ALIVE_S: Final = 0.1
-_BLOCK_S: Final = 0.01
 _LATENCY_S: Final = 0.06  # asked of the device; with less, a sound server's stream seldom starts
-_STARTS: Final = 20  # a stream of ALSA's plugin for sound servers may never start: it is opened again
 _START_LIMIT_S: Final = 0.3
 _OLDEST_S: Final = 1.0  # a time stamp that is further away is of another clock
 _DENORMAL: Final = np.finfo(np.float32).tiny  # what is smaller costs four times the processor
@@ -127,7 +126,7 @@ def listen(recording: Recording) -> Generator[Message | None, Told | None, None]
         before: Told | None = None
         said_s = next_statistics_s = 0.0
         while True:
-            mic.pass_on(front_end.mic, 2 * _BLOCK_S)
+            mic.pass_on(front_end.mic, 2 * BLOCK_S)
             if said is not None and isinstance(reference, LiveVoice):
                 said.pass_on(reference, 0.0)
             if told is not None and told is not before:
@@ -147,7 +146,7 @@ def listen(recording: Recording) -> Generator[Message | None, Told | None, None]
                 told, said_s = (yield message), now_s
 
 
-class Capture:
+class Capture(DeviceStream):
     """A device that records into a queue, by callbacks in a thread of PortAudio's.
 
     Attributes:
@@ -155,22 +154,16 @@ class Capture:
     """
 
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
-        self.device, self.rate_hz, self.channels = device, rate_hz, channels
+        super().__init__(device, rate_hz, channels)
         self.overflows = 0
         self._pieces: queue.SimpleQueue[tuple[Floats, float, bool]] = queue.SimpleQueue()
         self._heard_s = time.monotonic()
-        self._stream: Any = None
 
     def start(self) -> bool:
         """Open the stream; whether it records. Raises PortAudio's errors."""
         import sounddevice
 
-        with self.device.selected():
-            self._stream = sounddevice.InputStream(
-                device=self.device.number, samplerate=self.rate_hz, channels=self.channels, dtype="float32",
-                blocksize=round(self.rate_hz * _BLOCK_S), latency=_LATENCY_S, callback=self._called,
-            )  # fmt: skip
-            self._stream.start()
+        self._open(sounddevice.InputStream, _LATENCY_S, self._called)
         try:
             self._pieces.get(timeout=_START_LIMIT_S)
         except queue.Empty:
@@ -193,18 +186,6 @@ class Capture:
             if time.monotonic() - self._heard_s > LOST_S:
                 raise PortError(f"{self.device.name} gives no more sound") from None
 
-    def close(self) -> None:
-        if self._stream is not None:
-            self._stream.abort()
-            self._stream.close()
-            self._stream = None
-
-    def __enter__(self) -> Capture:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
         now_s = self._heard_s = time.monotonic()
         adc_age_s = stamp.currentTime - stamp.inputBufferAdcTime if stamp.inputBufferAdcTime else None
@@ -224,26 +205,18 @@ def captured_s(now_s: float, first_age_s: float | None, length_s: float) -> floa
 
 
 def open_capture(wanted: str, flag: str) -> Capture:
-    """The device that is wanted, recording: at 16 kHz and mono where it takes that, else as it is.
+    """Open the device that is wanted, recording: at 16 kHz and mono where it takes that, else as it is.
 
     Blocks until sound comes, some tenths of a second. Raises ConfigError, PortError; see `listen`.
     """
     sounddevice = portaudio(flag)
-    devices = recording_devices(flag)
+    devices = listed_devices(flag, "source")
     device = choose_device(devices, wanted, flag)
-    try:
-        rate_hz, channels = accepted_format(device, (1, device.channels), sounddevice.check_input_settings)
-        for _ in range(_STARTS):
-            capture = Capture(device, rate_hz, channels)
-            if capture.start():
-                return capture
-    except sounddevice.PortAudioError as error:
-        raise PortError(f"{flag}: {device.name} cannot be opened, {why_not_opened(error)}") from error
-    raise PortError(f"{flag}: {device.name} is open, but gives no sound ({_others(devices, device)})")
-
-
-def _others(devices: Sequence[SoundDevice], device: SoundDevice) -> str:
-    return ", ".join(each.label for each in devices if each is not device) or "there is no other"
+    capture = started_stream(Capture, device, (1, device.channels), sounddevice.check_input_settings, flag)
+    if capture is None:
+        others = ", ".join(each.label for each in devices if each is not device) or "there is no other"
+        raise PortError(f"{flag}: {device.name} is open, but gives no sound ({others})")
+    return capture
 
 
 # --- from what is recorded to what a person said, on the grid of the loop -----------------------------------------

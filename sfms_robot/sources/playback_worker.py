@@ -22,21 +22,19 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.signals.interpolation import at_positions
 from sfms_robot.sources.drift import SampleClock
 from sfms_robot.sources.sound_devices import (
+    DeviceStream,
     SoundDevice,
-    accepted_format,
     choose_device,
-    playing_devices,
+    listed_devices,
     portaudio,
-    why_not_opened,
+    started_stream,
 )
 
 FLAG: Final = "--play"
 LOST_S: Final = 0.5  # a busy computer is none that is gone
 STATISTICS_S: Final = 1.0
 TURN_S: Final = 0.02  # between two looks at what the parent tells
-_BLOCK_S: Final = 0.01
 _LATENCY_S: Final = 0.05  # asked of the device: what is on its way out cannot be hushed any more
-_STARTS: Final = 20  # a stream of ALSA's plugin for sound servers may never start: it is opened again
 _START_LIMIT_S: Final = 1.0
 _MEASURED_BLOCKS: Final = 20  # that tell how late the device is
 _LATEST_S: Final = 2.0  # a time stamp that is further away is of another clock
@@ -111,27 +109,21 @@ def play(wanted: str) -> Generator[Message | None, Speech | None, None]:
                 time.sleep(TURN_S)
 
 
-class PlaybackStream:
+class PlaybackStream(DeviceStream):
     """A device that plays what a `Playout` gives, by callbacks in a thread of PortAudio's."""
 
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
-        self.device, self.rate_hz, self.channels = device, rate_hz, channels
+        super().__init__(device, rate_hz, channels)
         self.playout = Playout(rate_hz)
         self._latencies_s: list[float] = []
         self._measured = Event()
         self._called_s = time.monotonic()
-        self._stream: Any = None
 
     def start(self) -> bool:
         """Open the stream; whether it plays. Raises PortAudio's errors."""
         import sounddevice
 
-        with self.device.selected():
-            self._stream = sounddevice.OutputStream(
-                device=self.device.number, samplerate=self.rate_hz, channels=self.channels, dtype="float32",
-                blocksize=round(self.rate_hz * _BLOCK_S), latency=_LATENCY_S, callback=self._called,
-            )  # fmt: skip
-            self._stream.start()
+        self._open(sounddevice.OutputStream, _LATENCY_S, self._called)
         if not self._measured.wait(_START_LIMIT_S):
             self.close()
             return False
@@ -145,18 +137,6 @@ class PlaybackStream:
         """Raises PortError when it went away."""
         if time.monotonic() - self._called_s > LOST_S:
             raise PortError(f"{self.device.name} takes no more sound")
-
-    def close(self) -> None:
-        if self._stream is not None:
-            self._stream.abort()
-            self._stream.close()
-            self._stream = None
-
-    def __enter__(self) -> PlaybackStream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _called(self, out: Floats, n: int, stamp: Any, status: Any) -> None:
         now_s = self._called_s = time.monotonic()
@@ -176,22 +156,17 @@ def leaves_after_s(ahead_s: float | None, usual_s: float) -> float:
 
 
 def open_loudspeaker(wanted: str) -> PlaybackStream:
-    """The device that is wanted, playing silence: at 16 kHz and mono where it takes that, else as it is.
+    """Open the device that is wanted, playing silence: at 16 kHz and mono where it takes that, else as it is.
 
     Blocks until it is known how late it is, some tenths of a second. Raises ConfigError, PortError; see `play`.
     """
     sounddevice = portaudio(FLAG)
-    device = choose_device(playing_devices(FLAG), wanted, FLAG, plays=True)
-    try:
-        counts = (1, min(_PLAYED, device.channels), device.channels)
-        rate_hz, channels = accepted_format(device, counts, sounddevice.check_output_settings)
-        for _ in range(_STARTS):
-            stream = PlaybackStream(device, rate_hz, channels)
-            if stream.start():
-                return stream
-    except sounddevice.PortAudioError as error:
-        raise PortError(f"{FLAG}: {device.name} cannot be opened, {why_not_opened(error)}") from error
-    raise PortError(f"{FLAG}: {device.name} is open, but takes no sound")
+    device = choose_device(listed_devices(FLAG, "sink"), wanted, FLAG, plays=True)
+    counts = (1, min(_PLAYED, device.channels), device.channels)
+    stream = started_stream(PlaybackStream, device, counts, sounddevice.check_output_settings, FLAG)
+    if stream is None:
+        raise PortError(f"{FLAG}: {device.name} is open, but takes no sound")
+    return stream
 
 
 # --- from what is said, in frames of the loop, to what the device is handed ---------------------------------------

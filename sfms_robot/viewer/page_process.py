@@ -18,9 +18,8 @@ import select
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
@@ -186,12 +185,8 @@ class PageProcess:
         assert pipe is not None
         with pipe:
             while (message := read_message(pipe)) is not None:
-                kind, visitor, data = message
                 self._alive = True
-                if kind == PERSON:
-                    self._heed(visitor, partial(_person, visitor, data))
-                else:
-                    self._told(visitor, orjson.loads(data))
+                self._take(*message)
         self.visitors = 0
         if not self._closing:
             self._problem = self._problem or PortError("--view: the page's process died")
@@ -199,7 +194,11 @@ class PageProcess:
                 log.warning("the page is away: its process died (exit code %s); the run goes on", self._process.wait())
         self._bound.set()
 
-    def _told(self, visitor: int, told: Mapping[str, Any]) -> None:
+    def _take(self, kind: int, visitor: int, data: bytes) -> None:
+        if kind == PERSON:
+            self._heed(visitor, lambda asked: asked.person(visitor, data))
+            return
+        told = orjson.loads(data)
         if "bound" in told:
             self.url, self.token, self.taken = told["bound"], told["token"], told["taken"]
             self._bound.set()
@@ -229,10 +228,6 @@ class PageProcess:
 def packed_message(kind: int, visitor: int, data: bytes) -> bytes:
     """With its header."""
     return HEADER.pack(len(data), kind, visitor) + data
-
-
-def _person(visitor: int, message: bytes, asked: Asked) -> None:
-    asked.person(visitor, message)
 
 
 def read_message(pipe: IO[bytes]) -> tuple[int, int, bytes] | None:
