@@ -103,7 +103,7 @@ def _packed(facts: dict[str, object], arrays: list[tuple[str, NDArray[np.generic
 
 
 def _morphs(head: HumanHead, count: int) -> tuple[list[dict[str, object]], list[tuple[str, NDArray[np.generic]]]]:
-    """What is told of each morph, and two arrays: the vertices that each moves, and by how much."""
+    """Return the facts of each morph, and two arrays: the vertices that each moves, and by how much."""
     told: list[dict[str, object]] = []
     vertices, steps = [], []
     for name, delta in zip(BLENDSHAPES, head.deltas[:, :count], strict=True):

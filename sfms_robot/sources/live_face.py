@@ -57,7 +57,7 @@ class FaceArgument:
 
 
 def parse_face_argument(kind: str, argument: str) -> FaceArgument:
-    """What stands behind `KIND:`. Raises ConfigError for another option and a channel that is none."""
+    """Return the parsed text behind `KIND:`. Raises ConfigError for another option, and for an unknown channel."""
     place, flip = argument, ()
     while option := _OPTION.search(place):
         name, value = option.groups()
