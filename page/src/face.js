@@ -41,7 +41,7 @@ export class FaceTracker {
 /**
  * MediaPipe's 4 x 4 (columns first; x to the picture's right, y up, z to the camera; centimetres) -> roll, pitch, yaw
  * [rad], x, y, z [m] of the person's head in its own axes: x forward (from the lens on, so negative), y to its left, z
- * up. The same as sfms_robot/sources/mediapipe_face.py.
+ * up. The same as sfms_robot/sources/webcam_worker.py.
  */
 export function poseOf(m) {
   const r = (row, column) => m[4 * column + row];

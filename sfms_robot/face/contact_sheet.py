@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from sfms_robot.face.drawing import BACKGROUND, add_head, add_renderer, load_vtk, look, open_window, save
-from sfms_robot.face.hair_and_collar import with_hair
+from sfms_robot.face.drawing import BACKGROUND, add_head, add_renderer, add_text, load_vtk, look, open_window, save
 from sfms_robot.face.human import HumanHead, load_human
+from sfms_robot.face.human_mesh import with_hair
 from sfms_robot.face.robot_drawing import add_robot
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import CHANNEL_INDEX, Doubles, Floats
@@ -30,7 +30,6 @@ _CAPTION_PX: Final = 58
 _GAP_PX: Final = 8
 _TITLE_PX: Final = 62
 _PAPER: Final = (1.0, 1.0, 1.0)
-_INK: Final = (0.16, 0.17, 0.20)
 _FAINT: Final = (0.45, 0.46, 0.49)
 _ACCENT: Final = (0.10, 0.38, 0.55)
 
@@ -165,7 +164,7 @@ def render_sheet(
     size = (_COLUMNS * wide + _GAP_PX, -(-len(instants) // _COLUMNS) * high + _TITLE_PX)
     window, head = open_window(vtk, size), with_hair(load_human())
     paper = add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
-    _text(vtk, paper, title, (_GAP_PX + 4, size[1] - 42), 24, _INK, bold=True)
+    add_text(vtk, paper, title, (_GAP_PX + 4, size[1] - 42), 24).SetBold(True)
     for index, instant in enumerate(instants):
         left = _GAP_PX + index % _COLUMNS * wide
         low = size[1] - _TITLE_PX - index // _COLUMNS * high - cell_high
@@ -178,17 +177,11 @@ def render_sheet(
         if robot is not None:
             scene, angles_rad = robot
             add_robot(vtk, cell(widths[0], sum(widths)), scene, scene.values(angles_rad[instant.row]))
-        _text(vtk, paper, f"{instant.time_s:.2f} s", (left + 4, low - 26), 19, _INK, bold=True)
-        _text(vtk, paper, instant.label, (left + 96, low - 26), 19, _ACCENT, bold=instant.label != "-")
+        add_text(vtk, paper, f"{instant.time_s:.2f} s", (left + 4, low - 26), 19).SetBold(True)
+        add_text(vtk, paper, instant.label, (left + 96, low - 26), 19, _ACCENT).SetBold(instant.label != "-")
         if talking is not None:
-            _text(
-                vtk,
-                paper,
-                "speaker talks" if talking[instant.row] else "speaker silent",
-                (left + 4, low - 46),
-                14,
-                _FAINT,
-            )
+            text = "speaker talks" if talking[instant.row] else "speaker silent"
+            add_text(vtk, paper, text, (left + 4, low - 46), 14, _FAINT)
     save(vtk, window, file)
     return instants
 
@@ -197,17 +190,3 @@ def _add_portrait(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> N
     """The head, seen from a little to its left."""
     add_head(vtk, renderer, head, motion)
     look(renderer, (1.07, 0.36, 0.07), (0.012, 0.0, 0.020), 17.4)
-
-
-def _text(
-    vtk: Any, renderer: Any, text: str, place_px: tuple[int, int], size_px: int, color: Any, bold: bool = False
-) -> None:
-    actor = vtk.TextActor()
-    actor.SetInput(text)
-    actor.SetPosition(*place_px)
-    style = actor.GetTextProperty()
-    style.SetFontFamilyToArial()
-    style.SetFontSize(size_px)
-    style.SetColor(*color)
-    style.SetBold(bold)
-    renderer.AddViewProp(actor)

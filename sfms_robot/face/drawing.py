@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,11 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError, MissingExtra
-from sfms_robot.face.human import HumanHead
-from sfms_robot.frames import Floats
+from sfms_robot.face.human import HumanHead, grid_triangles, load_human
+from sfms_robot.frames import Doubles, Floats
 
+INK: Final = (0.16, 0.17, 0.20)
 BACKGROUND: Final = (0.905, 0.915, 0.925)
+PLACE_M: Final = (0.6, 0.0, 0.0)  # of the virtual webcam's person: arm's length, in the middle of the picture
+ANGLE_DEG: Final = 45.0  # across the picture's height: a common webcam
+SIZE_PX: Final = (640, 480)
+_EYES_M: Final = (0.09, 0.0, 0.032)  # of the head at rest
 _COLLAR: Final = (0.23, 0.29, 0.36)
+
+Point = Sequence[float] | Doubles  # x, y, z
 
 
 def load_vtk() -> Any:
@@ -55,7 +63,7 @@ def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], 
 
 
 def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
-    """The head at one instant, its collar and three lights."""
+    """Add the head at one instant, its collar and three lights."""
     skin = _actor(vtk, head.vertices(motion), head.triangles)
     colors = vtk.arrays.numpy_to_vtk(head.colors, deep=True)
     skin.GetMapper().GetInput().GetPointData().SetScalars(colors)
@@ -66,19 +74,34 @@ def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
     collar.GetProperty().SetColor(*_COLLAR)
     renderer.AddActor(collar)
     for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
-        light = vtk.Light()
-        light.SetLightTypeToSceneLight()
-        light.SetPosition(*place)
-        light.SetFocalPoint(0, 0, 0)
-        light.SetIntensity(strength)
-        renderer.AddLight(light)
+        add_light(vtk, renderer, place, (0, 0, 0), strength)
 
 
-Point = tuple[float, float, float]
+def add_light(vtk: Any, renderer: Any, place: Point, towards: Point, strength: float) -> None:
+    """Light the scene from one place."""
+    light = vtk.Light()
+    light.SetLightTypeToSceneLight()
+    light.SetPosition(*place)
+    light.SetFocalPoint(*towards)
+    light.SetIntensity(strength)
+    renderer.AddLight(light)
+
+
+def add_text(vtk: Any, renderer: Any, text: str, place_px: tuple[int, int], size_px: int, color: Any = INK) -> Any:
+    """Write a line of text from `place_px` on, and return its style."""
+    actor = vtk.TextActor()
+    actor.SetInput(text)
+    actor.SetPosition(*place_px)
+    style = actor.GetTextProperty()
+    style.SetFontFamilyToArial()
+    style.SetFontSize(size_px)
+    style.SetColor(*color)
+    renderer.AddViewProp(actor)
+    return style
 
 
 def look(renderer: Any, from_m: Point, to_m: Point, angle_deg: float) -> None:
-    """The camera, in the axes of the head at rest; `angle_deg` is what it sees across the height of the picture."""
+    """Place the camera, in the axes of the scene; `angle_deg` is what it sees across the height of the picture."""
     camera = renderer.GetActiveCamera()
     camera.SetViewAngle(angle_deg)
     camera.SetFocalPoint(*to_m)
@@ -130,23 +153,54 @@ def _collar(around: int = 64) -> tuple[Floats, NDArray[np.int64]]:
         np.stack([x + depth * np.cos(angle), width * np.sin(angle), z - 0.012 * np.cos(angle)], axis=1)
         for x, z, width, depth in rings
     ]
-    here = np.arange(around)
-    there = (here + 1) % around
-    triangles = []
-    for ring in range(len(rings) - 1):
-        a, b = ring * around, (ring + 1) * around
-        triangles += [np.stack([a + here, b + here, b + there], axis=1)]
-        triangles += [np.stack([a + here, b + there, a + there], axis=1)]
-    return np.concatenate(points).astype(np.float32), np.concatenate(triangles)
+    return np.concatenate(points).astype(np.float32), grid_triangles(len(rings), around)
 
 
 def save(vtk: Any, window: Any, file: Path | str) -> None:
     if not Path(file).parent.is_dir():
         raise ConfigError(f"{file}: cannot be written: no folder {Path(file).parent}")
-    window.Render()
-    image, writer = vtk.WindowToImageFilter(), vtk.PNGWriter()
-    image.SetInput(window)
-    image.ReadFrontBufferOff()
+    image, writer = _image(vtk, window), vtk.PNGWriter()  # an output port does not keep its filter alive
     writer.SetFileName(str(file))
     writer.SetInputConnection(image.GetOutputPort())
     writer.Write()
+
+
+def _image(vtk: Any, window: Any) -> Any:
+    """Render, and return the filter that gives the picture."""
+    window.Render()
+    image = vtk.WindowToImageFilter()
+    image.SetInput(window)
+    image.ReadFrontBufferOff()
+    return image
+
+
+class VirtualWebcam:
+    """A camera with the virtual human before it: pictures with a known face, to try what reads faces from pictures.
+
+    The person looks straight ahead at rest. Raises MissingExtra without vtk.
+    """
+
+    def __init__(self, size_px: tuple[int, int] = SIZE_PX, angle_deg: float = ANGLE_DEG) -> None:
+        self._vtk = load_vtk()
+        self._window, self._angle_deg = open_window(self._vtk, size_px), angle_deg
+        self._human = load_human()
+
+    def picture(self, motion: Floats, place_m: tuple[float, float, float] = PLACE_M) -> NDArray[np.uint8]:
+        """(H, W, 3) red, green, blue, not mirrored.
+
+        motion: (58,) of the person. place_m: the eyes at rest, from the camera: x out of its lens, y to its left, z up;
+        the lens looks straight along its x, and the person along the same line towards it.
+        """
+        vtk = self._vtk
+        renderer = add_renderer(vtk, self._window, (0, 0, 1, 1), BACKGROUND)
+        add_head(vtk, renderer, self._human, motion)
+        # The person looks the other way: their left is the camera's right.
+        away, left, up = place_m
+        lens = (_EYES_M[0] + away, _EYES_M[1] + left, _EYES_M[2] - up)
+        look(renderer, lens, (lens[0] - 1.0, lens[1], lens[2]), self._angle_deg)
+        image = _image(vtk, self._window)
+        image.Update()
+        self._window.RemoveRenderer(renderer)
+        wide, high = self._window.GetSize()
+        flat = vtk.arrays.vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
+        return np.ascontiguousarray(flat.reshape(high, wide, 3)[::-1])

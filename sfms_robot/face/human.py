@@ -87,7 +87,10 @@ def load_human(folder: Path | None = None) -> HumanHead:
     except (OSError, KeyError, ValueError, IndexError) as error:
         raise ConfigError(f"{file}: not a head with the 52 ARKit morphs: {error}") from error
     shown = triangles[~_lower_lashes(rest, colors)[triangles].any(axis=1)]
-    return _with_brows(HumanHead(rest, deltas, share_of_rotation(rest), shown, _painted(rest, colors)))
+    head = HumanHead(rest, deltas, share_of_rotation(rest), shown, _painted(rest, colors))
+    for side in (1.0, -1.0):
+        head = _with_ribbon(head, *_brow_outline(side))
+    return head
 
 
 def parts_of(colors: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -135,13 +138,15 @@ def _rotated(points: NDArray[np.floating], turns: NDArray[np.floating]) -> NDArr
     return np.stack([x, y, z], axis=1)
 
 
+def grid_triangles(rings: int, spokes: int) -> NDArray[np.int64]:
+    """Rings from the top down, spokes counterclockwise seen from above -> triangles that face outward."""
+    ring, spoke = np.meshgrid(np.arange(rings - 1), np.arange(spokes), indexing="ij")
+    a, b = ring * spokes + spoke, ring * spokes + (spoke + 1) % spokes
+    c, d = a + spokes, b + spokes
+    return np.concatenate([np.stack([a, c, d], axis=-1).reshape(-1, 3), np.stack([a, d, b], axis=-1).reshape(-1, 3)])
+
+
 # --- brows ------------------------------------------------------------------------------------------------------
-
-
-def _with_brows(head: HumanHead) -> HumanHead:
-    for side in (1.0, -1.0):
-        head = _with_ribbon(head, *_brow_outline(side))
-    return head
 
 
 def _brow_outline(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.drawing import BACKGROUND, add_renderer, load_vtk, open_window, save
+from sfms_robot.face.drawing import BACKGROUND, add_light, add_renderer, add_text, load_vtk, look, open_window, save
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.face.urdf import Visual
 from sfms_robot.frames import Doubles
@@ -20,7 +20,6 @@ _DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.2
 _ANGLE_DEG: Final = 24.0
 _ROOM: Final = 1.12  # of a picture, by what it shows
 _LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
-_INK: Final = (0.16, 0.17, 0.20)
 _READERS: Final = {".stl": "STLReader", ".obj": "OBJReader", ".ply": "PLYReader"}
 
 
@@ -45,12 +44,12 @@ def render_robots(
         left, low = index % columns * wide, size[1] - (index // columns + 1) * (high + caption) + caption
         box = (left / size[0], low / size[1], (left + wide) / size[0], (low + high) / size[1])
         add_robot(vtk, add_renderer(vtk, window, box, BACKGROUND), scene, values)
-        _caption(vtk, paper, name, (left + wide // 2, low - caption + 8))
+        add_text(vtk, paper, name, (left + wide // 2, low - caption + 8), 15).SetJustificationToCentered()
     save(vtk, window, file)
 
 
 def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
-    """Every visual in its place, three lights, and the camera before it. Raises ConfigError for a bad mesh.
+    """Add every visual in its place, three lights, and the camera before it. Raises ConfigError for a bad mesh.
 
     The camera stands where it sees all of the robot at rest, so pictures of one robot show how it moves.
     """
@@ -59,20 +58,11 @@ def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> No
     bounds = np.array(at_rest.ComputeVisiblePropBounds()).reshape(3, 2)
     _add_visuals(vtk, renderer, scene, values)
     middle, size = bounds.mean(axis=1), float(np.linalg.norm(np.ptp(bounds, axis=1)))
-    camera = renderer.GetActiveCamera()
-    camera.SetViewAngle(_ANGLE_DEG)
-    camera.SetFocalPoint(*middle)
-    camera.SetPosition(*(middle + _distance(bounds, renderer.GetTiledAspectRatio()) * _DIRECTION))
-    camera.SetViewUp(0, 0, 1)
-    renderer.ResetCameraClippingRange()
+    away_m = _distance(bounds, renderer.GetTiledAspectRatio())
+    look(renderer, middle + away_m * _DIRECTION, middle, _ANGLE_DEG)
     renderer.AutomaticLightCreationOff()
     for place, strength in _LIGHTS:
-        light = vtk.Light()
-        light.SetLightTypeToSceneLight()
-        light.SetPosition(*(middle + size * np.array(place)))
-        light.SetFocalPoint(*middle)
-        light.SetIntensity(strength)
-        renderer.AddLight(light)
+        add_light(vtk, renderer, middle + size * np.array(place), middle, strength)
 
 
 def _distance(bounds: Doubles, aspect: float) -> float:
@@ -160,15 +150,3 @@ def _mesh(file: Path) -> Any:
     if reader.GetErrorCode() or not reader.GetOutput().GetNumberOfPoints():
         raise ConfigError(f"{file}: not a mesh that can be read")
     return reader
-
-
-def _caption(vtk: Any, renderer: Any, text: str, place_px: tuple[int, int]) -> None:
-    actor = vtk.TextActor()
-    actor.SetInput(text)
-    actor.SetPosition(*place_px)
-    style = actor.GetTextProperty()
-    style.SetFontFamilyToArial()
-    style.SetFontSize(15)
-    style.SetColor(*_INK)
-    style.SetJustificationToCentered()
-    renderer.AddViewProp(actor)

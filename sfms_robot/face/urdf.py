@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -22,7 +22,9 @@ from sfms_robot.frames import Doubles
 TURNING: Final = ("revolute", "continuous")
 MOVING: Final = (*TURNING, "prismatic")
 _TYPES: Final = (*MOVING, "fixed")
+_XACRO: Final = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
 _GREY: Final = (0.7, 0.7, 0.7, 1.0)
+_ROUND: Final = {"cylinder": ("radius", "length"), "sphere": ("radius",)}  # their sizes
 
 Color = tuple[float, float, float, float]
 
@@ -39,7 +41,7 @@ class Visual:
 
     link: str
     place: Doubles
-    shape: Literal["box", "cylinder", "sphere", "mesh"]
+    shape: str
     size: tuple[float, ...]
     color: Color
     mesh: str = ""
@@ -109,9 +111,7 @@ def read_urdf(file: Path) -> Urdf:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
     except ElementTree.ParseError as error:
         raise ConfigError(f"{file}: not XML: {error}") from error
-    if any(str(element.tag).startswith("{http://www.ros.org/wiki/xacro}") for element in root.iter()) or any(
-        str(element.tag).startswith("{http://ros.org/wiki/xacro}") for element in root.iter()
-    ):
+    if any(str(element.tag).startswith(_XACRO) for element in root.iter()):
         raise ConfigError(f"{file}: a xacro file: make a URDF of it (xacro {file.name} > robot.urdf)")
     if root.tag != "robot":
         raise ConfigError(f"{file}: not a URDF: its first element is <{root.tag}>, not <robot>")
@@ -211,18 +211,15 @@ class _Reader:
                 raise self._wrong("link", name, "has a visual without a geometry")
             place, color = self._origin(visual, where), self._material(visual)
             if shape.tag == "box":
-                size = self._triple(shape, "size", None, where)
-                found.append(Visual(name, place, "box", tuple(size), color))
-            elif shape.tag == "cylinder":
-                radius, length = (self._number(shape, key, None, where) for key in ("radius", "length"))
-                found.append(Visual(name, place, "cylinder", (radius, length), color))
-            elif shape.tag == "sphere":
-                found.append(Visual(name, place, "sphere", (self._number(shape, "radius", None, where),), color))
+                size = tuple(self._triple(shape, "size", None, where))
             elif shape.tag == "mesh":
-                scale = self._triple(shape, "scale", (1.0, 1.0, 1.0), where)
-                found.append(Visual(name, place, "mesh", tuple(scale), color, shape.get("filename", "")))
+                size = tuple(self._triple(shape, "scale", (1.0, 1.0, 1.0), where))
+            elif shape.tag in _ROUND:
+                size = tuple(self._number(shape, key, None, where) for key in _ROUND[shape.tag])
             else:
                 raise self._wrong("link", name, f"has the shape <{shape.tag}>, not box, cylinder, sphere or mesh")
+            mesh = shape.get("filename", "") if shape.tag == "mesh" else ""
+            found.append(Visual(name, place, shape.tag, size, color, mesh))
         return found
 
     def _material(self, visual: Element) -> Color:

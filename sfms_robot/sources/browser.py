@@ -16,8 +16,7 @@ import numpy as np
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import POSE_CHANNELS, Floats, Sighting
 from sfms_robot.sources.live_face import LiveFace
-from sfms_robot.sources.net_clock import SenderClock
-from sfms_robot.sources.net_intake import Intake
+from sfms_robot.sources.net_intake import Intake, SenderClock
 from sfms_robot.sources.net_messages import VOICE, Seen, Sound, parse_message
 from sfms_robot.sources.push import PushedVoice
 

@@ -15,7 +15,6 @@ What the signs of the head's angles mean is in `signals.tracks.SOURCES`.
 
 from __future__ import annotations
 
-import ipaddress
 import struct
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
@@ -25,9 +24,7 @@ import numpy as np
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
 from sfms_robot.signals.tracks import SOURCES
-from sfms_robot.sources.face_argument import parse_endpoint, parse_face_argument
-from sfms_robot.sources.live_face import LiveFace
-from sfms_robot.sources.udp_sight import ANY, DatagramSocket, UdpSight, addresses_of_this_machine, flag_for_others
+from sfms_robot.sources.udp_sight import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
 
 PORT: Final = 11111  # what the app suggests
 VERSION: Final = 6
@@ -190,23 +187,17 @@ class LiveLinkDecoder:
 
 
 def open_live_link(argument: str) -> UdpSight:
-    """`[PORT|HOST[:PORT]][,flip=...]`. This machine alone is heard, unless HOST says otherwise. A phone is another one,
-    so what to type for it is said, and the address that its app is to be given.
+    """Open `--face live-link[:PORT|HOST[:PORT]][,flip=...]`; without HOST only this machine can send.
 
-    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
+    A phone is another one, so the log says what to type for it, and the address for its app. Raises as
+    `open_udp_sight`.
     """
-    given = parse_face_argument("live-link", argument)
-    host, port = parse_endpoint("live-link", given.place, PORT)
-    opened = DatagramSocket("live-link", host, port)
-    return UdpSight("live-link", opened, LiveLinkDecoder(), LiveFace(given.signs), _hint(*opened.address))
+    return open_udp_sight("live-link", argument, PORT, LiveLinkDecoder(), _hint)
 
 
-def _hint(host: str, port: int) -> str:
-    """What to do so that it hears a phone."""
-    only_this = ipaddress.ip_address(host).is_loopback
-    own = addresses_of_this_machine() if only_this or host in ANY else [host]
+def _hint(host: str, port: int, wider: str) -> str:
+    """Return what to do so that packets of a phone arrive."""
+    own = addresses_of_this_machine() if wider or host in ANY else [host]
     target = f"{' or '.join(own) or 'the address of this machine'}, port {port}"
     app = f"in the app, capture mode Live Link (ARKit), enter the target {target}"
-    if not only_this:
-        return app
-    return f"{host}, port {port}, this machine alone; for a phone {flag_for_others('live-link', port, PORT)}, and {app}"
+    return f"{host}, port {port}, this machine alone; for a phone {wider}, and {app}" if wider else app

@@ -15,8 +15,7 @@ import numpy as np
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
 from sfms_robot.ports import Voice
-from sfms_robot.sources.front_end import Heard
-from sfms_robot.sources.microphone_worker import Opened, Recording, Told, listen
+from sfms_robot.sources.microphone_worker import Heard, Opened, Recording, Told, listen
 from sfms_robot.sources.sound_devices import SoundDevice, choose_device, tell_devices
 from sfms_robot.sources.worker import SourceWorker
 

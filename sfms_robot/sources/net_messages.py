@@ -22,7 +22,7 @@ import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,9 @@ class Hello:
 
 @dataclass(frozen=True)
 class Hush:
-    """What the robot has still to say will not be played."""
+    """The robot's remaining speech will not be played."""
+
+    kind: ClassVar[int] = SPEECH
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ class Sound:
 class Seen:
     """A person's face, motion (58,), None: lost; times as of `Sound`."""
 
+    kind: ClassVar[int] = FACE
     sent_s: float
     at_s: float
     motion: Floats | None
@@ -94,7 +97,7 @@ def parse_message(data: bytes) -> Message:
     if version != VERSION:
         raise PacketError(f"a message of version {version}, not {VERSION}")
     if kind not in FEEDS.values() or zero:
-        raise PacketError(f"a message of kind {kind}, which a robot is not sent ({_listed(FEEDS)})")
+        raise PacketError(f"a message of kind {kind}, which a robot is not sent ({', '.join(FEEDS)})")
     if not (math.isfinite(sent_s) and math.isfinite(at_s)):
         raise PacketError("a time that is not finite")
     if at_s and not sent_s:
@@ -165,7 +168,7 @@ def _parse_json(data: bytes) -> Message:
 def _names(told: Mapping[str, Any], key: str, choices: Mapping[str, int] | tuple[str, ...]) -> frozenset[str]:
     given = told.get(key, [])
     if not isinstance(given, list) or not all(isinstance(each, str) and each in choices for each in given):
-        raise PacketError(f"hello: {key} is no list of {_listed(choices)}")
+        raise PacketError(f"hello: {key} is no list of {', '.join(choices)}")
     return frozenset(given)
 
 
@@ -174,10 +177,6 @@ def _text(told: Mapping[str, Any], key: str) -> str:
     if not isinstance(given, str) or len(given) > _LONGEST_NAME or not given.isprintable():
         raise PacketError(f"hello: {key} is no text of up to {_LONGEST_NAME} characters")
     return given
-
-
-def _listed(names: Mapping[str, int] | tuple[str, ...]) -> str:
-    return ", ".join(names)
 
 
 def _sound(kind: int, rate_hz: int, rest: bytes, sent_s: float, at_s: float) -> Sound:

@@ -24,13 +24,11 @@ from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.origin import token_admits
-from sfms_robot.sources.net_clock import SenderClock
-from sfms_robot.sources.net_intake import Intake
+from sfms_robot.sources.net_intake import Intake, SenderClock
 from sfms_robot.sources.net_messages import (
     FEEDS,
     MICROPHONE,
     VERSION,
-    VOICE,
     Hello,
     Hush,
     Message,
@@ -122,19 +120,26 @@ class NetPerson:
     # --- what programs send; in the server's thread ---
 
     def received(self, connection: Connection, message: Message) -> None:
+        """Hand a message to the part that it feeds. Raises PacketError for one that was not announced."""
         if isinstance(message, Hello):
             self._greet(connection, message)
-        elif not connection.greeted:
+            return
+        if not connection.greeted:
             raise PacketError("the first message is no hello")
-        elif isinstance(message, Hush):
-            self._allowed(connection, "speech")
-            speech = self._feeds["speech"]
-            assert isinstance(speech, NetSpeech)
-            speech.hush()
-        elif isinstance(message, Seen):
-            self._see(connection, message)
-        else:
-            self._sound(connection, message)
+        name = next(name for name, kind in FEEDS.items() if kind == message.kind)
+        if self._feeders.get(name) is not connection:
+            raise PacketError(f"{name} was not announced in its hello")
+        self._heard_s[name] = self.now()
+        clock = self._clocks[connection]
+        match self._feeds[name], message:
+            case NetSpeech() as speech, Hush():
+                speech.hush()
+            case NetSpeech() as speech, Sound() as sound:
+                speech.say(sound.samples, sound.rate_hz, self._intake.times(sound, clock)[1])
+            case NetSight() as sight, Seen() as seen:
+                self._intake.see(sight, seen, clock)
+            case NetVoice() as voice, Sound() as sound:
+                self._intake.hear(voice, sound, clock)
 
     def gone(self, connection: Connection) -> None:
         self._clocks.pop(connection, None)
@@ -176,30 +181,6 @@ class NetPerson:
             raise PacketError(f"{name} comes from {feeder.name} already")
         del self._feeders[name]
         feeder.end(f"{name} now comes from {connection.name}: none came for {SILENT_S:g} s")
-
-    def _allowed(self, connection: Connection, name: str) -> None:
-        if self._feeders.get(name) is not connection:
-            raise PacketError(f"{name} was not announced in its hello")
-        self._heard_s[name] = self.now()
-
-    def _see(self, connection: Connection, message: Seen) -> None:
-        self._allowed(connection, "face")
-        sight = self._feeds["face"]
-        assert isinstance(sight, NetSight)
-        self._intake.see(sight, message, self._clocks[connection])
-
-    def _sound(self, connection: Connection, message: Sound) -> None:
-        name = next(name for name, kind in FEEDS.items() if kind == message.kind)
-        self._allowed(connection, name)
-        if message.kind == VOICE:
-            voice = self._feeds[name]
-            assert isinstance(voice, NetVoice)
-            self._intake.hear(voice, message, self._clocks[connection])
-            return
-        speech = self._feeds[name]
-        assert isinstance(speech, NetSpeech)
-        _, at_s = self._intake.times(message, self._clocks[connection])
-        speech.say(message.samples, message.rate_hz, at_s)
 
     def _send_sound(self, audio: Floats, at_s: float) -> None:
         wanting = [each for each in self._server.connections() if "microphone" in each.wants]

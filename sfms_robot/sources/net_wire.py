@@ -8,7 +8,7 @@ serves, or that came from the very address they call, are let in (`origin`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final, Protocol
+from typing import Final
 
 from websockets.exceptions import InvalidHandshake, WebSocketException
 from websockets.frames import CloseCode, Frame, Opcode
@@ -23,52 +23,40 @@ HTTP: Final = b"GET "
 _REASON: Final = 120  # bytes of a closing frame's text
 
 
-class Wire(Protocol):
-    """One connection's form."""
-
-    def push(self, data: bytes) -> Iterator[bytes | None]:
-        """Messages that are whole now; None for what is none but was to be looked at, as a ping.
-
-        Raises PacketError for bytes after which nothing can be read.
-        """
-
-    def packed(self, message: bytes) -> bytes:
-        """A message as it is sent; empty while the other side is not ready for any."""
-
-    def closing(self, reason: str, refused: bool) -> bytes:
-        """What is sent before the connection is closed."""
-
-    def answer(self) -> bytes:
-        """What the form itself has to send: a handshake, a pong."""
-
-    @property
-    def over(self) -> bool:
-        """Whether the other side has said that it ends."""
-
-
 class TcpWire:
-    """Each message behind its length."""
+    """One connection on which each message goes behind its length.
+
+    Attributes:
+        over: the other side has said that it ends.
+    """
 
     over = False
 
     def __init__(self) -> None:
         self._buffer = MessageBuffer()
 
-    def push(self, data: bytes) -> Iterator[bytes]:
+    def push(self, data: bytes) -> Iterator[bytes | None]:
+        """Yield messages that are whole now, and None for what else was to be looked at, such as a ping.
+
+        Raises PacketError for bytes after which nothing can be read.
+        """
         return self._buffer.push(data)
 
     def packed(self, message: bytes) -> bytes:
+        """Return a message as it is sent; empty while the other side is not ready for any."""
         return framed(message)
 
     def closing(self, reason: str, refused: bool) -> bytes:
+        """Return what is sent before the connection is closed."""
         return b""
 
     def answer(self) -> bytes:
+        """Return what the form itself has to send: a handshake, a pong."""
         return b""
 
 
 class WebSocketWire:
-    """A WebSocket (RFC 6455), server's side."""
+    """A WebSocket (RFC 6455), server's side; methods as of `TcpWire`."""
 
     def __init__(self) -> None:
         self._protocol = ServerProtocol(max_size=LONGEST)
@@ -126,6 +114,9 @@ class WebSocketWire:
         else:
             self._protocol.send_response(self._protocol.reject(403, problem + "\n"))
             raise PacketError(problem)
+
+
+Wire = TcpWire | WebSocketWire
 
 
 def _line(error: BaseException) -> str:

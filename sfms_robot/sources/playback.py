@@ -1,7 +1,7 @@
 """The robot's own voice, played: `--play [DEVICE]`, on a loudspeaker in a process of its own (`playback_worker`).
 
 Who plays it knows when it sounds. What is said at a time leaves the loudspeaker `delay_s` later, by the device's own
-time stamps (`playout`), and that is what everybody beside it is told: the listener's lips, the state of the run and
+time stamps (`Playout`), and that is what everybody beside it is told: the listener's lips, the state of the run and
 the echo canceller go by what leaves, not by when it was handed over. What did not leave is silence for them too.
 """
 
@@ -11,15 +11,14 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 import numpy as np
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.sources.microphone import sound_devices
-from sfms_robot.sources.playback_worker import FLAG, PlaybackOpened, Speech, play
-from sfms_robot.sources.playout import Silence
+from sfms_robot.sources.playback_worker import FLAG, PlaybackOpened, Silence, Speech, play
 from sfms_robot.sources.sound_devices import choose_device
 from sfms_robot.sources.spoken import Spoken
 from sfms_robot.sources.worker import SourceWorker
@@ -36,26 +35,11 @@ _FADE: Final = np.linspace(1.0, 0.0, AUDIO_HZ // 200, dtype=np.float32)  # 5 ms:
 _NONE: Final = np.zeros(0, np.float32)
 
 
-class Loudspeaker(Protocol):
-    """What plays: a `SourceWorker` of `playback_worker.play`."""
-
-    @property
-    def lost(self) -> bool: ...
-
-    def tell(self, value: Speech) -> None: ...
-
-    def messages(self, now_s: float) -> Sequence[Any]: ...
-
-    def statistics(self) -> Mapping[str, Any]: ...
-
-    def close(self) -> None: ...
-
-
 class PlayedVoice:
     """`ports.Voice` of what leaves the loudspeaker, of all that `spoken` says. Only `close` blocks.
 
     Args:
-        loudspeaker: its first message is there.
+        loudspeaker: the worker of `playback_worker.play`; its first message has arrived.
         now: `time.monotonic`, or a test's.
 
     Attributes:
@@ -69,7 +53,7 @@ class PlayedVoice:
     latency_s = 0.0
     early_s = EARLY_S
 
-    def __init__(self, loudspeaker: Loudspeaker, spoken: Spoken, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, loudspeaker: SourceWorker, spoken: Spoken, now: Callable[[], float] = time.monotonic) -> None:
         self._loudspeaker, self._spoken, self._now = loudspeaker, spoken, now
         self.device = ""
         self.delay_s = self._device_s = 0.0

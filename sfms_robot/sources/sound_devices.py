@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self, TypeVar
 
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
@@ -22,6 +22,8 @@ from sfms_robot.frames import AUDIO_HZ
 _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
 _HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # numbers that change when something is plugged in
 _PACTL_LIMIT_S: Final = 5.0
+BLOCK_S: Final = 0.01
+_STARTS: Final = 20  # a stream of ALSA's plugin for sound servers may never start: it is opened again
 _VARIABLES: Final = {"source": "PULSE_SOURCE", "sink": "PULSE_SINK"}
 
 
@@ -72,6 +74,68 @@ class SoundDevice:
                 os.environ[variable] = before
 
 
+class DeviceStream:
+    """A stream of PortAudio's on one device. Base of what records and of what plays; closed by its `with` block."""
+
+    def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
+        self.device, self.rate_hz, self.channels = device, rate_hz, channels
+        self._stream: Any = None
+
+    def start(self) -> bool:
+        """Open the stream; return whether sound flows. Raises PortAudio's errors."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close the device. Idempotent."""
+        if self._stream is not None:
+            self._stream.abort()
+            self._stream.close()
+            self._stream = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self, stream: Any, latency_s: float, callback: Any) -> None:
+        """Open and start one of sounddevice's streams."""
+        with self.device.selected():
+            self._stream = stream(
+                device=self.device.number,
+                samplerate=self.rate_hz,
+                channels=self.channels,
+                dtype="float32",
+                blocksize=round(self.rate_hz * BLOCK_S),
+                latency=latency_s,
+                callback=callback,
+            )
+            self._stream.start()
+
+
+Stream = TypeVar("Stream", bound=DeviceStream)
+
+
+def started_stream(
+    kind: type[Stream], device: SoundDevice, channels: Sequence[int], check: Callable[..., None], flag: str
+) -> Stream | None:
+    """Return a stream on which sound flows; None where none does. Arguments as of `accepted_format`.
+
+    Raises PortError for a device that cannot be opened.
+    """
+    import sounddevice
+
+    try:
+        rate_hz, count = accepted_format(device, channels, check)
+        for _ in range(_STARTS):
+            stream = kind(device, rate_hz, count)
+            if stream.start():
+                return stream
+    except sounddevice.PortAudioError as error:
+        raise PortError(f"{flag}: {device.name} cannot be opened, {why_not_opened(error)}") from error
+    return None
+
+
 def portaudio(flag: str) -> ModuleType:
     """The module sounddevice, its library loaded. Raises ConfigError where there is none; `flag` is who needs it."""
     try:
@@ -80,19 +144,6 @@ def portaudio(flag: str) -> ModuleType:
         raise ConfigError(f"{flag} needs PortAudio: sudo apt-get install libportaudio2") from error
     module: ModuleType = sounddevice
     return module
-
-
-def recording_devices(flag: str) -> list[SoundDevice]:
-    """Those there are; blocks for some tenths of a second. PortAudio sees what was there when it was loaded.
-
-    Raises ConfigError without PortAudio.
-    """
-    return _devices(flag, "source")
-
-
-def playing_devices(flag: str) -> list[SoundDevice]:
-    """As `recording_devices`."""
-    return _devices(flag, "sink")
 
 
 def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays: bool = False) -> SoundDevice:
@@ -139,10 +190,15 @@ def why_not_opened(error: Exception) -> str:
 
 def tell_devices(what: Literal["recording", "playing"]) -> Generator[list[SoundDevice], Any, None]:
     """For a `SourceWorker`: PortAudio, which prints what it likes, sees the devices of this moment."""
-    yield recording_devices("a microphone") if what == "recording" else playing_devices("a loudspeaker")
+    records = what == "recording"
+    yield listed_devices("a microphone" if records else "a loudspeaker", "source" if records else "sink")
 
 
-def _devices(flag: str, of_server: Literal["source", "sink"]) -> list[SoundDevice]:
+def listed_devices(flag: str, of_server: Literal["source", "sink"]) -> list[SoundDevice]:
+    """Return the devices that record (source) or play (sink); blocks for some tenths of a second.
+
+    PortAudio sees the devices of the moment when it was loaded. Raises ConfigError without PortAudio.
+    """
     sounddevice = portaudio(flag)
     records = of_server == "source"
     channels, default = "max_input_channels" if records else "max_output_channels", sounddevice.default.device

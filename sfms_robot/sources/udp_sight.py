@@ -8,17 +8,20 @@ the first has been silent for 2 s.
 from __future__ import annotations
 
 import errno
+import ipaddress
 import logging
 import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple, Protocol
 
-from sfms_robot.errors import PacketError, PortError
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, host_and_port
+from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import Floats, Sighting
-from sfms_robot.sources.live_face import LiveFace
+from sfms_robot.origin import is_loopback
+from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 
 logger = logging.getLogger(__name__)
 
@@ -247,6 +250,42 @@ def addresses_of_this_machine() -> list[str]:
     return [address for address in addresses if not address.startswith("127.")]
 
 
-def flag_for_others(kind: str, port: int, usual_port: int) -> str:
-    """What to type so that other machines are heard too."""
-    return f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")
+def open_udp_sight(
+    kind: str, argument: str, usual_port: int, decoder: Decoder, hint: Callable[[str, int, str], str]
+) -> UdpSight:
+    """Open `--face KIND[:PORT|HOST[:PORT]][,flip=...]`.
+
+    `hint`: returns what a person has to do when no packets come, for the bound host and port, and for the flag that
+    would also take packets from other machines ("" where this one does).
+
+    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
+    """
+    given = parse_face_argument(kind, argument)
+    opened = DatagramSocket(kind, *parse_endpoint(kind, given.place, usual_port))
+    host, port = opened.address
+    wider = f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")
+    return UdpSight(kind, opened, decoder, LiveFace(given.signs), hint(host, port, wider if is_loopback(host) else ""))
+
+
+def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:
+    """Return host and port of PORT, HOST:PORT ([HOST]:PORT for IPv6) or an address alone.
+
+    Loopback and `port` are what PLACE leaves out. Raises ConfigError.
+    """
+    if not place:
+        return LOOPBACK, port
+    if _is_address(place.strip("[]")):
+        return place.strip("[]"), port
+    found = host_and_port(place, least=1)
+    if found is None:
+        choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT, {kind}:ADDRESS; PORT 1 to {HIGHEST_PORT}"
+        raise ConfigError(f"--face {kind}:{place}: {place!r} is no UDP port ({choices})")
+    return found
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True

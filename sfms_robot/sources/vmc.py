@@ -18,7 +18,6 @@ primitives. Bundles are walked here: python-osc 1.10 never comes back from one t
 
 from __future__ import annotations
 
-import ipaddress
 import math
 import struct
 from collections.abc import Iterator, Mapping
@@ -29,9 +28,7 @@ from pythonosc.parsing import osc_types
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Floats
-from sfms_robot.sources.face_argument import parse_endpoint, parse_face_argument
-from sfms_robot.sources.live_face import LiveFace
-from sfms_robot.sources.udp_sight import ANY, DatagramSocket, UdpSight, addresses_of_this_machine, flag_for_others
+from sfms_robot.sources.udp_sight import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
 
 PORT: Final = 39539  # what the protocol gives those who receive
 
@@ -277,20 +274,15 @@ def _is_number(value: object) -> bool:
 
 
 def open_vmc(argument: str) -> UdpSight:
-    """`[PORT|HOST[:PORT]][,flip=...]`; avatar software on this machine by default, on another with `vmc:0.0.0.0`.
+    """Open `--face vmc[:PORT|HOST[:PORT]][,flip=...]`; without HOST only avatar software on this machine can send.
 
-    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
+    Raises as `open_udp_sight`.
     """
-    given = parse_face_argument("vmc", argument)
-    host, port = parse_endpoint("vmc", given.place, PORT)
-    opened = DatagramSocket("vmc", host, port)
-    return UdpSight("vmc", opened, VmcDecoder(), LiveFace(given.signs), _hint(*opened.address))
+    return open_udp_sight("vmc", argument, PORT, VmcDecoder(), _hint)
 
 
-def _hint(host: str, port: int) -> str:
-    """What to do so that it hears avatar software."""
+def _hint(host: str, port: int, wider: str) -> str:
+    """Return what to do so that packets of avatar software arrive."""
     own = addresses_of_this_machine() if host in ANY else [host]
     target = f"let the avatar software send VMC to {' or '.join(own) or 'this machine'}, port {port}"
-    if not ipaddress.ip_address(host).is_loopback:
-        return target
-    return f"{target}; {flag_for_others('vmc', port, PORT)} also hears other machines"
+    return f"{target}; {wider} also hears other machines" if wider else target

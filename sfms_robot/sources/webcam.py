@@ -13,8 +13,7 @@ from typing import Any, Final
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Sighting
 from sfms_robot.signals.quantiles import Quantiles
-from sfms_robot.sources.face_argument import parse_face_argument
-from sfms_robot.sources.live_face import LiveFace
+from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 from sfms_robot.sources.webcam_worker import Opened, Seen, watch
 from sfms_robot.sources.worker import SourceWorker
 
@@ -25,14 +24,10 @@ class Webcam:
     """`ports.Sight` of the worker `watch`. Only `close` blocks."""
 
     def __init__(self, worker: SourceWorker, face: LiveFace, duration_s: float | None) -> None:
-        self._worker, self._face, self._duration_s = worker, face, duration_s
+        self._worker, self._face, self.duration_s = worker, face, duration_s
         self._origin_s: float | None = None
-        self._pictures = self._without_face = self._dark = self._with_others = 0
+        self._counts = dict.fromkeys(("pictures", "without_face", "dark", "with_others"), 0)
         self._latency_ms = Quantiles()
-
-    @property
-    def duration_s(self) -> float | None:
-        return self._duration_s
 
     @property
     def lost(self) -> bool:
@@ -61,10 +56,7 @@ class Webcam:
         """What the worker tells; pictures, of these without a face, dark, and with other people in them; latency."""
         return {
             **self._worker.statistics(),
-            "pictures": self._pictures,
-            "without_face": self._without_face,
-            "dark": self._dark,
-            "with_others": self._with_others,
+            **self._counts,
             "latency_ms": self._latency_ms.report(p50=50, p99=99),
         }
 
@@ -74,10 +66,10 @@ class Webcam:
     def _take(self, seen: Seen) -> None:
         if self._origin_s is None or seen.taken_s < self._origin_s:
             return
-        self._pictures += 1
-        self._without_face += seen.face is None
-        self._dark += seen.dark
-        self._with_others += seen.others > 0
+        self._counts["pictures"] += 1
+        self._counts["without_face"] += seen.face is None
+        self._counts["dark"] += seen.dark
+        self._counts["with_others"] += seen.others > 0
         self._latency_ms.add((seen.known_s - seen.taken_s) * 1e3)
         if seen.face is not None:
             self._face.put(seen.taken_s, seen.face.motion, seen.face.place_m)

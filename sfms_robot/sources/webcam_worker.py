@@ -8,11 +8,12 @@ A recorded video is played at its own pace from the moment on that it is told; w
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,16 +23,36 @@ from numpy.typing import NDArray
 from sfms_robot.data import data_dir
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
-from sfms_robot.sources.face_choice import Choice, choose
-from sfms_robot.sources.mediapipe_face import SeenFace, seen_face
+from sfms_robot.frames import BLENDSHAPES, Floats
 
 MOST_FACES: Final = 3
 _PICTURE_PX: Final = (640, 480)  # asked of a camera; more shows nothing new of a face at arm's length
 _DARK: Final = 16  # mean of 0..255: a lens that is covered, a room without light
 _OLDEST_S: Final = 0.5  # a driver's time stamp that is further away is of another clock
 _ALIVE_S: Final = 0.02
+# Between the eyes, in the axes and centimetres of the matrix: mean of the corners of both eyes (points 33, 133, 362 and
+# 263) in `canonical_face_model.obj` of google-ai-edge/mediapipe.
+_EYES_CM: Final = (0.0, 2.62, 3.47, 1.0)
+
+NEARER: Final = 0.8  # of the chosen one's distance: clearly nearer
+TAKE_OVER_S: Final = 1.0  # for so long, without a break
+GONE_S: Final = 0.5  # one that has not been seen for so long is gone
+STEP: Final = 0.25  # of its distance: no further away from where it was can a face be the same one
 
 Picture = NDArray[np.uint8]  # (H, W, 3) red, green, blue
+
+
+@dataclass(frozen=True)
+class SeenFace:
+    """One face in one picture.
+
+    Attributes:
+        motion: (58,) pose in the person's axes (x forward, from the lens on, so negative), blendshapes.
+        place_m: (3,) between the eyes, from the camera: x out of its lens, y to its left, z up.
+    """
+
+    motion: Floats
+    place_m: Floats
 
 
 @dataclass(frozen=True)
@@ -209,3 +230,76 @@ def _why_not(number: int) -> str:
         return f"{device} is there: another program may hold it, or it gives no pictures"
     others = sorted(path.name.removeprefix("video") for path in Path("/dev").glob("video[0-9]*"))
     return f"there are {', '.join(others)}" if others else "none is plugged in"
+
+
+# --- one face in the words of this project ------------------------------------------------------------------------
+#
+# MediaPipe gives 52 blendshapes by name, `_neutral` among them and `tongueOut` not, left and right the person's own in
+# a picture that is not mirrored, and a matrix face -> camera: x to the picture's right, y up, z towards the viewer,
+# centimetres. With x forward = z, y left = x, z up = y its rotation is our Rz(yaw) Ry(pitch) Rx(roll), signs included.
+#
+# The distance is what a lens of 63 degrees across the picture's height would make of the face's size, and the face is
+# taken to be of average size. So it is relative: a lens of 45 degrees makes people come out about a third too near.
+# Sideways and up are not affected, since there the lens cancels out.
+
+
+def seen_face(matrix: NDArray[np.floating], shapes: Mapping[str, float]) -> SeenFace:
+    """`matrix` (4, 4) face -> camera; `shapes` by MediaPipe's names, those it does not give are 0."""
+    roll = math.atan2(matrix[1, 0], matrix[1, 1])
+    pitch = math.asin(min(1.0, max(-1.0, -float(matrix[1, 2]))))
+    yaw = math.atan2(matrix[0, 2], matrix[2, 2])
+    right_m, up_m, near_m = matrix[:3, 3] / 100.0
+    pose = (roll, pitch, yaw, near_m, right_m, up_m)
+    eyes_m = (matrix @ np.array(_EYES_CM))[:3] / 100.0
+    return SeenFace(
+        np.array([*pose, *(shapes.get(name, 0.0) for name in BLENDSHAPES)], dtype=np.float32),
+        np.array([-eyes_m[2], -eyes_m[0], eyes_m[1]], dtype=np.float32),
+    )
+
+
+# --- which of several faces is the person -------------------------------------------------------------------------
+#
+# The nearest, and not another one at every breath. A face that was chosen stays chosen while it is seen. Another takes
+# its place only when it has been clearly nearer for a while, or when the chosen one is gone. A face is recognized by
+# its place: it does not jump between two pictures.
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The person chosen so far: where and when they were last seen, and since when another one is clearly nearer."""
+
+    place_m: Floats
+    seen_s: float
+    rival_since_s: float | None = None
+
+
+def choose(places_m: Sequence[Floats], time_s: float, before: Choice | None) -> tuple[int | None, Choice | None]:
+    """The index of the person among the faces of a picture, by place (3,) from the camera; None where they are not.
+
+    `before` is what the last picture gave, None at first. The order of the faces does not matter.
+    """
+    distances_m = [float(np.linalg.norm(place)) for place in places_m]
+    same = _same(places_m, before)
+    if before is None or same is None:
+        if before is not None and time_s - before.seen_s < GONE_S:
+            return None, replace(before, rival_since_s=None)
+        if not places_m:
+            return None, None
+        nearest = int(np.argmin(distances_m))
+        return nearest, Choice(places_m[nearest], time_s)
+    nearest = int(np.argmin(distances_m))
+    if distances_m[nearest] >= NEARER * distances_m[same]:
+        return same, Choice(places_m[same], time_s)
+    since_s = time_s if before.rival_since_s is None else before.rival_since_s
+    if time_s - since_s < TAKE_OVER_S:
+        return same, Choice(places_m[same], time_s, since_s)
+    return nearest, Choice(places_m[nearest], time_s)
+
+
+def _same(places_m: Sequence[Floats], before: Choice | None) -> int | None:
+    """The face that is where the chosen one was, or None."""
+    if before is None or not places_m:
+        return None
+    steps_m = [float(np.linalg.norm(place - before.place_m)) for place in places_m]
+    same = int(np.argmin(steps_m))
+    return same if steps_m[same] <= STEP * float(np.linalg.norm(before.place_m)) else None

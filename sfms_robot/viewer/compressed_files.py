@@ -1,10 +1,11 @@
-"""The page's files as browsers take them: compressed, each once, by a thread."""
+"""The page's files and the virtual human as browsers take them: compressed, each once, by a thread."""
 
 from __future__ import annotations
 
 import asyncio
 import gzip
 import lzma
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -62,3 +63,12 @@ def _compressed(file: Path) -> bytes:
 
 def _plain(file: Path) -> bytes:
     return lzma.decompress(file.read_bytes()) if file.suffix == ".xz" else file.read_bytes()
+
+
+@cache
+def human_gz() -> bytes:
+    """Return `face.human_mesh`, compressed. Blocks for a second, once."""
+    from sfms_robot.face.human import load_human  # scipy's trees: in the thread that makes it, not at start-up
+    from sfms_robot.face.human_mesh import packed_human
+
+    return gzip.compress(packed_human(load_human()), _LEVEL)

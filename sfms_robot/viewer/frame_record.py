@@ -72,12 +72,6 @@ def pack_picture(picture: Picture) -> bytes:
     return header + numbers.tobytes() + picture.rare
 
 
-def picture_time_s(record: bytes) -> float:
-    """Time of a packed picture."""
-    time_s: float = struct.unpack_from("<d", record)[0]
-    return time_s
-
-
 def frame_json(record: bytes, shown: Shown | None = None) -> bytes:
     """The page's `frame` message of a packed picture. `shown` None: there is no URDF, its joints are the head's."""
     time_s, voice_db, own_db, attention, x_m, y_m, z_m, talking, _, joints = _HEADER.unpack_from(record)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, NamedTuple
 
 import orjson
 import uvicorn
@@ -178,15 +178,13 @@ def _first_document(pipe: int) -> dict[str, Any] | None:
 async def _serve(address: Address, run: RunPipe, incoming: IO[bytes], outgoing: IO[bytes], scene_of: SceneOf) -> None:
     await run.open(outgoing)
     try:
-        listening = bound(address)
+        place = listen_at(address)
         _check_certificate(address)
     except RobotError as error:
         run.send(0, problem=str(error), of=type(error).__name__)
         return
-    host, port = listening.getsockname()[:2]
-    token = None if is_loopback(host) else secrets.token_urlsafe(12)
     over = asyncio.Event()
-    page = PageServer(run, token)
+    page = PageServer(run, place.token)
     loop = asyncio.get_running_loop()
     await loop.connect_read_pipe(lambda: FromRun(page, over, scene_of), incoming)
     server = web_server(
@@ -198,9 +196,9 @@ async def _serve(address: Address, run: RunPipe, incoming: IO[bytes], outgoing: 
         ssl_certfile=address.certificate,
         ssl_keyfile=address.key,
     )
-    serving = asyncio.create_task(server.serve(sockets=[listening]))
+    serving = asyncio.create_task(server.serve(sockets=[place.socket]))
     page.prepare()
-    run.send(0, bound=url(address, host, port, token), token=token, taken=_taken(address, port))
+    run.send(0, bound=place.url, token=place.token, taken=place.taken)
     while not over.is_set():
         run.send(0, alive=True)
         with suppress(TimeoutError):
@@ -229,8 +227,30 @@ def web_server(app: ASGIApp, **options: Any) -> uvicorn.Server:
     return uvicorn.Server(config)
 
 
-def bound(address: Address) -> socket.socket:
-    """A socket that listens there, or on the next port that is free. Raises PortError where there is none."""
+class Listening(NamedTuple):
+    """A socket that listens, and its address.
+
+    Attributes:
+        url: address to open in a browser, with its token where there is one.
+        taken: port that was asked for and is used by another program; None where it was free.
+    """
+
+    socket: socket.socket
+    url: str
+    token: str | None
+    taken: int | None
+
+
+def listen_at(address: Address) -> Listening:
+    """Listen at an address, or on the next port that is free. Raises PortError where there is none."""
+    listening = _bound(address)
+    host, port = listening.getsockname()[:2]
+    token = None if is_loopback(host) else secrets.token_urlsafe(12)
+    taken = None if address.port in (0, port) else address.port
+    return Listening(listening, _url(address, host, port, token), token, taken)
+
+
+def _bound(address: Address) -> socket.socket:
     ports = [0] if address.port == 0 else [*range(address.port, min(address.port + TRIED, 65536)), 0]
     for port in ports:
         try:
@@ -246,17 +266,13 @@ def bound(address: Address) -> socket.socket:
     raise PortError(f"--view {address.host}:{address.port}: no port is free")
 
 
-def url(address: Address, host: str, port: int, token: str | None) -> str:
-    """What to open in a browser; with its token, where there is one. Of every address: this machine's local name."""
+def _url(address: Address, host: str, port: int, token: str | None) -> str:
+    """Return the address to open; for a socket that listens on all addresses, with this machine's local name."""
     scheme = "http" if address.certificate is None else "https"
     if host in ("0.0.0.0", "::"):
         host = f"{socket.gethostname().partition('.')[0]}.local"
     name = f"[{host}]" if ":" in host else host
     return f"{scheme}://{name}:{port}/" + ("" if token is None else f"?token={token}")
-
-
-def _taken(address: Address, port: int) -> int | None:
-    return address.port if address.port not in (0, port) else None
 
 
 def _check_certificate(address: Address) -> None:

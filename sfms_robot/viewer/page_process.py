@@ -6,18 +6,20 @@ Both directions are messages behind a header, over the child's stdin and stdout:
     uint8     kind: P packed picture, J JSON, V a visitor's voice or face (from the child)
     uint32    number of a visitor, 0 for none
 
-The run's side hands over numbers and small documents (`pipe_writer`). The child makes JSON of pictures, talks to
+The run's side hands over numbers and small documents (`PipeWriter`). The child makes JSON of pictures, talks to
 visitors, and sends back what they ask for, and a sign of life every `BEAT_S`. It ends with its pipe.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import select
 import struct
 import threading
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
@@ -26,7 +28,6 @@ import orjson
 from sfms_robot.child_process import end_child, start_child
 from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PortError, RobotError
-from sfms_robot.viewer.pipe_writer import THREAD, PipeWriter
 from sfms_robot.viewer.visitor_commands import Command
 
 HEADER: Final = struct.Struct("<IBI")
@@ -38,6 +39,9 @@ HUNG_S: Final = 2.5  # without a sign of life
 _STEP_S: Final = 0.2  # a longer pause between two looks was the run's own
 CHILD: Final = "sfms_robot.viewer.page_child:main"
 PORT: Final = 8780
+THREAD: Final = "page"  # names of the threads that a page has in the run's process
+_LOOK_S: Final = 0.5  # at a pipe that is full, whether it is to be closed
+_AT_ONCE: Final = os.name == "posix"  # elsewhere a pipe cannot be asked not to block
 
 log = logging.getLogger(__name__)
 
@@ -77,10 +81,11 @@ class Asked(Protocol):
 
     def command(self, visitor: int, command: Command) -> None: ...
 
-    def person(self, visitor: int, message: bytes) -> None: ...
+    def person(self, visitor: int, message: bytes) -> None:
+        """Take a piece of the voice, or a face, of the visitor with the controls: a message of docs/protocol.md."""
 
     def left(self, visitor: int) -> None:
-        """Who had the controls has them no more."""
+        """Note that the visitor with the controls has them no more."""
 
 
 class PageProcess:
@@ -180,12 +185,8 @@ class PageProcess:
         assert pipe is not None
         with pipe:
             while (message := read_message(pipe)) is not None:
-                kind, visitor, data = message
                 self._alive = True
-                if kind == PERSON:
-                    self._heed(visitor, partial(_person, visitor, data))
-                else:
-                    self._told(visitor, orjson.loads(data))
+                self._take(*message)
         self.visitors = 0
         if not self._closing:
             self._problem = self._problem or PortError("--view: the page's process died")
@@ -193,7 +194,11 @@ class PageProcess:
                 log.warning("the page is away: its process died (exit code %s); the run goes on", self._process.wait())
         self._bound.set()
 
-    def _told(self, visitor: int, told: Mapping[str, Any]) -> None:
+    def _take(self, kind: int, visitor: int, data: bytes) -> None:
+        if kind == PERSON:
+            self._heed(visitor, lambda asked: asked.person(visitor, data))
+            return
+        told = orjson.loads(data)
         if "bound" in told:
             self.url, self.token, self.taken = told["bound"], told["token"], told["taken"]
             self._bound.set()
@@ -225,10 +230,6 @@ def packed_message(kind: int, visitor: int, data: bytes) -> bytes:
     return HEADER.pack(len(data), kind, visitor) + data
 
 
-def _person(visitor: int, message: bytes, asked: Asked) -> None:
-    asked.person(visitor, message)
-
-
 def read_message(pipe: IO[bytes]) -> tuple[int, int, bytes] | None:
     """(kind, visitor, data); None at the end of the pipe. Blocks until it is whole."""
     header = pipe.read(HEADER.size)
@@ -237,3 +238,99 @@ def read_message(pipe: IO[bytes]) -> tuple[int, int, bytes] | None:
     length, kind, visitor = HEADER.unpack(header)
     data = pipe.read(length)
     return None if len(data) < length else (kind, visitor, data)
+
+
+class PipeWriter:
+    """A pipe to another process, for a loop that may wait for nothing.
+
+    A picture is written at once, by the thread that hands it over: some microseconds, and no other thread that would
+    have to get the interpreter in the middle of a tick. Where the pipe is full or something waits already, a thread
+    sends it, of pictures the newest. Everything else waits in order for that thread. All methods may be called from any
+    thread; none blocks. Messages that cannot be sent since the other process died are dropped.
+
+    Args:
+        pipe: its writing end; closed by the thread in the end.
+    """
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self._pipe = pipe
+        self._waiting: deque[bytes] = deque()
+        self._tasks: deque[Callable[[], None]] = deque()
+        self._picture: bytes | None = None
+        self._unsent = b""  # of a message that the pipe has taken the beginning of
+        self._changed = threading.Condition()
+        self._closing = self._broken = False
+        if _AT_ONCE:
+            os.set_blocking(pipe.fileno(), False)
+        threading.Thread(target=self._work, name=THREAD, daemon=True).start()
+
+    def send(self, message: bytes) -> None:
+        """In order, whole."""
+        with self._changed:
+            self._waiting.append(message)
+            self._changed.notify()
+
+    def send_newest(self, picture: bytes) -> None:
+        """Instead of an older one that has not left yet."""
+        if not self._changed.acquire(blocking=False):
+            self._picture = picture  # the thread is at it, and finds it now or beside the next one
+            return
+        try:
+            if _AT_ONCE and not (self._unsent or self._waiting or self._picture is not None):
+                self._unsent = self._taken(picture)
+                waits = bool(self._unsent)
+            else:
+                self._picture, waits = picture, True
+            if waits:
+                self._changed.notify()
+        finally:
+            self._changed.release()
+
+    def later(self, task: Callable[[], None]) -> None:
+        """Have the thread do something that takes longer than a tick has."""
+        with self._changed:
+            self._tasks.append(task)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Once everything has been sent that waits now."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+
+    def _work(self) -> None:
+        with self._pipe:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._closing or self._something())
+                    if self._broken or (self._closing and not self._something()):
+                        return
+                    tasks = [*self._tasks]
+                    self._tasks.clear()
+                for task in tasks:
+                    task()
+                with self._changed:
+                    self._unsent = self._taken(self._unsent or self._next())
+                    full = bool(self._unsent)
+                if full:
+                    select.select([], [self._pipe], [], _LOOK_S)
+
+    def _something(self) -> bool:
+        return bool(self._unsent or self._waiting or self._tasks or self._picture is not None)
+
+    def _next(self) -> bytes:
+        """All that waits, the newest picture behind it."""
+        messages = [*self._waiting, *([] if self._picture is None else [self._picture])]
+        self._waiting.clear()
+        self._picture = None
+        return b"".join(messages)
+
+    def _taken(self, message: bytes) -> bytes:
+        """What the pipe has not taken of it."""
+        try:
+            return message[os.write(self._pipe.fileno(), message) :] if message and not self._broken else b""
+        except BlockingIOError:
+            return message
+        except (OSError, ValueError):
+            self._broken = True  # its reader died: who reads from it sees that too, and says so
+            return b""

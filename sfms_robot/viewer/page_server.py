@@ -34,9 +34,9 @@ from sfms_robot.errors import PacketError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.origin import host_problem, origin_problem, token_admits
-from sfms_robot.viewer.compressed_files import CompressedFiles
+from sfms_robot.viewer.compressed_files import CompressedFiles, human_gz
 from sfms_robot.viewer.frame_record import Shown, frame_json, told_json
-from sfms_robot.viewer.human_file import human_gz
+from sfms_robot.viewer.page_process import Asked
 from sfms_robot.viewer.visitor_commands import Command, parse_command
 from sfms_robot.viewer.visitors import COMMAND_S, MOST_MALFORMED, PERSON_BYTES_PER_S, PERSON_S, Visitor, Visitors
 
@@ -60,19 +60,11 @@ def no_scene() -> RobotScene | None:
     return None
 
 
-class Run(Protocol):
-    """What visitors ask of a run. Never blocks."""
-
-    def command(self, visitor: int, command: Command) -> None: ...
-
-    def person(self, visitor: int, message: bytes) -> None:
-        """A piece of the voice, or a face, of who holds the controls: a message of docs/protocol.md."""
-
-    def left(self, visitor: int) -> None:
-        """It holds the controls no more."""
+class Run(Asked, Protocol):
+    """A run as the page's server sees it: takes what visitors ask for. Never blocks."""
 
     def watched(self, visitors: int) -> None:
-        """So many are connected now."""
+        """Note how many visitors are connected now."""
 
 
 class PageServer:

@@ -12,7 +12,6 @@ Beyond loopback every POST needs the token of the printed address, as `X-Token`.
 from __future__ import annotations
 
 import asyncio
-import secrets
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -26,10 +25,9 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.origin import is_loopback, token_admits
-from sfms_robot.viewer.compressed_files import CompressedFiles
-from sfms_robot.viewer.human_file import human_gz
-from sfms_robot.viewer.page_child import bound, url, web_server
+from sfms_robot.origin import token_admits
+from sfms_robot.viewer.compressed_files import CompressedFiles, human_gz
+from sfms_robot.viewer.page_child import listen_at, web_server
 from sfms_robot.viewer.page_process import Address
 from sfms_robot.viewer.page_server import STATIC, guarded_app
 
@@ -97,11 +95,9 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
 
 def serve_study(study: Comparison, address: Address, ready: Callable[[str, int | None], None]) -> None:
     """Serve until interrupted; `ready(url, taken port or None)` once. Raises PortError, KeyboardInterrupt."""
-    listening = bound(address)
-    host, port = listening.getsockname()[:2]
-    token = None if is_loopback(host) else secrets.token_urlsafe(12)
-    ready(url(address, host, port, token), None if address.port in (0, port) else address.port)
-    web_server(study_app(study, token), ws="none").run(sockets=[listening])
+    place = listen_at(address)
+    ready(place.url, place.taken)
+    web_server(study_app(study, place.token), ws="none").run(sockets=[place.socket])
 
 
 async def _refused(request: Request, error: Exception) -> Response:

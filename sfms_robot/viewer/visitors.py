@@ -137,15 +137,12 @@ class Visitors:
 
     def take(self, visitor: Visitor) -> None:
         """It asks for the controls. Raises PacketError where it cannot have them."""
-        if not visitor.allowed:
-            raise PacketError("the token is needed for this: it was printed when the robot started")
-        now_s = self._now()
-        if self._holder not in (None, visitor):
-            assert self._holder is not None
-            if now_s - self._holder.used_s < IDLE_S:
-                raise PacketError("somebody else holds the controls")
+        _check_allowed(visitor)
+        now_s, holder = self._now(), self._holder
+        if holder is not None and holder is not visitor and now_s - holder.used_s < IDLE_S:
+            raise PacketError("somebody else holds the controls")
         visitor.used_s = now_s
-        if visitor is not self._holder:
+        if visitor is not holder:
             self._pass_on(visitor)
 
     def give(self, visitor: Visitor) -> None:
@@ -158,8 +155,7 @@ class Visitors:
     def admit(self, visitor: Visitor, command: Command) -> None:
         """Whether it may do that now: the controls are taken where nobody has them. Raises PacketError."""
         if command.name == "halt":
-            if not visitor.allowed:
-                raise PacketError("the token is needed for this: it was printed when the robot started")
+            _check_allowed(visitor)
         elif command.name not in FREE:
             self.take(visitor)
 
@@ -179,3 +175,8 @@ class Visitors:
 
     def _controls_json(self, visitor: Visitor) -> bytes:
         return told_json(type="controls", held=self.controls(visitor), needs_token=not visitor.allowed)
+
+
+def _check_allowed(visitor: Visitor) -> None:
+    if not visitor.allowed:
+        raise PacketError("the token is needed for this: it was printed when the robot started")

@@ -4,8 +4,9 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS
-from sfms_robot.sources.face_argument import FaceArgument, parse_endpoint, parse_face_argument
+from sfms_robot.sources.live_face import FaceArgument, parse_face_argument
 from sfms_robot.sources.registry import split_kind
+from sfms_robot.sources.udp_sight import parse_endpoint
 
 
 @pytest.mark.parametrize(

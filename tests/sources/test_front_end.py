@@ -5,8 +5,8 @@ import pytest
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
-from sfms_robot.sources.front_end import LONGEST_WAIT_S, REFERENCE_WAIT_S, FrontEnd, ToldSpeech
 from sfms_robot.sources.live_voice import LiveVoice
+from sfms_robot.sources.microphone_worker import LONGEST_WAIT_S, REFERENCE_WAIT_S, FrontEnd, ToldSpeech
 
 ORIGIN_S = 1000.0
 PIECE_S = 0.01

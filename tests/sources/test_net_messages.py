@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
-from sfms_robot.sources.net_clock import SenderClock
+from sfms_robot.sources.net_intake import SenderClock
 from sfms_robot.sources.net_messages import (
     FACE,
     LONGEST,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE, SHAPES
 from sfms_robot.signals.rotations import rotation
 from sfms_robot.signals.spaces import angles_of
-from sfms_robot.sources import neutral
+from sfms_robot.sources.live_face import AWAY_S, relative_to_rest
 
 SMILE, JAW = CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["jawOpen"]
 HZ = 10
@@ -28,7 +28,7 @@ def follow(faces, start_s=0.0, state=None):
     """What comes of faces at `HZ`."""
     out = []
     for i, face in enumerate(faces):
-        given_face, state = neutral.step(face, start_s + i / HZ, state)
+        given_face, state = relative_to_rest(face, start_s + i / HZ, state)
         out.append(given_face)
     return np.array(out), state
 
@@ -96,14 +96,14 @@ def test_a_place_is_told_from_the_resting_one_in_the_persons_axes():
 
 def test_who_comes_back_after_10_s_is_somebody_else():
     _, state = follow([motion((0, 0, 0))] * 60 * HZ)
-    out, state = follow([motion((0, 0, 0.5))] * 10, 60 + neutral.AWAY_S, state)
+    out, state = follow([motion((0, 0, 0.5))] * 10, 60 + AWAY_S, state)
     assert np.abs(out).max() < 1e-5
     assert len(state.samples) < 5
 
 
 def test_who_comes_back_sooner_is_known():
     _, state = follow([motion((0, 0, 0))] * 60 * HZ)
-    out, _ = follow([motion((0, 0, 0.5))] * 10, 60 + neutral.AWAY_S / 2, state)
+    out, _ = follow([motion((0, 0, 0.5))] * 10, 60 + AWAY_S / 2, state)
     assert out[0][2] == pytest.approx(0.5, abs=1e-4)
 
 
@@ -111,8 +111,8 @@ def test_memory_is_bounded_and_state_is_a_value():
     _, state = follow([motion((0.1, 0, 0))] * 200 * HZ)
     assert state.samples.shape == (240, MOTION_DIM)
     kept = pickle.dumps(state)
-    first, _ = neutral.step(motion((0.2, 0, 0)), 200.0, state)
-    second, _ = neutral.step(motion((0.2, 0, 0)), 200.0, state)
+    first, _ = relative_to_rest(motion((0.2, 0, 0)), 200.0, state)
+    second, _ = relative_to_rest(motion((0.2, 0, 0)), 200.0, state)
     assert (first == second).all()
     assert pickle.dumps(state) == kept
 
@@ -125,6 +125,6 @@ def test_what_comes_out_is_a_face(faces):
         time_s += pause_s
         given_face = np.full(MOTION_DIM, value, np.float32)
         given_face[POSE] = angle
-        out, state = neutral.step(given_face, time_s, state)
+        out, state = relative_to_rest(given_face, time_s, state)
         assert np.isfinite(out).all()
         assert out[SHAPES].min() >= 0 and out[SHAPES].max() <= 1

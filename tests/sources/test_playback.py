@@ -19,8 +19,7 @@ from sfms_robot.sources.live_voice import LiveVoice
 from sfms_robot.sources.microphone import OwnVoice
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.playback import EARLY_S, HUSH_S, MARGIN_S, PlayedVoice, open_playback
-from sfms_robot.sources.playback_worker import PlaybackOpened, PlaybackStream, leaves_after_s
-from sfms_robot.sources.playout import Playout
+from sfms_robot.sources.playback_worker import PlaybackOpened, PlaybackStream, Playout, leaves_after_s
 from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
-from sfms_robot.sources.face_argument import FaceArgument
-from sfms_robot.sources.live_face import LiveFace
+from sfms_robot.sources.live_face import FaceArgument, LiveFace
 from sfms_robot.sources.udp_sight import (
     LOST_S,
     PACKETS_PER_CALL,

@@ -10,12 +10,10 @@ from scripted_worker import shows
 
 from sfms_robot.app.bench.webcam_bench import face_of, webcam, write_video
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
-from sfms_robot.face.virtual_webcam import VirtualWebcam
-from sfms_robot.sources.face_argument import FaceArgument
-from sfms_robot.sources.live_face import LiveFace
-from sfms_robot.sources.mediapipe_face import SeenFace
+from sfms_robot.face.drawing import VirtualWebcam
+from sfms_robot.sources.live_face import FaceArgument, LiveFace
 from sfms_robot.sources.webcam import Webcam, open_webcam
-from sfms_robot.sources.webcam_worker import Landmarker, Opened, Seen, live, open_video, played, watch
+from sfms_robot.sources.webcam_worker import Landmarker, Opened, Seen, SeenFace, live, open_video, played, watch
 from sfms_robot.sources.worker import SourceWorker
 
 pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from sfms_robot.viewer.frame_record import Picture, frame_json, pack_picture, picture_time_s, rare_json
+from sfms_robot.viewer.frame_record import Picture, frame_json, pack_picture, rare_json
 
 MOTION = np.linspace(-0.5, 0.5, 58, dtype=np.float32)
 ASKED_RAD = np.array([0.1, -0.2, 0.3])
@@ -41,7 +41,3 @@ def test_a_scene_turns_joints_into_those_of_its_urdf() -> None:
     record = pack_picture(Picture(1.0, MOTION, ASKED_RAD, READ_RAD, RARE))
     told = json.loads(frame_json(record, lambda angles_rad: 2 * angles_rad[:2]))
     assert told["u"] == [0.22, -0.4] and told["j"] == [0.1, -0.2, 0.3]
-
-
-def test_the_time_of_a_packed_picture_is_known_without_unpacking_it() -> None:
-    assert picture_time_s(pack_picture(Picture(12.34, MOTION, ASKED_RAD, READ_RAD, RARE))) == 12.34

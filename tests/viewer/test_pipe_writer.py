@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from sfms_robot.viewer.pipe_writer import PipeWriter
+from sfms_robot.viewer.page_process import PipeWriter
 
 LIMIT_S = 30.0
 LARGE = 1_000_000  # bytes: more than any pipe takes

@@ -6,7 +6,7 @@ import soundfile
 from chromium import Page, ServedRun, missing
 
 from sfms_robot.data import data_dir
-from sfms_robot.face.virtual_webcam import VirtualWebcam
+from sfms_robot.face.drawing import VirtualWebcam
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 
 pytestmark = [

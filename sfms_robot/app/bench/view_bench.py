@@ -41,8 +41,7 @@ from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
-from sfms_robot.viewer.page_process import PageProcess
-from sfms_robot.viewer.pipe_writer import THREAD
+from sfms_robot.viewer.page_process import THREAD, PageProcess
 
 SETTLE_S: Final = 4.0
 PAUSE_S: Final = 1.0  # after a turn: who comes gets a hello, who goes says good-bye

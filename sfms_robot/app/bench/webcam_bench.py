@@ -19,11 +19,10 @@ import numpy as np
 
 from sfms_robot.app.bench.measure import Told, times
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.virtual_webcam import PLACE_M, SIZE_PX, VirtualWebcam
+from sfms_robot.face.drawing import PLACE_M, SIZE_PX, VirtualWebcam
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
-from sfms_robot.sources.mediapipe_face import SeenFace
 from sfms_robot.sources.webcam import open_webcam
-from sfms_robot.sources.webcam_worker import Landmarker, Picture
+from sfms_robot.sources.webcam_worker import Landmarker, Picture, SeenFace
 
 SEEN_CORRELATION: Final = 0.8  # a channel that follows this well, and this far, counts as seen
 SEEN_SLOPE: Final = 0.1
