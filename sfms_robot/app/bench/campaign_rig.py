@@ -33,7 +33,7 @@ _FOLLOWS_RAD: Final = 0.15
 
 # Family -> (bus family, model, ids, baud, what its servos or board check a packet with; "" where they take any byte).
 FAMILIES: Final[Mapping[str, tuple[str, str, Sequence[int], int, str]]] = {
-    "dynamixel2": ("dynamixel", "xl330-m288", (1, 2, 3, 4), 1_000_000, "CRC-16"),
+    "dynamixel2": ("dynamixel2", "xl330-m288", (1, 2, 3, 4), 1_000_000, "CRC-16"),
     "dynamixel1": ("dynamixel1", "ax-12a", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
     "dynamixel1-mx": ("dynamixel1", "mx-28-1.0", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
     "sts": ("feetech", "sts3215", (1, 2, 3, 4), 1_000_000, "8-bit sum"),

@@ -18,7 +18,6 @@ from rig import emulated
 
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.families import current_name
 
 STATISTICS = {"writes", "reads", "errors", "retries", "reconnects", "silent", "faults"}
 WIRE_FAULTS = ("drop=0.1", "corrupt=0.1", "truncate=0.1", "duplicate=0.3", "noise=0.3", "delay=0.03")
@@ -395,7 +394,7 @@ GROUP_READS = {"dynamixel2": "sync_read", "dynamixel1-mx": "bulk_read", "sts": "
 @pytest.mark.emulated
 @pytest.mark.parametrize("count", [1, 4])
 def test_bytes_on_the_wire_are_those_that_are_counted(rig, request, count):
-    framing, table = FRAMINGS[current_name(rig.family.bus)], rig.family.table
+    framing, table = FRAMINGS[rig.family.bus], rig.family.table
     ids, name = rig.ids[:count], request.node.callspec.params["rig"]
 
     def spent(ask):
