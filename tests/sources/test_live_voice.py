@@ -72,7 +72,7 @@ def offsets_s(frames, first):
 )  # fmt: skip
 @example(8000, 0.0, 0.003, 0.02734375, 0)
 def test_whatever_the_card_frames_are_in_their_time(rate_hz, ppm, piece_s, jitter_s, seed):
-    """From 5 s on: a stretch is first placed within 10 ms, and the jitter of the first second then goes with 1/e a s."""
+    """From 5 s on: a stretch is first placed within 10 ms, and jitter of the first second fades by 1/e a second."""
     card = Card(rate_hz, ppm, jitter_s, seed)
     voice, frames = played(card, pieces(max(1, int(piece_s * rate_hz))), 20)
     assert not any(frame is None for frame in frames[3:])
