@@ -1,0 +1,53 @@
+"""A rearranged project prints, sends and computes as its golden files say. New options and keys may join."""
+
+import pins
+import pytest
+from ended import Ended
+
+FAILED = {"version", "exit", "error", "exit_code"}
+
+
+def test_options_keep_their_names_types_and_defaults():
+    now = pins.options()
+    for words, before in pins.golden("options").items():
+        assert before.items() <= now[words].items(), words
+
+
+@pytest.mark.parametrize("words", sorted(pins.golden("options")))
+def test_a_command_that_fails_prints_the_same_keys(command_line, words):
+    ended: Ended = command_line(*words.split(), "--no-such-option", "--json")
+    assert (ended.code, set(ended.told)) == (2, FAILED)
+
+
+@pytest.mark.slow
+def test_commands_print_the_keys_that_they_printed():
+    now = pins.keys()
+    for words, before in pins.golden("keys").items():
+        assert set(before) <= set(now[words]), words
+
+
+def test_contract_rigs_send_the_same_bytes():
+    assert pins.wire() == pins.golden("wire")
+
+
+def same(value, before):
+    """Assert that two JSON values differ by `TOLERANCE` of a figure at most."""
+    if isinstance(before, dict):
+        for key, each in before.items():
+            same(value[key], each)
+    elif isinstance(before, list):
+        assert len(value) == len(before)
+        for one, other in zip(value, before, strict=True):
+            same(one, other)
+    elif isinstance(before, float):
+        assert value == pytest.approx(before, rel=pins.TOLERANCE, abs=pins.TOLERANCE)
+    else:
+        assert value == before
+
+
+def test_figures_are_the_same():
+    same(pins.figures(), pins.golden("figures"))
+
+
+def test_every_command_is_pinned():
+    assert set(pins.golden("options")) == set(pins.options()), "pins.py write options"
