@@ -64,7 +64,7 @@ FAULTS = (
     # timeline
     Fault(TIMELINE, "plan.made_at_s < old.made_at_s", "plan.made_at_s < old.made_at_s - 1", MOTION),
     Fault(TIMELINE, "step_s / 4\n        late", "step_s\n        late", MOTION),
-    Fault(TIMELINE, "np.maximum(before[_BLINKS], after[_BLINKS])", "blend[_BLINKS]", MOTION),
+    Fault(TIMELINE, "np.maximum(before[BLINKS], after[BLINKS])", "blend[BLINKS]", MOTION),
     Fault(TIMELINE, "delay_s = FRAME_S if len(times_s) == 1 else 0.0", "delay_s = 0.0", MOTION),
     Fault(TIMELINE, "b0 / 2,", "b0,", MOTION),
     Fault(TIMELINE, "np.isfinite(frames).all() and", "", MOTION),
@@ -103,8 +103,8 @@ FAULTS = (
     # startup
     Fault(
         "servo/chain/startup.py",
-        '        yield from self._write(index, self._field(index, "goal_position"), goal)\n        yield from self._restore_torque(index)',
-        "        yield from self._restore_torque(index)",
+        'self._write(index, self._field(index, "goal_position"), goal)',
+        'self._write(index, self._field(index, "goal_position"), 0)',
         WIRE,
     ),
     Fault(
@@ -116,6 +116,15 @@ FAULTS = (
     Fault("servo/chain/startup.py", "if limits is not None and not _inside(present, limits):", "if False:", WIRE),
     Fault("servo/chain/startup.py", "if len(answer.data) != length:", "if False:", WIRE),
     Fault("servo/chain/startup.py", "return limits[0] <= ticks <= limits[1]", "return limits[0] <= ticks", WIRE),
+    # halt
+    Fault("runtime/halt.py", 'if door in ("device", cause[1]) and', "if", LOOP),
+    Fault("runtime/halt.py", "        if active:\n", "        if False:\n", LOOP),
+    Fault("runtime/halt.py", "self._closed.get(cause) == closing:", "cause in self._closed:", LOOP),
+    Fault("runtime/halt.py", '            bus.torque_off("release")', "            pass", LOOP),
+    Fault("runtime/halt_switches.py", "return not path.parent.is_dir()", "return False", LOOP),
+    Fault("runtime/loop.py", "if state.run.since_s == now_s and released.any():", "if False:", LOOP),
+    Fault("runtime/loop.py", "if not parts.halt.causes:", "if True:", LOOP),
+    Fault("runtime/states.py", "    if now.halted:", "    if False:", LOOP),
     # decoders
     Fault("sources/live_link.py", "if data[0] != VERSION:", "if data[0] > VERSION:", SOURCES),
     Fault("sources/live_link.py", "return motion_of(packet.values)", "return packet.values[:58]", SOURCES),
