@@ -218,7 +218,7 @@ def main() -> int:
     """Write golden files, or compare two checkouts; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("write").add_argument("sections", nargs="*", default=SECTIONS, choices=[*SECTIONS, []])
+    commands.add_parser("write").add_argument("sections", nargs="*", default=list(SECTIONS))
     commands.add_parser("compare").add_argument("checkout", type=Path)
     given = parser.parse_args()
     if given.command == "compare":
