@@ -78,6 +78,7 @@ class ChainBus(WireBus[L], Generic[L]):
     family: ClassVar[str]
     protocol: ClassVar[int]
     framing: ClassVar[Framing]
+    startup: ClassVar[type[Startup[Any]]]
 
     def __init__(
         self,
@@ -131,11 +132,20 @@ class ChainBus(WireBus[L], Generic[L]):
         """Time that a poll may take, whatever is lost: see `status_poll`."""
         return self._poll.budget_s
 
-    # --- what a family adds -------------------------------------------------------------------------------------
-
-    @abstractmethod
     def _begin(self, link: L, tries: int = 3) -> Startup[L]:
-        """What starts servos up over `link`."""
+        """Return the startup of the family's servos over `link`."""
+        return self.startup(
+            self.name,
+            link,
+            self._servos,
+            self._tables,
+            self._conversion,
+            self._baud,
+            tries=tries,
+            warnings=self._warnings,
+        )
+
+    # --- what a family adds -------------------------------------------------------------------------------------
 
     @abstractmethod
     def _found(self, link: L) -> None:

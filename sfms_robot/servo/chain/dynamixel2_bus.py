@@ -31,6 +31,7 @@ class Dynamixel2Bus(ChainBus[Dynamixel2Link]):
 
     family = "dynamixel"
     framing = FRAMINGS["dynamixel2"]
+    startup = Dynamixel2Startup
     protocol = 2
 
     def _set_up(self) -> None:
@@ -46,18 +47,6 @@ class Dynamixel2Bus(ChainBus[Dynamixel2Link]):
 
     def _open(self) -> Dynamixel2Link:
         return Dynamixel2Link(self._open_port(), self._baud, self._read_deadline_s)
-
-    def _begin(self, link: Dynamixel2Link, tries: int = 3) -> Dynamixel2Startup:
-        return Dynamixel2Startup(
-            self.name,
-            link,
-            self._servos,
-            self._tables,
-            self._conversion,
-            self._baud,
-            tries=tries,
-            warnings=self._warnings,
-        )
 
     def _found(self, link: Dynamixel2Link) -> None:
         self._wrote_s = math.inf

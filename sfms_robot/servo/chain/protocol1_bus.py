@@ -36,6 +36,7 @@ class Protocol1Bus(ChainBus[Protocol1Link]):
 
     family: ClassVar[Family]
     protocol = 1
+    startup = Protocol1Startup
 
     @abstractmethod
     def _group_reader(self, link: Protocol1Link) -> GroupRead | None:
@@ -43,18 +44,6 @@ class Protocol1Bus(ChainBus[Protocol1Link]):
 
     def _open(self) -> Protocol1Link:
         return Protocol1Link(self._open_port(), self._baud, self._read_deadline_s, self.family)
-
-    def _begin(self, link: Protocol1Link, tries: int = 3) -> Protocol1Startup:
-        return Protocol1Startup(
-            self.name,
-            link,
-            self._servos,
-            self._tables,
-            self._conversion,
-            self._baud,
-            tries=tries,
-            warnings=self._warnings,
-        )
 
     def _found(self, link: Protocol1Link) -> None:
         group, present = self._group_reader(link), self._present()
