@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from tiny_arig_training import settings
 
-from sfms_robot.learning.arig.trainer import train_arig
-from sfms_robot.learning.job import Run
-from sfms_robot.learning.process_group import joined
+from sfms_robot.lab.learning.arig.trainer import train_arig
+from sfms_robot.lab.learning.job import Run
+from sfms_robot.lab.learning.process_group import joined
 
 
 def main() -> None:

@@ -31,11 +31,9 @@ ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},
     "viewer": BASE | {"viewer", "face"},
     "emulator": BASE | {"emulator", "servo"},
-    "corpora": BASE | {"corpora"},
-    "learning": BASE | {"learning", "listeners", "corpora"},
-    "evaluation": BASE | {"evaluation", "learning", "listeners", "corpora", "face"},
-    "app": BASE | PEERS | {"viewer", "emulator", "corpora", "learning", "evaluation", "app"},
-    "cli": {"app", "config", "errors", "data", "cli"},
+    "app": BASE | PEERS | {"viewer", "emulator", "app"},
+    "cli": {"app", "config", "errors", "data", "cli", "lab"},
+    "lab": BASE | PEERS | {"viewer", "emulator", "app", "lab"},
 }
 SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}
 
@@ -131,4 +129,4 @@ def test_the_vendors_sdk_is_known_to_one_file_and_to_the_bench_that_measures_it(
         for name in ([node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
         if name and name.split(".")[0] == "dynamixel_sdk"
     }
-    assert knows == {"servo/chain/sdk_packets.py", "app/bench/bus_bench.py"}
+    assert knows == {"servo/chain/sdk_packets.py", "lab/bench/bus_bench.py"}

@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 import yaml
 
-from sfms_robot.corpora import clips
 from sfms_robot.frames import BLENDSHAPES, POSE_CHANNELS
+from sfms_robot.lab.corpora import clips
 
 ROOT = Path(__file__).parents[1]
 START = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]

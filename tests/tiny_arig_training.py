@@ -6,9 +6,9 @@ import numpy as np
 
 from sfms_robot import config
 from sfms_robot.config import parse_training
-from sfms_robot.corpora import clips
-from sfms_robot.corpora import conversational_states as labels
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES, ListenerEvent
+from sfms_robot.lab.corpora import clips
+from sfms_robot.lab.corpora import conversational_states as labels
 
 HZ = 25
 TINY = {

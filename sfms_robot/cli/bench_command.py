@@ -9,8 +9,8 @@ from pathlib import Path
 
 import typer
 
-from sfms_robot.app.bench import ALL, BENCHES
 from sfms_robot.cli.json_line import print_json
+from sfms_robot.lab.bench import ALL, BENCHES
 
 EPILOG = "\n\n".join(
     f"[bold]{name}[/bold]{'' if bench.in_all else ' (not part of all)'}: {bench.about}"
@@ -51,8 +51,8 @@ def bench(
     json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
     """Measure, each figure beside that of a peer in the same run. Exit code 1: something is not as it should be."""
-    from sfms_robot.app.bench import run_bench
     from sfms_robot.app.out_files import checked_file
+    from sfms_robot.lab.bench import run_bench
 
     if write is not None:
         checked_file(write, "--write")
@@ -63,7 +63,7 @@ def bench(
     began_s = time.monotonic()
     told = run_bench(name, {key: value for key, value in options.items() if value is not None}, _say)
     if write is not None:
-        from sfms_robot.app.bench import performance_page
+        from sfms_robot.lab.bench import performance_page
 
         performance_page.write(write, told.figures, (time.monotonic() - began_s) / 60)
     if json:

@@ -34,8 +34,8 @@ def compose(
     json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object."),
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
-    from sfms_robot.app.train.datasets import compose_dyads
     from sfms_robot.cli.show_learning import show
+    from sfms_robot.lab.train.datasets import compose_dyads
 
     show(compose_dyads(data, out, minutes, seed, overwrite), json)
 
@@ -50,8 +50,8 @@ def check(
     json: bool = typer.Option(False, "--json", help="Print everything found as one JSON object."),
 ) -> None:
     """Read a whole data set once: what is there, and everything that is wrong with it."""
-    from sfms_robot.app.train.datasets import check_data
     from sfms_robot.cli.show_learning import print_check, show
+    from sfms_robot.lab.train.datasets import check_data
 
     report = check_data(folder, layout, order.value if order else None, window)
     show(report, json, partial(print_check, channels=channels))
@@ -72,8 +72,8 @@ def convert(
     json: bool = typer.Option(False, "--json", help="Print the figures as one JSON object."),
 ) -> None:
     """Convert a data set into dyads at 25 fps in our own space, and tell what is lost."""
-    from sfms_robot.app.train.data_conversion import convert_data
     from sfms_robot.cli.show_learning import print_conversion, show
+    from sfms_robot.lab.train.data_conversion import convert_data
 
     show(convert_data(folder, out, layout, order.value if order else None, flame_matrix, flame_order), json,
          print_conversion)  # fmt: skip

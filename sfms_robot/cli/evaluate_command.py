@@ -64,13 +64,13 @@ def tokenizer(
     from sfms_robot.cli.show_learning import print_figures, print_tokenizer_tables, show
 
     if table is None:
-        from sfms_robot.app.evaluate.listener_evaluation import evaluate_tokenizer
+        from sfms_robot.lab.evaluate.listener_evaluation import evaluate_tokenizer
 
         if data is None:
             raise typer.BadParameter("--data is needed without --table")
         show(evaluate_tokenizer(listener, data, order.value if order else None), json, print_figures)
         return
-    from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
+    from sfms_robot.lab.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
 
     options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
     show(interruptible(lambda: evaluate_table(options)), json, print_tokenizer_tables)
@@ -98,8 +98,8 @@ def listener_(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.app.evaluate.listener_evaluation import evaluate_listener, listener_table
     from sfms_robot.cli.show_learning import print_arig_table, print_figures, print_listener_table, show
+    from sfms_robot.lab.evaluate.listener_evaluation import evaluate_listener, listener_table
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
@@ -109,7 +109,7 @@ def listener_(
     if of_arig:
         if order is not None or hop is not None:
             raise typer.BadParameter("--order and --hop are for --table 1 and 2, or none")
-        from sfms_robot.app.evaluate.arig_evaluation import AblationOptions, arig_table
+        from sfms_robot.lab.evaluate.arig_evaluation import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
@@ -140,8 +140,8 @@ def papers(
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
-    from sfms_robot.app.evaluate.papers import EVERY, PapersOptions, evaluate_papers
     from sfms_robot.cli.show_learning import print_paper_table, show
+    from sfms_robot.lab.evaluate.papers import EVERY, PapersOptions, evaluate_papers
 
     options = PapersOptions(data, models, table or EVERY, clips, samples, steps, seed)
     each = (lambda name, found: None) if json else print_paper_table
@@ -167,9 +167,9 @@ def timing(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
-    from sfms_robot.app.evaluate.meetings import TimingOptions, evaluate_timing
     from sfms_robot.app.listen.preflight import engine_named
     from sfms_robot.cli.show_learning import print_timing, show
+    from sfms_robot.lab.evaluate.meetings import TimingOptions, evaluate_timing
 
     runs_on = engine_named(engine)
     options = TimingOptions(
@@ -193,8 +193,8 @@ def robustness(
     json: bool = JSON,
 ) -> None:
     """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
-    from sfms_robot.app.evaluate.unseen_speakers import evaluate_robustness
     from sfms_robot.cli.show_learning import print_robustness, show
+    from sfms_robot.lab.evaluate.unseen_speakers import evaluate_robustness
 
     found = evaluate_robustness(listener, data, split.value, speakers, minutes, seeds, seed, jobs)
     show(found, json, print_robustness)
@@ -212,9 +212,9 @@ def naturalness(
     json: bool = JSON,
 ) -> None:
     """How a listener moves beside people whose motion it never saw: nods, smiles, gaze, sway, and a network's guess."""
-    from sfms_robot.app.evaluate.naturalness import evaluate_naturalness
     from sfms_robot.app.listen.preflight import engine_named
     from sfms_robot.cli.show_learning import show
+    from sfms_robot.lab.evaluate.naturalness import evaluate_naturalness
 
     show(evaluate_naturalness(listener, data, split, clips, drift, seed, engine_named(engine)), json)
 
@@ -230,8 +230,8 @@ def metrics_(
     json: bool = JSON,
 ) -> None:
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
-    from sfms_robot.app.evaluate.motion_metrics import MetricFiles, evaluate_metrics
     from sfms_robot.cli.show_learning import print_figures, show
+    from sfms_robot.lab.evaluate.motion_metrics import MetricFiles, evaluate_metrics
 
     show(evaluate_metrics(MetricFiles(truth, prediction, speaker, space, frames), seed), json, print_figures)
 
@@ -245,8 +245,8 @@ def interaction(
     json: bool = JSON,
 ) -> None:
     """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
-    from sfms_robot.app.evaluate.arig_evaluation import evaluate_interaction
     from sfms_robot.cli.show_learning import print_interaction, show
+    from sfms_robot.lab.evaluate.arig_evaluation import evaluate_interaction
 
     show(evaluate_interaction(listener, data, clips, seed), json, print_interaction)
 
@@ -270,8 +270,8 @@ def people(
     json: bool = JSON,
 ) -> None:
     """A page that asks people, blind, which of two listens more like a person; Ctrl-C ends it, with a table."""
-    from sfms_robot.app.evaluate import people_study
     from sfms_robot.cli.show_learning import print_preferences, show
+    from sfms_robot.lab.evaluate import people_study
 
     if results is not None:
         show(people_study.table(results), json, print_preferences)

@@ -71,7 +71,7 @@ def tokenizer(
     if dry_run:
         _show_dry_run(config, json)
         return
-    from sfms_robot.app.train.train_runs import TrainOptions, train_tokenizer
+    from sfms_robot.lab.train.train_runs import TrainOptions, train_tokenizer
 
     data, out = _both(data, out)
     placed = placement.value if placement else None
@@ -102,7 +102,7 @@ def listener(
     if dry_run:
         _show_dry_run(config, json)
         return
-    from sfms_robot.app.train.train_runs import TrainOptions, train_listener
+    from sfms_robot.lab.train.train_runs import TrainOptions, train_listener
 
     data, out = _both(data, out)
     options = TrainOptions(
@@ -123,8 +123,8 @@ def events(
     json: bool = JSON,
 ) -> None:
     """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
-    from sfms_robot.app.train.event_training import train_events
     from sfms_robot.cli.show_learning import print_figures, show
+    from sfms_robot.lab.train.event_training import train_events
 
     show(interruptible(lambda: train_events(data, out, all_series, seed)), json, print_figures)
 
@@ -138,8 +138,8 @@ def idle(
     json: bool = JSON,
 ) -> None:
     """The small motion of a resting face that a listener leaves out, into its folder: a minute's work."""
-    from sfms_robot.app.train.idle_training import train_idle
     from sfms_robot.cli.show_learning import show
+    from sfms_robot.lab.train.idle_training import train_idle
 
     show(interruptible(lambda: train_idle(listener, data, clips, seed)), json)
 
@@ -152,9 +152,9 @@ def _both(data: Path | None, out: Path | None) -> tuple[Path, Path]:
 
 
 def _show_dry_run(config: Path, json: bool) -> None:
-    from sfms_robot.app.train.dry_run import dry_run
     from sfms_robot.cli.show_learning import print_dry_run, show
     from sfms_robot.config import load_training
+    from sfms_robot.lab.train.dry_run import dry_run
 
     show(dry_run(load_training(config)), json, print_dry_run)
 

@@ -371,3 +371,34 @@ def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
         counts = next(base for base in (24, 25, 30) if highest < base)
     times_s: Doubles = whole_s + parts[:, 3] / counts
     return times_s
+
+
+@dataclass(frozen=True)
+class Take:
+    """A stretch in which a face was seen all the time. `motion` (N, 58) at 25 fps, radians, metres, 0..1."""
+
+    name: str
+    motion: Floats
+
+
+def face_stretches(file: Path, name: str) -> list[Take]:
+    """Return the stretches of a face track in which a face was seen. Raises ConfigError."""
+    return stretches(resample(read_track(file), FRAME_HZ).motion, name)
+
+
+def folder_takes(folder: Path) -> list[Take]:
+    """Return every face track (CSV, CSV.gz) below `folder`.
+
+    Raises ConfigError when there is none or one cannot be read.
+    """
+    files = sorted([*folder.rglob("*.csv"), *folder.rglob("*.csv.gz")])
+    if not files:
+        raise ConfigError(f"--data {str(folder)!r}: no face tracks (*.csv, *.csv.gz) below it")
+    return [take for file in files for take in face_stretches(file, str(file.relative_to(folder)))]
+
+
+def stretches(motion: Floats, name: str) -> list[Take]:
+    """Return the parts of `motion` (N, 58) without gaps (rows that are not finite)."""
+    known = np.isfinite(motion).all(axis=1)
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+    return [Take(name, motion[first:last]) for first, last in zip(ends[::2], ends[1::2], strict=True)]

@@ -17,8 +17,8 @@ from sfms_robot.app.replay.run_playback import PlaybackOptions, play_back
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.config.arig import STATES, paper_state
 from sfms_robot.data import data_dir
-from sfms_robot.evaluation.rollout import speaker_frames
 from sfms_robot.frames import CHANNEL_INDEX
+from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.registry import load_listener

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sfms_robot.app.bench.measure import environment
 from sfms_robot.errors import ConfigError
+from sfms_robot.lab.bench.measure import environment
 
 
 def test_a_folder_without_the_package_is_refused(tmp_path):

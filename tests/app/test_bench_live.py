@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.live_bench import GOALS, goals
-from sfms_robot.app.bench.live_stamps import SETTLED_S, STAGES, Stamps
-from sfms_robot.app.bench.torture_bench import Blow, missed_ticks
 from sfms_robot.frames import FRAME_S, FaceFrame, Plan, SpeakerFrame
+from sfms_robot.lab.bench.live_bench import GOALS, goals
+from sfms_robot.lab.bench.live_stamps import SETTLED_S, STAGES, Stamps
+from sfms_robot.lab.bench.torture_bench import Blow, missed_ticks
 from sfms_robot.ports import Tick
 
 TICK_S = 0.01

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.adversary import CHUNK, adversarial, torment, wild
-from sfms_robot.app.bench.lead import delay_ticks, delays
-from sfms_robot.app.bench.retarget_bench import retarget
 from sfms_robot.config import load_head
 from sfms_robot.data import head_names
+from sfms_robot.lab.bench.adversary import CHUNK, adversarial, torment, wild
+from sfms_robot.lab.bench.lead import delay_ticks, delays
+from sfms_robot.lab.bench.retarget_bench import retarget
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
 HEADS = head_names()

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.acoustics import GEAR_SEED, gear_noise
-from sfms_robot.app.bench.own_voice_bench import CHOSEN_ON, CHOSEN_ON_GEAR_SEED, Condition, call_names, own_voice
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
+from sfms_robot.lab.bench.acoustics import GEAR_SEED, gear_noise
+from sfms_robot.lab.bench.own_voice_bench import CHOSEN_ON, CHOSEN_ON_GEAR_SEED, Condition, call_names, own_voice
 
 
 def test_calls_that_parameters_were_chosen_on_are_not_reported_on(tmp_path):

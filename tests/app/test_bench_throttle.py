@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from sfms_robot.app.bench.throttle_bench import state_problems
-from sfms_robot.app.bench.throttled_tree import Tree, processes_of
+from sfms_robot.lab.bench.throttle_bench import state_problems
+from sfms_robot.lab.bench.throttled_tree import Tree, processes_of
 
 WELL = [(0.0, "starting", ()), (1.0, "listening", ()), (10.0, "stopping", ()), (11.0, "stopped", ())]
 PLANS = [(0.2 * count, 0.2 * count + 0.3) for count in range(1, 50)]

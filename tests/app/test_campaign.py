@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.campaign import (
+from sfms_robot.emulator.faults import KINDS
+from sfms_robot.errors import ConfigError
+from sfms_robot.lab.bench.campaign import (
     CASES,
     CORRUPT,
     HALF_DEAD,
@@ -20,10 +22,8 @@ from sfms_robot.app.bench.campaign import (
     run_campaign,
     table,
 )
-from sfms_robot.app.bench.campaign_rig import FAMILIES, Judge, head_of, plugged_in
-from sfms_robot.app.bench.fuzz import BYTES, fuzz_one
-from sfms_robot.emulator.faults import KINDS
-from sfms_robot.errors import ConfigError
+from sfms_robot.lab.bench.campaign_rig import FAMILIES, Judge, head_of, plugged_in
+from sfms_robot.lab.bench.fuzz import BYTES, fuzz_one
 
 BOARDS = ("maestro", "maestro-crc", "ssc32")
 UNCHECKED = ("maestro", "ssc32")

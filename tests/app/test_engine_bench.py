@@ -3,11 +3,11 @@
 import math
 import shutil
 
-from sfms_robot.app.bench.engine_bench import TURN_HOPS, Stream, engines_of, take_turns
-from sfms_robot.app.bench.listener_bench import _distance, _speaker, _table
-from sfms_robot.app.bench.listener_process import listener_process
 from sfms_robot.config import load_listener as load_settings
 from sfms_robot.data import data_dir
+from sfms_robot.lab.bench.engine_bench import TURN_HOPS, Stream, engines_of, take_turns
+from sfms_robot.lab.bench.listener_bench import _distance, _speaker, _table
+from sfms_robot.lab.bench.listener_process import listener_process
 from sfms_robot.listeners.registry import load_listener
 
 LISTENERS = data_dir("configs") / "listeners"

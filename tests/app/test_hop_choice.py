@@ -2,9 +2,9 @@
 
 import pytest
 
-from sfms_robot.app.evaluate.hop_choice import load_at_hop
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
+from sfms_robot.lab.evaluate.hop_choice import load_at_hop
 
 
 @pytest.mark.parametrize(("hop", "plans_every"), [(None, 4), (2, 2), (8, 8)])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.bench.lead import Waves
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.open_head import build_bus, build_motion
@@ -13,6 +12,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import MOTION_DIM
+from sfms_robot.lab.bench.lead import Waves
 from sfms_robot.ports import Observer
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.log import RunLog

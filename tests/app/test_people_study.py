@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import soundfile
 
-from sfms_robot.app.evaluate.people_study import Study, StudyOptions, clip_name, prepare, read_answers, table
-from sfms_robot.corpora import clips
-from sfms_robot.corpora.clips import Dyad
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.preferences import QUESTIONS
+from sfms_robot.lab.corpora import clips
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.evaluate.people_study import Study, StudyOptions, clip_name, prepare, read_answers, table
+from sfms_robot.lab.evaluation.preferences import QUESTIONS
 
 ALL_LEFT = dict.fromkeys(QUESTIONS, "left")
 

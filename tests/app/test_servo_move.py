@@ -3,7 +3,6 @@
 import pytest
 from test_single_servo import put, wire_on
 
-from sfms_robot.app.bench.campaign_rig import FAMILIES, head_of
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.servo.move import BEHIND_DEG, SILENT, SPEED_DEG_S, move, release, release_chain
 from sfms_robot.app.servo.single_servo import field_named, read, read_registers
@@ -11,6 +10,7 @@ from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError, TorqueError
+from sfms_robot.lab.bench.campaign_rig import FAMILIES, head_of
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.port import WrappedPort
 from sfms_robot.servo.registers import Table

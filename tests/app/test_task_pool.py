@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import sfms_robot
-from sfms_robot.app.evaluate.task_pool import done_in_processes
 from sfms_robot.child_process import ONE_THREAD, messages, process_pool, start_child, take_pipes
 from sfms_robot.errors import ConfigError
+from sfms_robot.lab.evaluate.task_pool import done_in_processes
 
 # Not the environment alone: BLAS and OpenMP read it when they are loaded.
 LOOSE = {name: "7" for name in ONE_THREAD}

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfms_robot.app.evaluate.unseen_speakers import unseen, voice_folders
 from sfms_robot.config import find
-from sfms_robot.corpora.splits import split_of_voice
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.robustness import CONDITIONS, counted, heard_and_seen
-from sfms_robot.evaluation.rollout import rollout
 from sfms_robot.frames import FRAME_SAMPLES
+from sfms_robot.lab.corpora.splits import split_of_voice
+from sfms_robot.lab.evaluate.unseen_speakers import unseen, voice_folders
+from sfms_robot.lab.evaluation.robustness import CONDITIONS, counted, heard_and_seen
+from sfms_robot.lab.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import load_listener
 
 LIES = ("face constant", "face saturated", "face upside down", "face lost", "attention flickers")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.app.bench.view_bench import Window, cost_figures
+from sfms_robot.lab.bench.view_bench import Window, cost_figures
 
 
 def windows(run_shares, page_share=1.5, telling_share=0.25, late=()):

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfms_robot.app.evaluate.tokenizer_evaluation import TableOptions, train_missing
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_S
+from sfms_robot.lab.evaluate.tokenizer_evaluation import TableOptions, train_missing
 from sfms_robot.signals.tracks import Track, write_track
 
 TABLE = ("evaluate", "tokenizer", "--table")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-from sfms_robot.corpora import clips
 from sfms_robot.data import data_dir
 from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
+from sfms_robot.lab.corpora import clips
 
 FRAMES = 110
 START = "from sfms_robot.cli.main import main; main()"

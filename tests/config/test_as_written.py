@@ -10,7 +10,7 @@ import torch
 from sfms_robot import config
 from sfms_robot.config import load_training
 from sfms_robot.data import data_dir
-from sfms_robot.learning.training_loop import optimizer, schedule
+from sfms_robot.lab.learning.training_loop import optimizer, schedule
 from sfms_robot.listeners import checkpoint
 
 TRAINING = data_dir("configs") / "training"

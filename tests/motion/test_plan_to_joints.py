@@ -6,11 +6,11 @@ from motion_rows import motions
 
 from sfms_robot.app.open_head import build_motion
 from sfms_robot.config import load_head
-from sfms_robot.corpora.compose.motions import load
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Plan
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
+from sfms_robot.signals.motion_primitives import read_motions
 
 TICK_S, HORIZON, HOP, LATENCY_TICKS = 0.01, 8, 4, 2
 HEAD = load_head("face28")
@@ -73,7 +73,7 @@ def recorded_nods() -> list[np.ndarray]:
     """Pitch [rad] of recorded heads, 25 a second, from rest and to it."""
     clips = [
         np.asarray(clip)[:, CHANNEL_INDEX["pitch"]]
-        for motion in load(data_dir("sim") / "listeners" / "motions.npz").values()
+        for motion in read_motions(data_dir("sim") / "listeners" / "motions.npz").values()
         for clip in motion.heads
         if len(clip) >= 25
     ]

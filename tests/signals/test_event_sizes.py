@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from sfms_robot.corpora.compose import acting
-from sfms_robot.corpora.compose.motions import load
 from sfms_robot.data import data_dir
+from sfms_robot.lab.corpora.compose import acting
 from sfms_robot.signals.event_sizes import (
     ASIDE_DEG,
     ASIDE_MEAN_S,
@@ -18,6 +17,7 @@ from sfms_robot.signals.event_sizes import (
     swing_reach_rad,
     swings,
 )
+from sfms_robot.signals.motion_primitives import read_motions
 
 
 def test_looks_aside_are_peoples():
@@ -41,7 +41,7 @@ def test_a_swing_is_never_faster_nor_slower_than_a_neck_goes(length_s):
 
 
 def test_a_swing_reaches_as_far_as_recorded_ones_do_in_that_time():
-    nods = load(data_dir("sim") / "listeners" / "motions.npz")["train"].nods
+    nods = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"].nods
     for swing_s in SWING_REACH[0]:
         manner = acting.NodManner(np.deg2rad(NOD_DEG[2]), 1, swing_s, 1.0)
         reached = np.median([np.ptp(acting.nod_curve(manner, shape, 0.4, 50)) for shape in nods])

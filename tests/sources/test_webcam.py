@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scripted_worker import shows
 
-from sfms_robot.app.bench.webcam_bench import face_of, webcam, write_video
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
 from sfms_robot.face.drawing import VirtualWebcam
+from sfms_robot.lab.bench.webcam_bench import face_of, webcam, write_video
 from sfms_robot.sources.live_face import FaceArgument, LiveFace
 from sfms_robot.sources.webcam import Webcam, open_webcam
 from sfms_robot.sources.webcam_worker import Landmarker, Opened, Seen, SeenFace, live, open_video, played, watch

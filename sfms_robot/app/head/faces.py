@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sfms_robot.corpora.compose.motions import load
-from sfms_robot.corpora.takes import face_stretches, folder_takes
 from sfms_robot.data import data_dir
 from sfms_robot.frames import MOTION_DIM, POSE_CHANNELS, Floats
+from sfms_robot.signals.motion_primitives import read_motions
+from sfms_robot.signals.tracks import face_stretches, folder_takes
 
 SHORTEST = 4  # frames that a curve can be laid through
 _POSE = len(POSE_CHANNELS)
@@ -42,7 +42,7 @@ def _bundled() -> list[tuple[str, Floats]]:
     sim = data_dir("sim")
     speakers = sorted(sim.glob("speakers/*/face.csv.gz"))
     clips = [(take.name, take.motion) for track in speakers for take in face_stretches(track, track.parent.name)]
-    for motions in load(sim / "listeners" / "motions.npz").values():
+    for motions in read_motions(sim / "listeners" / "motions.npz").values():
         for kind, columns in _PARTS.items():
             for piece in getattr(motions, kind):
                 clip = np.zeros((len(piece), MOTION_DIM), dtype=np.float32)

@@ -3,10 +3,10 @@
 import pytest
 from tiny_arig import arig_listener, talk
 
-from sfms_robot.app.bench import listener_bench as bench
-from sfms_robot.app.bench.engine_bench import TURN_HOPS, Stream, take_turns
-from sfms_robot.app.bench.in_run import in_run
-from sfms_robot.app.bench.samplers import WAYS, samplers
+from sfms_robot.lab.bench import listener_bench as bench
+from sfms_robot.lab.bench.engine_bench import TURN_HOPS, Stream, take_turns
+from sfms_robot.lab.bench.in_run import in_run
+from sfms_robot.lab.bench.samplers import WAYS, samplers
 from sfms_robot.listeners import checkpoint
 
 MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8}

@@ -5,9 +5,9 @@ import pytest
 from tiny_sfms import speech
 
 from sfms_robot.config import find
-from sfms_robot.evaluation.detection import added_up, asked_and_seen
-from sfms_robot.evaluation.rollout import rollout
 from sfms_robot.frames import CHANNEL_INDEX, ListenerEvent
+from sfms_robot.lab.evaluation.detection import added_up, asked_and_seen
+from sfms_robot.lab.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import at_hop, load_listener
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, anchored, revoked
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from tiny_sfms import plans_of, speech, told_listener
 
-from sfms_robot.corpora.clips import Dyad
 from sfms_robot.errors import ConfigError
-from sfms_robot.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.listeners.sfms.keyframes import KEPT_FRAMES, UNDECIDED, later, passed, revoked
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.signals.control import COLUMNS, control_track

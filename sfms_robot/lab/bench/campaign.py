@@ -1,0 +1,317 @@
+"""Every kind of trouble on every family of servos, in virtual time: what the bus lets through, and what comes back.
+
+One run: four emulated servos follow a slow wave under the limiter, as in the loop. Either a fault of the emulator sets
+in after a while, and when it has passed they get time to come back; or the servos are not as the head's file says from
+the start, or half of them are lost for good. Judged from outside, by what the emulated servos hold and where they are:
+
+    escaped       an exception left the bus that should not have, or a bad goal was not refused
+    outside       goals outside the limits of a joint that a servo held
+    pulse_us      the shortest and longest pulse that a board made
+    stale         readings that tell another position than the servo had at the time they name
+    recovered_s   from the end of the fault until every joint is read, has torque and follows its goal, for good
+    named         joints that stay out, with their fault named: protection that is latched, or a servo left alone
+    refused       what the bus said at the start, of servos that contradict the head's file
+    off_s, stop_s until the torque was off, and until `stop` returned, where nobody answers
+    left_on       servos that had torque when all was over
+
+What a corrupted byte of the host can do is a statement per family (`corrupted_bytes`). On a board without a checksum
+goals outside the limits are part of it, and no failure.
+
+A run is the same every time: time is virtual, and the dice are seeded.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.app.wiring import emulated
+from sfms_robot.config import load_firmware_map
+from sfms_robot.emulator.faults import KINDS
+from sfms_robot.emulator.launch import EmulatedServo
+from sfms_robot.errors import BusError, ServoError
+from sfms_robot.lab.bench.campaign_rig import (
+    FAMILIES,
+    LIMIT_DEG,
+    RATE_HZ,
+    RECOVERY_S,
+    Judge,
+    Rig,
+    head_of,
+    plugged_in,
+)
+from sfms_robot.lab.bench.measure import Told
+from sfms_robot.servo.port import WrappedPort
+
+TICKS: Final = 1000
+_QUIET, _FAULTY = 0.1, 0.5  # fraction of the ticks before the fault, and with it
+_BAD_GOALS_EVERY: Final = 50
+_OFF_S, _STOP_S = 0.02, 0.5  # the longest that torque-off and `stop` may take
+_FAILS_AFTER_S: Final = 1.0  # a bus on which nobody answers; a board is given five times that
+_SAID_BY_S: Final = 7.0  # a board that fails is said
+_OUTSIDE_DEG: Final = 8.0
+
+# Kind -> ids (all of the wire where there are none) and value.
+SPECS: Final[Mapping[str, str]] = {
+    "drop": "drop{two}{when}=0.3",
+    "delay": "delay{two}{when}=0.03",
+    "corrupt": "corrupt{two}{when}=0.3",
+    "duplicate": "duplicate{two}{when}=0.5",
+    "truncate": "truncate{two}{when}=0.3",
+    "echo": "echo{when}",
+    "noise": "noise{when}=0.5",
+    "request-drop": "request-drop{when}=0.3",
+    "request-corrupt": "request-corrupt{when}=0.3",
+    "request-delay": "request-delay{when}=0.03",
+    "silent": "silent{one}{when}",
+    "mute": "mute{one}{when}",
+    "stuck": "stuck{one}{when}",
+    "overload": "overload{one}{when}",
+    "overheat": "overheat{one}{when}",
+    "load": "load{two}{when}=0.1",
+    "voltage": "voltage{when}=20",
+    "brownout": "brownout{when}",
+    "hangup": "hangup{when}",
+}
+CORRUPT: Final = "request-corrupt"
+STORED, MANY_TURNS, OUTSIDE = "stored limits", "many turns", "found outside"
+HALF_DEAD, MUTE_AT_STOP = "one bus of two dead", "mute at stop"
+STARTS: Final = (STORED, MANY_TURNS, OUTSIDE)
+CASES: Final = (*KINDS, *STARTS, HALF_DEAD, MUTE_AT_STOP)
+CONTRADICTS: Final = frozenset({STORED, MANY_TURNS})  # a servo may be refused for it at the start
+LATCHED: Final = frozenset({"overload", "overheat", "voltage", "stuck"})  # a servo's protection holds on to these
+LIMP_S: Final = {"stuck": 3.0}  # a joint that was pinched stays limp so long before it comes back
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one case on one family; see the head of this file. `possible`: this family can have that case."""
+
+    family: str
+    case: str
+    ticks: int
+    possible: bool = True
+    escaped: str | None = None
+    outside: int = 0
+    pulse_us: Sequence[float] = ()
+    stale: int = 0
+    recovered_s: float | None = None
+    named: Sequence[str] = ()
+    refused: str | None = None
+    off_s: float | None = None
+    stop_s: float | None = None
+    left_on: int = 0
+
+    @property
+    def as_stated(self) -> bool:
+        """Whether every joint came back in time, or stays out for a reason that is stated."""
+        if self.case == MUTE_AT_STOP:
+            return (self.off_s or 0.0) <= _OFF_S and (self.stop_s or 0.0) <= _STOP_S and self.off_s is not None
+        if self.refused is not None:
+            return self.case in CONTRADICTS
+        reasons = all("left alone" in each or self.case in LATCHED for each in self.named)
+        within_s = RECOVERY_S + LIMP_S.get(self.case, 0.0)
+        return self.recovered_s is not None and self.recovered_s <= within_s and reasons
+
+    @property
+    def passed(self) -> bool:
+        unchecked = self.case == CORRUPT and not FAMILIES[self.family][-1]
+        harmless = self.escaped is None and (unchecked or not self.outside) and not self.stale and not self.left_on
+        return not self.possible or (harmless and self.as_stated)
+
+
+@dataclass
+class SilencePort(WrappedPort):
+    """A port on which silence costs time; what is written arrives at once, and `arrived` is called."""
+
+    baud: int
+    arrived: Callable[[], None]
+
+    def write(self, data: bytes) -> None:
+        self.inner.write(data)
+        self.inner.set_baud(self.baud)  # hands over what was written
+        self.arrived()
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        data = self.inner.read(n, deadline_s)
+        if not data:
+            self.inner.wait_until(deadline_s)
+        return data
+
+
+def one(family: str, case: str, ticks: int = TICKS) -> Outcome:
+    """Run `ticks` of one family in one case."""
+    if case == MUTE_AT_STOP:
+        return _mute_at_stop(family)
+    head = head_of(family, _FAILS_AFTER_S if case == HALF_DEAD else None)
+    servos = emulated(head)
+    if case in STARTS:
+        servos["main"] = _found(servos["main"], case)
+    if not servos["main"] or (case == "voltage" and load_firmware_map(servos["main"][0].model).tick_us):
+        return Outcome(family, case, 0, possible=False)
+    with plugged_in(head, servos) as rig:
+        try:
+            rig.hold()
+        except ServoError as error:
+            return _at_the_end(rig, Outcome(family, case, 0, refused=str(error)))
+        over_s = start_s = rig.clock.now_s() + _QUIET * ticks / RATE_HZ
+        if case == HALF_DEAD:
+            rig.chains["other"].inject(f"silent@{start_s:g}")
+        elif case in KINDS:
+            over_s += _FAULTY * ticks / RATE_HZ
+            names = {"one": f":{rig.ids[1]}", "two": f":{rig.ids[1]},{rig.ids[2]}"}
+            rig.chains["main"].inject(SPECS[case].format(when=f"@{start_s:g}-{over_s:g}", **names))
+        return _ride(rig, Outcome(family, case, ticks), over_s)
+
+
+def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
+    """Return the servos, two of them not as the head's file says; none where the family cannot be found like that."""
+    table = load_firmware_map(servos[0].model)
+    turn = round(table.ticks_per_revolution)
+    changes: list[dict[str, Any]]
+    if case == OUTSIDE:
+        beyond = round((LIMIT_DEG + _OUTSIDE_DEG) / 360.0 * table.ticks_per_revolution)
+        changes = [{"start_ticks": table.center_ticks + sign * beyond} for sign in (1, -1)]
+    elif case == STORED:
+        names = [name for name in table.registers if name.endswith(("position_limit", "angle_limit"))]
+        if not names:
+            return []
+        sides = {name: 1 if name.startswith(("max", "ccw")) else -1 for name in names}
+        narrow = {name: table.center_ticks + side * turn // 20 for name, side in sides.items()}
+        changes = [{"registers": narrow}] * 2
+    else:
+        if not table.registers or table.ticks_per_revolution != turn:
+            return []  # a board, or a potentiometer, which knows one turn only
+        registers = {}
+        if "multi_turn_offset" in table.registers:
+            registers = {"cw_angle_limit": 4095, "ccw_angle_limit": 4095}
+        elif "phase" in table.registers:
+            registers = {"phase": 28}
+        changes = [{"start_ticks": table.center_ticks + sign * turn + 54, "registers": registers} for sign in (1, -1)]
+    return [servos[0], *(replace(s, **change) for s, change in zip(servos[1:3], changes, strict=True)), servos[3]]
+
+
+def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
+    """Run the ticks and judge them; the trouble is over at `over_s`, or half of the buses die then.
+
+    A bus that dies is reported once, by a BusError, and the other one continues.
+    """
+    judge, reports, dies = Judge(rig), 0, outcome.case == HALF_DEAD
+    for tick in range(outcome.ticks):
+        if dies and rig.clock.now_s() >= over_s:
+            judge.away = frozenset({2, 3})
+        try:
+            judge.see(rig.tick())
+            if tick % _BAD_GOALS_EVERY == 0 and not dies:
+                rig.try_bad_goals(bool(judge.named))
+        except Exception as error:  # what escapes is what is looked for
+            reports += 1
+            if not dies or reports > 1 or not isinstance(error, BusError):
+                outcome = replace(outcome, ticks=tick, escaped=f"{type(error).__name__}: {error}")
+                break
+    if dies and not reports and rig.clock.now_s() > over_s + _SAID_BY_S:
+        outcome = replace(outcome, escaped="nothing: the failure of a bus was not reported")
+    for chain in rig.chains.values():
+        chain.clear_faults()  # what was dead is plugged in again: torque off has to reach it
+    outcome = replace(
+        outcome,
+        outside=judge.outside,
+        pulse_us=[edge(judge.pulses_us) for edge in (min, max) if judge.pulses_us],
+        stale=judge.stale,
+        recovered_s=judge.recovered_s(over_s),
+        named=judge.named,
+    )
+    return _at_the_end(rig, outcome)
+
+
+def _at_the_end(rig: Rig, outcome: Outcome) -> Outcome:
+    """Switch torque off, and count the servos that still have it."""
+    rig.bus.stop("release")
+    rig.bus.close()
+    return replace(outcome, left_on=sum(bool(state["torque"]) for state in rig.states()))
+
+
+def _mute_at_stop(family: str) -> Outcome:
+    """Call `stop` while all obey and none answers, and silence costs time."""
+    head, start_s, off_s = head_of(family), np.inf, np.inf
+
+    def arrived() -> None:
+        nonlocal off_s
+        if rig.clock.now_s() >= start_s and not any(state["torque"] for state in rig.states()):
+            off_s = min(off_s, rig.clock.now_s() - start_s)
+
+    with plugged_in(head, wrap=lambda port: SilencePort(port, head.buses["main"].baud, arrived)) as rig:
+        rig.hold()
+        for _ in range(round(_QUIET * TICKS)):
+            rig.tick()
+        rig.chains["main"].inject("mute")
+        start_s = rig.clock.now_s()
+        rig.bus.stop("release")
+        stop_s = rig.clock.now_s() - start_s
+        return _at_the_end(rig, Outcome(family, MUTE_AT_STOP, 0, off_s=float(off_s), stop_s=stop_s))
+
+
+def run_campaign(
+    families: Iterable[str] = tuple(FAMILIES),
+    cases: Iterable[str] = CASES,
+    ticks: int = TICKS,
+    progress: Callable[[str], None] = lambda line: None,
+) -> list[Outcome]:
+    """Run every case on every family."""
+    out = []
+    for family, case in product(families, cases):
+        progress(f"{family}: {case}")
+        out.append(one(family, case, ticks))
+    return out
+
+
+def measure(say: Callable[[str], None]) -> Told:
+    """Return `run_campaign` in the form of a bench."""
+    logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
+    outcomes = run_campaign(progress=say)
+    plain = [asdict(each) | {"passed": each.passed} for each in outcomes]
+    passed, corrupted = all(each["passed"] for each in plain), corrupted_bytes(outcomes)
+    lines = [f"{family}, corrupted bytes: {', '.join(said.values())}" for family, said in corrupted.items()]
+    return Told({"passed": passed, "runs": plain, "corrupted_bytes": corrupted}, table(outcomes), lines, passed)
+
+
+def corrupted_bytes(outcomes: Sequence[Outcome]) -> dict[str, dict[str, str]]:
+    """Return, per family, its checksum and what came of corrupted requests, in words."""
+    return {
+        each.family: {
+            "checksum": FAMILIES[each.family][-1] or "no checksum",
+            "goals": f"{each.outside} outside limits",
+            "pulses": "{:g} to {:g} us".format(*each.pulse_us) if each.pulse_us else "no pulses",
+        }
+        for each in outcomes
+        if each.case == CORRUPT
+    }
+
+
+def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """Return a row per run, as printed."""
+
+    def short(value: float | None) -> float | None:
+        return None if value is None else round(value, 3)
+
+    return [
+        {
+            "family": each.family,
+            "case": each.case,
+            "escaped": each.escaped or 0,
+            "outside": each.outside,
+            "stale": each.stale,
+            "back s": short(each.recovered_s),
+            "out": len(each.named) + (each.refused is not None),
+            "off s": short(each.off_s),
+            "stop s": short(each.stop_s),
+            "left on": each.left_on,
+            "passed": ("yes" if each.passed else "NO") if each.possible else "-",
+        }
+        for each in outcomes
+    ]

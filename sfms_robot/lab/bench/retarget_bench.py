@@ -1,0 +1,103 @@
+"""One tick from a face to servo ticks, of a head that listens to recorded faces."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from sfms_robot.app.head.faces import recorded_faces
+from sfms_robot.app.open_head import build_motion
+from sfms_robot.config import load_firmware_map, load_head
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan
+from sfms_robot.lab.bench.adversary import adversarial
+from sfms_robot.lab.bench.measure import HEAD, Row, row, times
+from sfms_robot.motion.calibration import Calibration
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.retarget.kinematics import Stewart
+from sfms_robot.runtime.loop import difference
+
+RATE_HZ = 100.0
+TICKS = 2000
+_HORIZON, _HOP = 8, 4
+STEWART_HEAD = "reachy_mini"
+
+
+def retarget(head: str | None = None, frames: int | None = None) -> dict[str, Row]:
+    """CPU time of a tick, or violations over so many wild `frames`, of all heads or of one.
+
+    Raises ConfigError for a head without frames.
+    """
+    if frames is not None:
+        return adversarial(frames, (head,) if head else ())
+    if head is not None:
+        raise ConfigError(f"--head {head}: 'bench retarget' takes a head with --frames N")
+    return {**_tick(), "retarget.stewart": _stewart()}
+
+
+def _tick() -> dict[str, Row]:
+    """CPU time of `retarget.tick` = mapping + limits + calibration, of each of them, and of the timeline before."""
+    head = load_head(HEAD)
+    motion = build_motion(head, RATE_HZ)
+    turns = [load_firmware_map(joint.model).ticks_per_revolution for joint in head.joints.values()]
+    calibration = Calibration(head.joints, np.array(turns))
+    plans = _plans(TICKS)
+    timeline, limiter = motion.timeline.start(), motion.limiter.start(motion.rest_rad)
+    before = here = motion.rest_rad
+    memory = motion.retargeter.start()
+    spent: dict[str, list[float]] = {"timeline": [], "mapping": [], "limits": [], "calibration": []}
+    for tick in range(TICKS):
+        now_s = tick / RATE_HZ
+        marks = [time.thread_time()]
+        if now_s >= plans[0].made_at_s:
+            timeline = motion.timeline.accept(plans.pop(0), timeline)
+        asked_s = np.concatenate([[now_s], now_s + motion.leads_s + 1 / RATE_HZ])
+        faces, timeline = motion.timeline.sample(asked_s, now_s, timeline)
+        marks.append(time.thread_time())
+        ahead, memory = motion.retargeter.step(faces[1:], memory)
+        marks.append(time.thread_time())
+        goals, limiter = motion.limiter.step(difference(before, here, ahead, 1 / RATE_HZ), limiter)
+        marks.append(time.thread_time())
+        calibration.to_ticks(goals)
+        marks.append(time.thread_time())
+        before, here = here, ahead
+        for name, took_s in zip(spent, np.diff(marks), strict=True):
+            spent[name].append(1e3 * float(took_s))
+    safe = np.sum([spent["mapping"], spent["limits"], spent["calibration"]], axis=0).tolist()
+
+    rng = np.random.default_rng(0)
+    matrix, frame = rng.normal(size=(len(head.joints), MOTION_DIM)), rng.normal(size=MOTION_DIM)
+    peers = times(lambda: matrix @ frame, TICKS, time.thread_time)
+    name = f"{len(head.joints)} x {MOTION_DIM} matrix product"
+    rows = {f"retarget.{part}": row(took, peers, "ms", name) for part, took in spent.items()}
+    return {"retarget.tick": row(safe, peers, "ms", name), **rows}
+
+
+def _plans(ticks: int) -> list[Plan]:
+    """Recorded faces as plans of 8 frames, a new one every 4, from 0 s to past the last tick."""
+    need = int(ticks / RATE_HZ / FRAME_S) + 2 * _HORIZON
+    clips: list[Floats] = []
+    while sum(map(len, clips)) < need:
+        clips += [clip for clip in recorded_faces() if len(clip) > _HORIZON]
+    faces = np.concatenate(clips)
+    return [
+        Plan(k * FRAME_S, FRAME_S * np.arange(k + 1.0, k + _HORIZON + 1), faces[k : k + _HORIZON])
+        for k in range(0, need - _HORIZON, _HOP)
+    ]
+
+
+def _stewart() -> Row:
+    """The closed-form inverse of six legs beside one product of six rows of three."""
+    neck = HeadRetargeter(load_head(STEWART_HEAD)).neck
+    if not isinstance(neck, Stewart):
+        raise TypeError(f"{STEWART_HEAD} stands on no platform")
+    pose: Doubles = np.array([0.05, 0.1, 0.02, 0.003, 0.002, 0.001])
+    rows, way = np.random.default_rng(0).normal(size=(6, 3)), np.array([0.1, 0.2, 0.3])
+    platform = neck.geometry
+    return row(
+        times(lambda: platform.inverse(pose), TICKS, time.thread_time),
+        times(lambda: rows @ way, TICKS, time.thread_time),
+        "ms",
+        "6 x 3 matrix product",
+    )

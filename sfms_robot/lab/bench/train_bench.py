@@ -1,0 +1,74 @@
+"""`bench train`: a step of every stage of the trainings that fit this machine, beside plain matrix products.
+
+A step is the whole of it, as `train` makes it: data drawn, loss, gradients, clipping, optimizer. Its multiplications
+and additions in products are counted (`operation_count`), and the peer is so many of them in one product of square
+matrices after the other: what torch makes of this machine when nothing else is to be done. Frames are made up: what a
+step costs does not depend on what is in them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import torch
+
+from sfms_robot.config import load_training
+from sfms_robot.data import data_dir
+from sfms_robot.lab.bench.measure import Row, row, times
+from sfms_robot.lab.bench.operation_count import OperationCount
+from sfms_robot.lab.learning.gradients import Gradients
+from sfms_robot.lab.learning.job import Job
+from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.training_loop import make_step
+from sfms_robot.lab.train.dry_run import jobs_of
+
+FILES: Final = ("sfms-small", "arig")
+STEPS: Final = 8
+LIMIT_S: Final = 8.0  # for the steps of one stage
+SIDE: Final = 768  # of the peer's matrices: they fit no cache of one core, and are large enough to be quick
+_PRODUCTS: Final = 20
+
+
+def measure(say: Callable[[str], None]) -> dict[str, Row]:
+    """A row a stage, a minute in all."""
+    product_s = _product_s()
+    rows = {}
+    for file in FILES:
+        settings = load_training(data_dir("configs") / "training" / f"{file}.yaml")
+        for stage, job, _ in jobs_of(settings):
+            name = f"train.{file}" if stage == "arig" else f"train.{file}.{stage}"
+            say(name)
+            rows[name] = _steps(job, product_s)
+    return rows
+
+
+def _steps(job: Job, product_s: float) -> Row:
+    """Durations of steps beside products of as many operations."""
+    generator = torch.Generator().manual_seed(job.seed)
+    job.model.train()
+    with TemporaryDirectory() as scratch:
+        gradients = Gradients(job, ProcessGroup(), 1, Path(scratch))
+        with OperationCount() as count:  # also the first, which is slower
+            make_step(gradients, 0, generator)
+        taken_ms: list[float] = []
+        began_s = time.perf_counter()
+        while len(taken_ms) < STEPS and time.perf_counter() - began_s < LIMIT_S:
+            step_s = time.perf_counter()
+            make_step(gradients, 1 + len(taken_ms), generator)
+            taken_ms.append((time.perf_counter() - step_s) * 1e3)
+    products_ms = count.matrix / (2 * SIDE**3) * product_s * 1e3
+    found = row(taken_ms, [products_ms], "ms a step", f"{count.matrix / 1e9:.1f} GFLOP as plain products")
+    return found | {
+        "steps_per_s": round(1e3 / found["median"], 2),
+        "frames_per_s": round(1e3 / found["median"] * job.frames_per_step),
+    }
+
+
+def _product_s() -> float:
+    """One product of square matrices, in fp32, with the threads that a training has."""
+    left, right = torch.rand(SIDE, SIDE), torch.rand(SIDE, SIDE)
+    return sorted(times(lambda: left @ right, _PRODUCTS))[_PRODUCTS // 2] * 1e-3

@@ -1,0 +1,215 @@
+"""Data too big for memory: clips known by name and length, read one at a time, and a list of what is wrong with it.
+
+Every layout of files on disk is one `Layout`: how to know it, which splits it has, and `scan`, which looks at names
+and headers only and gives a `Dataset`. What cannot be used is left out by name, as a `Problem`: never silently.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal, TypeVar, overload
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import Floats
+from sfms_robot.lab.corpora.clips import UNREADABLE, Dyad
+
+_T = TypeVar("_T")
+Order = Literal["exp-first", "pose-first"]
+Kind = Literal[
+    "missing half", "missing sound", "missing feature", "wrong dims", "lengths differ", "not finite", "too short",
+    "unreadable", "swapped order", "time stamps",
+]  # fmt: skip
+
+_NAMED: Final = 5  # problems a warning names
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that makes a clip, a file or a feature unusable."""
+
+    kind: Kind
+    where: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.detail}"
+
+
+class ClipError(ConfigError):
+    """One clip cannot be used; the others can."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(str(problem))
+        self.problem = problem
+
+    @classmethod
+    def of(cls, kind: Kind, where: Path | str, detail: object) -> ClipError:
+        return cls(Problem(kind, str(where), str(detail).splitlines()[0] if str(detail) else type(detail).__name__))
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One listener's clip: its name, frames, and how to read it.
+
+    Attributes:
+        row: its place in the layout's own list, before anything was left out (REACT's appropriateness matrix counts
+            in it).
+        read: gives the dyad without features; raises ClipError or what `UNREADABLE` names.
+        features: readers of what else the layout ships about the frames, (N, F).
+    """
+
+    name: str
+    frames: int
+    row: int
+    read: Callable[[], Dyad]
+    features: Mapping[str, Callable[[], Floats]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Dataset(Sequence[Dyad]):
+    """Dyads of one split, read when asked for.
+
+    Attributes:
+        features: names of the shipped features each dyad carries.
+        problems: what was left out, and why.
+        notes: what else a person should know.
+        licence: what may be done with the data, as far as they say; None: they do not.
+    """
+
+    layout: str
+    split: str
+    space: str
+    fps: float
+    clips: tuple[Clip, ...]
+    problems: tuple[Problem, ...] = ()
+    notes: tuple[str, ...] = ()
+    features: tuple[str, ...] = ()
+    licence: str | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(clip.name for clip in self.clips)
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Frames of each clip."""
+        return tuple(clip.frames for clip in self.clips)
+
+    @property
+    def minutes(self) -> float:
+        return sum(self.lengths) / self.fps / 60
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    @overload
+    def __getitem__(self, index: int) -> Dyad: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Dataset: ...
+
+    def __getitem__(self, index: int | slice) -> Dyad | Dataset:
+        """One dyad, read now, or a part of the set. Raises ClipError for a clip that cannot be used."""
+        if isinstance(index, slice):
+            return replace(self, clips=self.clips[index])
+        clip = self.clips[index]
+        dyad = guarded(clip.name, clip.read)
+        if not self.features:
+            return dyad
+        shipped = {name: guarded(clip.name, clip.features[name]) for name in self.features if name in clip.features}
+        if missing := [name for name in self.features if name not in shipped]:
+            raise ClipError.of("missing feature", clip.name, f"has no {', '.join(missing)}")
+        return guarded(clip.name, lambda: replace(dyad, features={**dyad.features, **shipped}))
+
+    def map(self, change: Callable[[Dyad], Dyad], space: str | None = None) -> Dataset:
+        """The same set, every dyad changed as it is read (smoothed, moved to another space, given features)."""
+
+        def changed(clip: Clip) -> Clip:
+            return replace(clip, read=lambda: change(guarded(clip.name, clip.read)))
+
+        return replace(self, space=space or self.space, clips=tuple(changed(clip) for clip in self.clips))
+
+    def checked(self, least_frames: int = 0, each: Callable[[Dyad | None], None] | None = None) -> Dataset:
+        """The clips that can be used, every one of them read once; the others join the problems.
+
+        `each` is given every dyad, or None for a clip that cannot be used.
+        """
+        kept, problems = [], list(self.problems)
+        for index, clip in enumerate(self.clips):
+            dyad = None
+            try:
+                if clip.frames < (least := max(1, least_frames)):
+                    detail = f"{clip.frames} frames, a window needs {least}"
+                    raise ClipError.of("too short", clip.name, detail)
+                dyad = self[index]
+                kept.append(clip)
+            except ClipError as error:
+                problems.append(error.problem)
+            if each is not None:
+                each(dyad)
+        return replace(self, clips=tuple(kept), problems=tuple(problems))
+
+    def summary(self) -> str:
+        """One line: what is there, and how much was left out."""
+        left_out = Counter(problem.kind for problem in self.problems)
+        said = ", ".join(f"{count} {kind}" for kind, count in left_out.items())
+        return f"{self.layout} {self.split}: {len(self)} clips, {self.minutes:.1f} min" + (
+            f"; left out: {said}" if said else ""
+        )
+
+
+def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
+    """Every dyad that can be read; the others are counted and named in one warning when all are through."""
+    left_out = []
+    for index in range(len(dyads)):
+        try:
+            dyad = dyads[index]
+        except ClipError as error:
+            left_out.append(str(error))
+        else:
+            yield dyad
+    if left_out:
+        named = "; ".join(left_out[:_NAMED]) + ("; ..." if len(left_out) > _NAMED else "")
+        log.warning("%d of %d clips cannot be used: %s", len(left_out), len(dyads), named)
+
+
+def guarded(where: str, read: Callable[[], _T]) -> _T:
+    """What `read` gives; whatever a broken file makes it raise becomes a ClipError."""
+    try:
+        return read()
+    except ClipError:
+        raise
+    except (ConfigError, *UNREADABLE) as error:
+        raise ClipError.of("unreadable", where, error) from error
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How one family of data sets lies on disk.
+
+    Attributes:
+        space, fps: of the motion.
+        order: of the channels in the files as they are shipped; None: there is only one.
+        root: the folder in or under the given one in which it lies, or None: this is not the layout.
+        splits: their names by ours (train, validation, test, ...).
+        scan: (root, their split's name, order) -> Dataset. Reads headers only where the format allows it.
+        held_out: share of train that serves as validation where the layout ships none.
+        features: names of what it ships beside motion and sound.
+    """
+
+    name: str
+    about: str
+    space: str
+    fps: float
+    order: Order | None
+    root: Callable[[Path], Path | None]
+    splits: Callable[[Path], Mapping[str, str]]
+    scan: Callable[[Path, str, Order | None], Dataset]
+    held_out: float = 0.0
+    features: tuple[str, ...] = ()

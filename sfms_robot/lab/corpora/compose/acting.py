@@ -1,0 +1,447 @@
+"""From a score of events to a listener's motion: recorded primitives, stretched and laid where things happened.
+
+Everything is added to a head and a face that never stand still. Layers are joined so that neither value nor speed
+jumps: primitives start and end at rest, looks go by `signals.gaze_kinematics`, loops are crossfaded. What was laid,
+when and how large, comes back as events. Nothing else of their kind is put there, but for what a head does that speaks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.config.drives import other_side
+from sfms_robot.frames import (
+    BLENDSHAPES,
+    CHANNEL_INDEX,
+    FRAME_HZ,
+    FRAME_S,
+    LATERAL_POSE,
+    MOTION_DIM,
+    POSE,
+    SHAPES,
+    Doubles,
+    Floats,
+    ListenerEvent,
+)
+from sfms_robot.lab.corpora.compose.motions import SHAPE, edges, slow
+from sfms_robot.lab.corpora.compose.splicing import (
+    FADE,
+    SMILE,
+    first_frame,
+    held,
+    laid_event,
+    over,
+    pick,
+    placed,
+    stretched,
+    tiled,
+)
+from sfms_robot.signals import event_sizes as sizes
+from sfms_robot.signals import gaze_kinematics
+from sfms_robot.signals.events import runs
+from sfms_robot.signals.motion_primitives import Motions
+
+NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay below 1800 deg/s^2
+_LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
+_MIRROR: Final = [BLENDSHAPES.index(other_side(name)) for name in BLENDSHAPES]
+_TURNED: Final = [CHANNEL_INDEX[name] for name in LATERAL_POSE]
+
+
+def _nothing(*shape: int) -> Doubles:
+    return np.zeros(shape)
+
+
+def _spans() -> Doubles:
+    return _nothing(0, 2)
+
+
+@dataclass(frozen=True)
+class Score:
+    """What happens in `frames` frames, in seconds from their beginning; spans are (K, 2) start, end.
+
+    Attributes:
+        nods, shakes, tilts, laughs, talk, backchannels, mm_hms: the listener's own.
+        gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away". How
+            far and to which side goes by `signals.event_sizes`, since no robot sits at their table.
+        shared_laughs: laughs of the others.
+        asked, ends: instants at which the others asked something, and at which their phrases ended.
+        mouth: (frames, 52) that belongs to his own recorded voice, or None: a recorded mouth that fits none.
+    """
+
+    frames: int
+    nods: Doubles = field(default_factory=_spans)
+    shakes: Doubles = field(default_factory=_spans)
+    tilts: Doubles = field(default_factory=_spans)
+    laughs: Doubles = field(default_factory=_spans)
+    talk: Doubles = field(default_factory=_spans)
+    backchannels: Doubles = field(default_factory=_spans)
+    mm_hms: Doubles = field(default_factory=_spans)
+    gaze: tuple[tuple[float, float, str], ...] = ()
+    shared_laughs: Doubles = field(default_factory=_spans)
+    asked: Doubles = field(default_factory=lambda: _nothing(0))
+    ends: Doubles = field(default_factory=lambda: _nothing(0))
+    mouth: Floats | None = None
+
+
+@dataclass(frozen=True)
+class Acted:
+    """Motion (N, 58), the events that are in it by their start, and the part (N, 3) of its head that is gaze."""
+
+    motion: Floats
+    events: tuple[ListenerEvent, ...]
+    head_of_gaze_rad: Floats
+
+
+def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
+    """One listener, whose manners (size and pace of nods, how often he blinks, where he looks) are drawn."""
+    motion = np.zeros((score.frames, MOTION_DIM), np.float32)
+    pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
+    targets, looks = _targets(score, rng)
+    pose[:, :3] = _sway(motions, score.frames, rng)
+    pose[:, 3:] = _drift(motions, score.frames, rng)
+    pose += _talking_head(score, motions, rng)
+    events = looks + _gestures(pose, score, motions, rng)
+    shapes += _idle(motions, score.frames, rng)
+    events += _smile(shapes, score, motions, rng)
+    events += _raise_brows(shapes, score, motions, rng)
+    events += _speak(shapes, score, motions, rng)
+    cues = np.concatenate([score.ends, [look.start_s for look in looks]])
+    events += _blink(shapes, cues, motions, rng)
+    np.clip(shapes, 0, 1, out=shapes)
+    head, eyes, _ = gaze_kinematics.follow(targets, pose, gaze_kinematics.start(int(rng.integers(2**31))))
+    pose[:, :3] += head
+    motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
+    acted = Acted(motion, tuple(sorted(events, key=lambda event: event.start_s)), head)
+    return _mirror_image(acted) if rng.random() < 0.5 else acted
+
+
+def speaker_motion(
+    mouth: Floats,
+    motions: Motions,
+    rng: np.random.Generator,
+    attention: Floats | None = None,
+    laughs: Doubles | None = None,
+    nods: Doubles | None = None,
+) -> Floats:
+    """(N, 58) of somebody who speaks with this mouth (N, 52); head and the rest of the face from recordings.
+
+    Args:
+        attention: (N,) 1 where they look at the listener, 0 where they do not, NaN where anything may be.
+        laughs, nods: (K, 2) seconds.
+    """
+    motion = np.zeros((len(mouth), MOTION_DIM), np.float32)
+    pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
+    pose += rng.uniform(0.5, 1.1) * tiled(motions.heads, len(mouth), rng)
+    _nod(pose, _spans() if nods is None else nods, motions, rng)
+    shapes += np.clip(tiled(motions.faces, len(mouth), rng) + rng.uniform(0.8, 1.1) * mouth, 0, 1)
+    for start, end in _spans() if laughs is None else laughs:
+        _lay_smile(shapes, start - 0.2, end - start + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7, motions, rng)
+    np.clip(shapes, 0, 1, out=shapes)
+    known = np.full(len(mouth), np.nan, np.float32) if attention is None else attention
+    state = gaze_kinematics.start(int(rng.integers(2**31)))
+    head, eyes, _ = gaze_kinematics.follow(_speaker_targets(known, rng), pose, state)
+    pose[:, :3] += head
+    motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
+    return mirrored(motion) if rng.random() < 0.5 else motion
+
+
+def mirrored(motion: Floats) -> Floats:
+    """The same motion (N, 58) of the mirror image."""
+    out = motion.copy()
+    out[:, SHAPES] = motion[:, SHAPES][:, _MIRROR]
+    out[:, _TURNED] *= -1
+    return out
+
+
+def _mirror_image(acted: Acted) -> Acted:
+    head = acted.head_of_gaze_rad * np.array([-1, 1, -1], np.float32)
+    events = tuple(
+        event
+        if event.target_rad is None
+        else replace(event, target_rad=(0.0 - event.target_rad[0], event.target_rad[1]))
+        for event in acted.events
+    )
+    return Acted(mirrored(acted.motion), events, head)
+
+
+# --- head -------------------------------------------------------------------------------------------------------
+
+
+def _sway(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
+    """Idle roll, pitch, yaw: recorded slow motion brought to about a degree."""
+    unit = [piece / (piece.std(axis=0) + 1e-6) for piece in motions.sway]
+    size = np.deg2rad(rng.uniform(0.4, 1.1)) * np.array([1.0, 0.8, 1.0], np.float32)
+    return np.asarray(tiled(unit, frames, rng, fade=2 * FADE) * size * rng.choice([-1, 1], 3), np.float32)
+
+
+def _drift(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
+    """Idle x, y, z: millimetres."""
+    slowly = [slow(head[:, 3:], 0.5) for head in motions.heads]
+    return np.asarray(rng.uniform(0.2, 0.5) * tiled(slowly, frames, rng), np.float32)
+
+
+def _talking_head(score: Score, motions: Motions, rng: np.random.Generator) -> Floats:
+    """The head (N, 6) of somebody who speaks, while he does."""
+    talks = np.zeros(score.frames, np.float32)
+    for start, end in score.talk:
+        talks[max(0, first_frame(start)) : max(0, first_frame(end))] = 1
+    ramp = edges(FRAME_HZ, FRAME_HZ // 2)
+    eased = np.convolve(talks, ramp / ramp.sum(), "same")[:, None]
+    return np.asarray(eased * rng.uniform(0.2, 0.4) * tiled(motions.heads, score.frames, rng), np.float32)
+
+
+@dataclass(frozen=True)
+class NodHabit:
+    """How one person nods: the usual size [rad, peak to peak], and the pace of the swings."""
+
+    size_rad: float
+    pace_hz: float
+
+
+@dataclass(frozen=True)
+class NodManner:
+    """One nod: size [rad, peak to peak] of its first swing, how many swings, how long all take, how they die away."""
+
+    size_rad: float
+    swings: int
+    duration_s: float
+    fall: float
+
+
+def nod_habit(rng: np.random.Generator) -> NodHabit:
+    """A person's: about 5 degrees, 1.8 to 3 swings a second."""
+    usual = sizes.NOD_DEG[1]
+    size = np.deg2rad(rng.normal(usual, usual * sizes.HABIT_SPREAD))
+    return NodHabit(float(size), float(rng.uniform(*sizes.SWINGS_HZ)))
+
+
+def nod_manner(habit: NodHabit, length_s: float, rng: np.random.Generator) -> NodManner:
+    """How this person makes a nod that is to last about so long: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12 degrees."""
+    swings, lasts_s = sizes.swings(length_s, habit.pace_hz)
+    least, _, most = np.deg2rad(sizes.NOD_DEG)
+    size = np.clip(habit.size_rad * np.exp(rng.normal(0, sizes.NOD_SPREAD)), least, most)
+    return NodManner(float(size), swings, lasts_s, float(rng.uniform(0.65, 0.95)))
+
+
+def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> Floats:
+    """Nose down [rad] (frames,) of a nod from `start_s` on; smaller than its size where a neck could not follow."""
+    out = np.zeros(frames)
+    each_s = manner.duration_s / manner.swings
+    size = min(manner.size_rad, NOD_RAD_S2 * each_s**2 / max(_bend(shape, each_s), 1.0))
+    low, high = max(0, first_frame(start_s) - 1), min(frames, first_frame(start_s + manner.duration_s) + 2)
+    times = np.arange(low + 1, high + 1) * FRAME_S - start_s
+    for swing in range(manner.swings):
+        phase = times / each_s - swing
+        out[low:high] += size * manner.fall**swing * np.interp(phase, np.linspace(0, 1, len(shape)), shape, 0, 0)
+    return out.astype(np.float32)
+
+
+def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    habit, events = nod_habit(rng), []
+    for start, end in spans.tolist():
+        manner = nod_manner(habit, end - start, rng)
+        curve = nod_curve(manner, pick(motions.nods, rng), start, len(pose))
+        pose[:, 1] += curve
+        events.append(ListenerEvent("nod", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
+    return events
+
+
+def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """Nods, shakes and tilts, added to a pose (N, 6)."""
+    events = _nod(pose, score.nods, motions, rng)
+    habit = nod_habit(rng)
+    for start, end in score.shakes.tolist():
+        manner = nod_manner(habit, end - start, rng)
+        curve = sizes.SHAKE * nod_curve(manner, pick(motions.shakes, rng), start, len(pose))
+        pose[:, 2] += rng.choice([-1, 1]) * curve
+        events.append(ListenerEvent("shake", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
+    for start, end in score.tilts:
+        curve = np.deg2rad(rng.uniform(*sizes.TILT_DEG)) * edges(max(12, int((end - start) * FRAME_HZ) + 12), 12)
+        pose[:, 0] += rng.choice([-1, 1]) * placed(curve, start, len(pose))
+        events.append(laid_event("tilt", start, curve, curve.max()))
+    return events
+
+
+def _bend(shape: Floats, length_s: float) -> float:
+    """Largest second derivative of a unit cycle over unit time, as seen at the frame rate."""
+    samples = max(4, int(round(length_s * FRAME_HZ)))
+    played = np.interp(np.linspace(0, 1, samples + 1), np.linspace(0, 1, len(shape)), shape)
+    twice = np.concatenate([[0, 0], np.tile(played[:-1], 2), [0, 0, 0]])
+    return float(np.abs(np.diff(twice, 2)).max()) * samples**2
+
+
+# --- gaze -------------------------------------------------------------------------------------------------------
+
+
+def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[ListenerEvent]]:
+    """Where he looks, (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead; and his gaze shifts."""
+    seats: dict[str, tuple[float, float]] = {}
+    out = np.zeros((score.frames, 2), np.float32)
+    for start, end, where in score.gaze:
+        far, side, up = rng.random(3).tolist()
+        target = sizes.aside(sizes.aside_rad(far), side, up)
+        if where.startswith("side"):  # the same person sits where he sat
+            target = seats.setdefault(where, target)
+        out[max(0, first_frame(start)) : max(0, first_frame(end))] = target
+    return out, _shifts(out)
+
+
+def _shifts(targets: Floats) -> list[ListenerEvent]:
+    """One event at each step of the targets (N, 2); before the first frame he looked at the person."""
+    before = np.concatenate([np.zeros((1, 2), np.float32), targets])
+    at = np.flatnonzero((np.diff(before, axis=0) != 0).any(axis=1)).tolist()
+    return [
+        ListenerEvent(
+            "gaze_shift",
+            first * FRAME_S,
+            (last - first) * FRAME_S,
+            float(np.hypot(*(targets[first] - before[first]))),
+            target_rad=(float(targets[first, 0]), float(targets[first, 1])),
+        )
+        for first, last in pairwise([*at, len(targets)])
+    ]
+
+
+def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
+    """Where somebody looks who speaks, (N, 2): at the listener or not, as told; at random where nothing is told."""
+    at_listener = attention > 0.5
+    unknown = np.isnan(attention)
+    looks, row = bool(rng.random() < 0.6), 0
+    while row < len(attention):
+        long = max(5, int(FRAME_HZ * 1.5 * np.exp(rng.normal(0, 0.7))))
+        at_listener[row : row + long] |= unknown[row : row + long] & looks
+        looks, row = not looks, row + long
+    out = np.zeros((len(attention), 2), np.float32)
+    for start, end in runs(~at_listener):
+        while start < end:
+            long = int(FRAME_HZ * rng.uniform(1, 4))
+            aside = rng.choice([-1, 1]) * rng.uniform(15, 32), rng.normal(4, 6)
+            out[start : min(end, start + long)] = np.deg2rad(aside)
+            start += long
+    return out
+
+
+# --- face -------------------------------------------------------------------------------------------------------
+
+
+def _idle(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
+    """The motion of a resting face, lifted so that it hardly ever falls below the neutral."""
+    moving = tiled(motions.idle, frames, rng, fade=12)
+    return np.asarray(rng.uniform(0.7, 1.2) * (moving - np.percentile(moving, 20, axis=0)), np.float32)
+
+
+def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """Own laughs always, laughs of others often, backchannels and nods now and then; only a laugh opens the jaw.
+
+    A smile that would begin during another one is left out.
+    """
+    wanted = [
+        ("laugh", a, b - a + rng.uniform(*sizes.LAUGH_LONGER_S), rng.uniform(*sizes.LAUGH), 0.7)
+        for a, b in score.laughs
+    ]
+    wanted += [
+        ("smile", a, max(b - a, smile_s(rng)), rng.uniform(0.35, 0.7), 0.2)
+        for a, b in score.shared_laughs
+        if rng.random() < 0.6
+    ]
+    wanted += [
+        ("smile", a, smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3
+    ]
+    wanted += [("smile", a, smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.nods if rng.random() < 0.12]
+    events: list[ListenerEvent] = []
+    for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):
+        if any(event.start_s - seen_s < start < event.end_s for event in events):
+            continue
+        curve = _lay_smile(shapes, start - 0.2, seen_s, size, jaw, motions, rng)
+        events.append(laid_event(kind, start - 0.2, curve, curve[:, SMILE].mean(axis=1).max()))
+    return events
+
+
+def smile_s(rng: np.random.Generator) -> float:
+    """How long a smile that answers something is seen."""
+    median_s, deviation, least_s, most_s = sizes.SMILE_S
+    return float(np.clip(median_s * np.exp(rng.normal(0, deviation)), least_s, most_s))
+
+
+def _lay_smile(
+    shapes: Floats,
+    start_s: float,
+    seen_s: float,
+    size: float,
+    jaw: float,
+    motions: Motions,
+    rng: np.random.Generator,
+) -> Floats:
+    """A recorded smile over the face (N, 52) from `start_s` on; the curve (K, 52) that was laid."""
+    curve = held(pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
+    knots = np.arange(0, len(curve) + FRAME_HZ, FRAME_HZ)
+    breath = np.interp(np.arange(len(curve)), knots, rng.uniform(0.9, 1.0, len(knots)))  # no smile stands still
+    curve = (size * curve * (breath * edges(len(curve), 9))[:, None]).astype(np.float32)
+    curve[:, SHAPE["jawOpen"]] *= jaw
+    np.copyto(shapes, over(shapes, placed(curve, start_s, len(shapes))))
+    return curve
+
+
+def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """After half of the questions, with some of the nods."""
+    at = [instant for instant in score.asked if rng.random() < 0.5]
+    at += [start for start, _ in score.nods if rng.random() < 0.15]
+    events: list[ListenerEvent] = []
+    for instant in sorted(at):
+        if events and instant - 0.1 < events[-1].end_s:
+            continue
+        curve, size = pick(motions.brows, rng), rng.uniform(*sizes.BROW_RAISE)
+        length = int(len(curve) * rng.uniform(*sizes.BROW_STRETCH))
+        curve = (size * stretched(curve, length) * edges(length, 6)[:, None]).astype(np.float32)
+        np.copyto(shapes, over(shapes, placed(curve, instant - 0.1, len(shapes))))
+        events.append(laid_event("brow_raise", instant - 0.1, curve, size))
+    return events
+
+
+def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """His own words: the mouth of his voice, or else some recorded mouth over them, small for an "mm-hm".
+
+    The size of an "mm-hm" is how far it opens the jaw.
+    """
+    said = np.zeros_like(shapes) if score.mouth is None else score.mouth
+    source = motions.talk[0]
+    short = {float(start) for start, _ in np.concatenate([score.backchannels, score.mm_hms])}
+    for start, end in score.talk if score.mouth is None else ():
+        length = max(4, int((end - start) * FRAME_HZ))
+        gain = rng.uniform(*sizes.MM_HM) if any(abs(start - other) < 0.3 for other in short) else rng.uniform(0.6, 0.9)
+        offset = int(rng.integers(max(1, len(source) - length)))
+        piece = source[offset : offset + length]
+        said = said + placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
+    np.copyto(shapes, over(shapes, said))
+    events = []
+    for start, end in score.mm_hms.tolist():
+        low, high = max(0, first_frame(start)), max(first_frame(start) + 1, first_frame(end))
+        jaw = float(said[low:high, SHAPE["jawOpen"]].max(initial=0.0))
+        events.append(ListenerEvent("mm_hm", start, end - start, min(1.0, jaw)))
+    return events
+
+
+def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+    """Recorded intervals at a personal rate; half the blinks wait for a cue (gaze shift, phrase end) close by."""
+    end_s = len(shapes) * FRAME_S
+    pace, gaps = rng.uniform(0.75, 1.4), np.concatenate(motions.gaps)
+    at, times = rng.uniform(0, 3), []
+    while at < end_s:
+        near = cues[np.abs(cues - at) < 0.6] if len(cues) else cues
+        times.append(float(rng.choice(near)) if len(near) and rng.random() < 0.5 else at)
+        at += pace * float(rng.choice(gaps))
+    times += [cue for cue in cues if rng.random() < 0.08]
+    events: list[ListenerEvent] = []
+    for instant in sorted(times):
+        if events and instant - events[-1].start_s < 0.5:
+            continue
+        curve = pick(motions.blinks, rng)
+        size = rng.uniform(*sizes.BLINK[0 if rng.random() < sizes.SLIGHT_BLINKS else 1])
+        curve = (size * curve).astype(np.float32)
+        np.maximum(shapes, placed(curve, instant, len(shapes)), out=shapes)
+        events.append(laid_event("blink", instant, curve, curve[:, _LIDS].mean(axis=1).max()))
+    return events

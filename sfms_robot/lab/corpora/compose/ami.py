@@ -1,0 +1,208 @@
+"""The AMI meeting annotations, seen from each listener: when he nods, looks, laughs, speaks, and when others speak.
+
+Reads the tables head_gestures, gaze_focus, words, dialogue_acts and participants (CSV, gzipped or not) of one folder.
+Times are seconds of the meeting; an interval table is (K, 2) start, end, sorted by start.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import Doubles
+from sfms_robot.lab.corpora.compose.motions import table
+from sfms_robot.lab.corpora.splits import Split, by_split, split_of
+
+GAP_S: Final = 0.2  # shorter silences are part of a phrase
+NODS: Final = ("concord_signal nod", "concord_signal ")  # form nod, and form left blank
+_SHORT_S: Final = 0.6  # an isolated word
+_ALONE_S: Final = 0.5  # of silence before and after it
+_COLUMNS: Final = {
+    "participants": ("meeting", "agent", "participant", "head_annotated_until_s", "has_gaze_focus"),
+    "head_gestures": ("meeting", "agent", "start_s", "end_s", "type", "form"),
+    "gaze_focus": ("meeting", "agent", "start_s", "end_s", "type", "target"),
+    "words": ("meeting", "agent", "start_s", "end_s", "kind", "text"),
+    "dialogue_acts": ("meeting", "agent", "start_s", "end_s", "type"),
+}
+_Rows = dict[str, list[str]]
+_Spans = dict[tuple[str, str], list[tuple[float, float, str]]]
+
+
+@dataclass(frozen=True)
+class Person:
+    """One participant of one meeting, as a listener to everybody else in it.
+
+    Attributes:
+        meeting, agent, participant: who; `agent` is the letter used as a gaze target.
+        until_s: his head was annotated from 0 to here.
+        nods, shakes, tilts: head gestures (concord signal; discord or negative; other communicative). Some annotators
+            left the form of a nod blank; where they did not, 98 % of concord signals are nods.
+        unseen: his head was off camera.
+        gaze: (start, end, target): an agent's letter, a place, or "" (unspecified); None where nobody annotated it.
+        laughs, talk, backchannels: his own voice.
+        others: phrases of all the others together, joined across gaps under 0.2 s.
+        floor: (start, end, agent) phrases of each of the others.
+        others_laughs: laughs of the others.
+        asked: ends of the others' acts that ask for something.
+        others_backchannels: of the others.
+        mm_hms: his own isolated words under 0.6 s, silent for 0.5 s before and after.
+        others_nods: (start, end, agent) nods of each of the others.
+        looked_at: (start, end, agent) of each of the others looking at him.
+        gaze_known: the others whose gaze was annotated.
+        words: every single one, by agent, his own among them.
+    """
+
+    meeting: str
+    agent: str
+    participant: str
+    until_s: float
+    nods: Doubles
+    shakes: Doubles
+    tilts: Doubles
+    unseen: Doubles
+    gaze: tuple[tuple[float, float, str], ...] | None
+    laughs: Doubles
+    talk: Doubles
+    backchannels: Doubles
+    others: Doubles
+    floor: tuple[tuple[float, float, str], ...]
+    others_laughs: Doubles
+    asked: Doubles
+    others_backchannels: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
+    mm_hms: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
+    others_nods: tuple[tuple[float, float, str], ...] = ()
+    looked_at: tuple[tuple[float, float, str], ...] = ()
+    gaze_known: frozenset[str] = frozenset()
+    words: Mapping[str, Doubles] = field(default_factory=dict)
+
+
+def read_people(folder: Path) -> list[Person]:
+    """Everybody whose head was annotated. Raises ConfigError naming the table, and the column that is missing."""
+    gestures, gaze = _spans(folder, "head_gestures", "type", "form"), _spans(folder, "gaze_focus", "target")
+    words, acts = _spans(folder, "words", "kind", "text"), _spans(folder, "dialogue_acts", "type")
+    listed = _table(folder, "participants")
+    agents = defaultdict(list)
+    for meeting, agent in zip(listed["meeting"], listed["agent"], strict=True):
+        agents[meeting].append(agent)
+    said = {key: np.array(_spoken(found), np.float64).reshape(-1, 2) for key, found in list(words.items())}
+    people = []
+    for row in zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True):
+        meeting, agent, participant, until, has_gaze = row
+        if float(until or 0) < 60:
+            continue
+        key, others = (meeting, agent), [(meeting, other) for other in agents[meeting] if other != agent]
+        people.append(
+            Person(
+                meeting,
+                agent,
+                participant,
+                float(until),
+                nods=_pick(gestures[key], NODS),
+                shakes=_pick(gestures[key], ("discord_signal shake", "negative_signal shake")),
+                tilts=_pick(gestures[key], ("other_comm_head ",)),
+                unseen=_pick(gestures[key], ("off_camera ",)),
+                gaze=tuple(gaze[key]) if has_gaze == "1" and gaze[key] else None,
+                laughs=_pick(words[key], ("vocalsound laugh",)),
+                talk=phrases(_spoken(words[key])),
+                backchannels=_pick(acts[key], ("bck",)),
+                others=phrases(span for other in others for span in _spoken(words[other])),
+                floor=tuple(
+                    sorted(
+                        (float(start), float(end), other[1])
+                        for other in others
+                        for start, end in phrases(_spoken(words[other]))
+                    )
+                ),
+                others_laughs=phrases((a, b) for o in others for a, b, what in words[o] if what == "vocalsound laugh"),
+                asked=np.sort([b for o in others for _, b, what in acts[o] if what.startswith("el.")]),
+                others_backchannels=phrases((a, b) for o in others for a, b, what in acts[o] if what == "bck"),
+                mm_hms=isolated(_spoken(words[key])),
+                others_nods=_of_others(gestures, others, NODS),
+                looked_at=_of_others(gaze, others, (agent,)),
+                gaze_known=frozenset(other[1] for other in others if gaze[other]),
+                words={one: said[meeting, one] for one in agents[meeting] if (meeting, one) in said},
+            )
+        )
+    if not people:
+        raise ConfigError(f"{folder}: participants: nobody has head annotations of a minute or more")
+    return people
+
+
+def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
+    """Spans in any order -> (K, 2), overlapping ones and gaps under 0.2 s joined."""
+    joined: list[list[float]] = []
+    for start, end in sorted(spans):
+        if joined and start - joined[-1][1] < GAP_S:
+            joined[-1][1] = max(joined[-1][1], end)
+        elif end > start:
+            joined.append([start, end])
+    return np.array(joined, np.float64).reshape(-1, 2)
+
+
+def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
+    """Words (start, end) of one person -> (K, 2) those under 0.6 s with 0.5 s of his silence on both sides."""
+    spans = np.array(sorted(words), np.float64).reshape(-1, 2)
+    before = spans[:, 0] - np.r_[-np.inf, spans[:-1, 1]]
+    after = np.r_[spans[1:, 0], np.inf] - spans[:, 1]
+    short = spans[:, 1] - spans[:, 0] < _SHORT_S
+    return np.asarray(spans[short & (before >= _ALONE_S) & (after >= _ALONE_S)], np.float64)
+
+
+def split_series(people: Iterable[Person]) -> dict[Split, list[Person]]:
+    """People by the part their meeting belongs to (`splits`); who is trained on is left out of the other parts."""
+    parts = by_split((split_of(person.meeting), person) for person in people)
+    seen = {person.participant for person in parts["train"]}
+    for split in ("validation", "test"):
+        parts[split] = [person for person in parts[split] if person.participant not in seen]
+    return parts
+
+
+def _of_others(
+    spans: _Spans, others: Iterable[tuple[str, str]], wanted: tuple[str, ...]
+) -> tuple[tuple[float, float, str], ...]:
+    """(start, end, agent) of what the others did, by start."""
+    return tuple(
+        sorted((start, end, other[1]) for other in others for start, end, what in spans[other] if what in wanted)
+    )
+
+
+def _spoken(spans: Iterable[tuple[float, float, str]]) -> list[tuple[float, float]]:
+    return [(start, end) for start, end, what in spans if what.startswith("w ")]
+
+
+def _pick(spans: Iterable[tuple[float, float, str]], wanted: tuple[str, ...]) -> Doubles:
+    return np.array([(start, end) for start, end, what in spans if what in wanted], np.float64).reshape(-1, 2)
+
+
+def _spans(folder: Path, name: str, *what: str) -> _Spans:
+    rows = _table(folder, name)
+    spans: _Spans = defaultdict(list)
+    try:
+        for meeting, agent, start, end, *rest in zip(
+            *(rows[column] for column in ("meeting", "agent", "start_s", "end_s", *what)), strict=True
+        ):
+            spans[meeting, agent].append((float(start), float(end), " ".join(rest)))
+    except ValueError as error:
+        raise ConfigError(f"{folder}: {name}: {error}") from error
+    for found in spans.values():
+        found.sort()
+    return spans
+
+
+def _table(folder: Path, name: str) -> _Rows:
+    for file in (folder / f"{name}.csv.gz", folder / f"{name}.csv"):
+        if file.is_file():
+            break
+    else:
+        raise ConfigError(f"{folder / name}.csv.gz: no such file; an AMI folder holds {', '.join(_COLUMNS)}")
+    rows = table(file)
+    for column in _COLUMNS[name]:
+        if column not in rows:
+            raise ConfigError.at(file, "column", column, "is missing", rows)
+    return rows

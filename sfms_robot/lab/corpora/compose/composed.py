@@ -1,0 +1,415 @@
+"""Composed dyads: real timing, real movement, put together here.
+
+Real are: when somebody nods, laughs or says "mm-hm" while others talk, when they talk and pause, laugh and nod, and
+when they look at him (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`); how speech
+sounds (`voices`). That they belong together is ours: the voice says other words than the meeting did, only its phrases
+begin and end when they did. Meetings, people, takes and voices kept for validation and test are whole ones (`splits`).
+
+All others of a meeting become one speaker. Whoever holds the floor sits straight ahead, and looks at the listener when
+he was annotated to; where nobody annotated his gaze he looks at random and `Dyad.attention` is unknown, as it is while
+no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, his looks
+are drawn from how long looks last in the training part (`looks`), and so is their order, which is ours.
+
+Stretches with nods, above all those with nods at the end of a phrase, and those in which he is spoken to are drawn more
+often than they are in the meetings; asked for enough minutes, a set holds every stretch once.
+
+A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
+serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
+the filmed recordings themselves (`speaking.py`). Each is a data set of its own in a folder of that name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, Doubles, Floats
+from sfms_robot.lab.corpora import conversational_states as labels
+from sfms_robot.lab.corpora.clips import Dyad, save
+from sfms_robot.lab.corpora.compose import speaking
+from sfms_robot.lab.corpora.compose.acting import Score, act, speaker_motion
+from sfms_robot.lab.corpora.compose.ami import Person, read_people, split_series
+from sfms_robot.lab.corpora.compose.looks import Dwell, away, learn_dwell
+from sfms_robot.lab.corpora.compose.recorded import heard, seen
+from sfms_robot.lab.corpora.compose.voices import (
+    Voice,
+    find_laughter,
+    find_voices,
+    laugh,
+    lay,
+    mouth_over,
+    split_voices,
+)
+from sfms_robot.lab.corpora.splits import SPLITS, Split
+from sfms_robot.signals.events import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
+from sfms_robot.signals.motion_primitives import Motions, read_motions
+
+LENGTH_S: Final = (30.0, 60.0)
+HELD_OUT_SHARE: Final = 1 / 6  # of the training minutes, for validation and for test
+SHARES: Final = {"interaction": 0.5, "speaking": 0.25}  # minutes of the sets that speak, per minute of listening
+Scene = Literal["listening", "interaction"]
+_SOUNDS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", "ami_audio_clips")
+_FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
+_FACELESS: Final = 0.25  # share of those in which the speaker is heard only
+_FLOOR_S: Final = 1.0  # a shorter phrase does not take the floor
+_WEIGHTS: Final = (
+    4.0,
+    3.0,
+    2.0,
+    3,
+    100.0,
+)  # base + nods a minute, up to + a nod after a phrase, up to + addressed time
+
+_FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # Stretch.name
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A piece of a meeting in which a person mostly listens.
+
+    Attributes:
+        nods_per_minute: of listening time.
+        answers: nods that begin 0 to 0.8 s after the end of a phrase.
+        addressed: share of the time in which whoever holds the floor is known to look at him.
+    """
+
+    person: Person
+    start_s: float
+    end_s: float
+    nods_per_minute: float = 0.0
+    answers: int = 0
+    addressed: float = 0.0
+
+    @property
+    def weight(self) -> float:
+        """How often it is drawn: more for nods, for nods when a phrase ends, and for being addressed."""
+        base, most, answer, answers, addressed = _WEIGHTS
+        nods = min(self.nods_per_minute, most) + answer * min(self.answers, answers)
+        return base + nods + addressed * self.addressed
+
+    @property
+    def frames(self) -> int:
+        return int(round((self.end_s - self.start_s) * FRAME_HZ))
+
+    @property
+    def name(self) -> str:
+        return f"{self.person.meeting}_{self.person.agent}_{int(self.start_s):04d}"
+
+
+@dataclass(frozen=True)
+class Material:
+    """What the dyads of one part are made of."""
+
+    people: Sequence[Person]
+    voices: Sequence[Voice]
+    laughter: Sequence[Floats]
+    motions: Motions
+    dwell: Dwell
+
+
+def read_material(ami: Path, voices: Sequence[Path], motions: Path) -> dict[Split, Material]:
+    """By part, from the AMI tables, folders of WAV files and a file of motion primitives. Raises ConfigError."""
+    people = split_series(read_people(ami))
+    spoken, laughter, moves = split_voices(find_voices(voices)), find_laughter(voices), read_motions(motions)
+    dwell = learn_dwell(people["train"])
+    return {split: Material(people[split], spoken[split], laughter[split], moves[split], dwell) for split in SPLITS}
+
+
+def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> dict[Split, list[Dyad]]:
+    """`minutes` of "train" dyads and a sixth of it of "validation" and "test"; the same for the same seed.
+
+    `ami` holds the AMI tables, `voices` are folders of WAV files, `motions` is a file of motion primitives. Raises
+    ConfigError.
+    """
+    made: dict[Split, list[Dyad]] = {split: [] for split in SPLITS}
+    for split, dyad in dyads(read_material(ami, voices, motions), seed, minutes):
+        made[split].append(dyad)
+    return made
+
+
+def compose_folder(
+    data: Path,
+    out: Path,
+    seed: int,
+    minutes: float,
+    voices: Sequence[Path] = (),
+    told: Callable[[str, float, float], None] | None = None,
+    overwrite: bool = False,
+) -> dict[str, float]:
+    """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train, validation and test.
+
+    Beside them, out/interaction and out/speaking are sets of the same form. No filmed voice, no speaking.
+
+    Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
+    ami_audio_clips/, the clips beside the tables) and those of further folders. Dyads of an earlier run are refused,
+    or, with `overwrite`, removed from `out` once the new ones are written: two sets never mix. `told` hears of every
+    dyad: the set, the minutes wanted of it, the minutes written. Returns the minutes written per split. Raises
+    ConfigError.
+    """
+    sets = {
+        "listening": (out, minutes, dyads),
+        "interaction": (out / "interaction", SHARES["interaction"] * minutes, conversations),
+        "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),
+    }
+    if not overwrite and (earlier := sorted(file for folder, _, _ in sets.values() for file in _composed(folder))):
+        raise ConfigError(
+            f"--out {out}: holds dyads already, {earlier[0].name} among {len(earlier)}: another folder, or --overwrite"
+        )
+    ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
+    brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
+    bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
+    material = read_material(ami, [*bundled, *brought, *voices], data_dir("sim") / "listeners" / "motions.npz")
+    written: dict[str, float] = {}
+    for name, (folder, wanted, make) in sets.items():
+        each = partial(told, name, wanted * (1 + 2 * HELD_OUT_SHARE)) if told else None
+        found = _write(make(material, seed, wanted), folder, each)
+        written |= found if name == "listening" else {f"{name}_{split}": value for split, value in found.items()}
+    return written
+
+
+def _composed(out: Path) -> set[Path]:
+    """Every dyad that a run has written to a folder of splits."""
+    return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
+
+
+def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float], None] | None) -> dict[str, float]:
+    """Write a set and remove what an earlier one left; minutes per split."""
+    written, fresh = dict.fromkeys(SPLITS, 0.0), set()
+    for split, dyad in made:
+        save(out / split, [dyad])
+        fresh.add(out / split / f"{dyad.name}.npz")
+        written[split] += len(dyad.listener) * FRAME_S / 60
+        if each:
+            each(sum(written.values()))
+    for stale in _composed(out) - fresh:
+        stale.unlink()
+    return {str(split): value for split, value in written.items()}
+
+
+def dyads(
+    material: Mapping[Split, Material], seed: int, minutes: float, scene: Scene = "listening"
+) -> Iterator[tuple[Split, Dyad]]:
+    """Dyads one by one, as (split, dyad): for sets that need not lie in memory. Raises ConfigError."""
+    if not minutes > 0:
+        raise ConfigError(f"--minutes {minutes:g}: must be above 0")
+    for number, split in enumerate(SPLITS):
+        rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
+        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
+        for stretch in choose(stretches(material[split].people, rng, scene), wanted, rng):
+            yield split, compose_one(stretch, material[split], rng)
+
+
+def conversations(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
+    """Dyads in which both talk."""
+    return dyads(material, seed, minutes, "interaction")
+
+
+def monologues(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
+    """Dyads in which the agent speaks and nobody answers; none of a part without filmed voices."""
+    for number, split in enumerate(SPLITS):
+        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
+        part = material[split]
+        for dyad in speaking.dyads(part.voices, part.motions, part.dwell, [seed, number, 2], wanted):
+            yield split, dyad
+
+
+def cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
+    """A voice by lot, often one whose mouth was filmed."""
+    filmed = rng.random() < _FILMED
+    fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
+    return fitting[int(rng.integers(len(fitting)))]
+
+
+def own_voice(voices: Sequence[Voice], other: Voice, rng: np.random.Generator) -> Voice | None:
+    """A filmed voice for the listener, another one than the speaker's if there is one; None: none was filmed."""
+    filmed = [voice for voice in voices if voice.mouth is not None]
+    fitting = [voice for voice in filmed if voice.name != other.name] or filmed
+    return fitting[int(rng.integers(len(fitting)))] if fitting else None
+
+
+# --- which stretches --------------------------------------------------------------------------------------------
+
+
+def stretches(people: Sequence[Person], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
+    """Cut everybody's time into pieces of 30 to 60 s; keep those he was seen in and that make the scene.
+
+    Listening: he mostly listens. Interaction: he talks a fifth of the time or more, and so do the others together.
+    """
+    found = []
+    for person in people:
+        at = float(rng.uniform(0, LENGTH_S[0]))
+        while at + LENGTH_S[1] < person.until_s:
+            length = FRAME_S * round(float(rng.uniform(*LENGTH_S)) * FRAME_HZ)
+            piece = Stretch(person, at, at + length)
+            at += length
+            own, others = (active(spans, piece) for spans in (person.talk, person.others))
+            listening = listening_mask(others, FRAME_HZ, own)
+            listens = own.mean() <= 0.2 and listening.mean() >= 0.6
+            converses = own.mean() > 0.2 and others.mean() > 0.2
+            if active(person.unseen, piece).any() or not (listens if scene == "listening" else converses):
+                continue
+            onsets = within(person.nods, piece)[:, 0]
+            rate = nods_per_minute(onsets, listening, FRAME_HZ)
+            answers = phrase_end_counts(onsets, phrase_ends(others, FRAME_HZ), listening, FRAME_HZ)[0]
+            addressed = float((others & (attention_of(piece) == 1)).mean())
+            found.append(replace(piece, nods_per_minute=rate, answers=answers, addressed=addressed))
+    return found
+
+
+def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -> list[Stretch]:
+    """Draw about `minutes` of stretches without repetition, by weight; all of them where there are no more.
+
+    Systematic draw along the nod rate: even a small set has the rates of the large one.
+    """
+    if not found:
+        return []
+    ranked = sorted(found, key=lambda stretch: stretch.nods_per_minute)
+    weights = np.array([stretch.weight for stretch in ranked])
+    lengths = np.array([stretch.frames * FRAME_S / 60 for stretch in ranked])
+    chances = _chances(weights, lengths, minutes)
+    if chances.sum() < 1:  # less than one stretch is asked for
+        chances = chances / chances.sum()
+    spots = np.floor(np.cumsum(chances) + rng.random())
+    drawn = np.flatnonzero(np.diff(spots, prepend=0.0) >= 1)
+    return [ranked[int(index)] for index in rng.permutation(drawn)]
+
+
+def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
+    """(K,) proportional to the weights, none above 1, so that the expected length is what is wanted (or all)."""
+    low, high = 0.0, 1 / weights.min()
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if (np.minimum(1, middle * weights) * lengths).sum() < wanted else (low, middle)
+    return np.asarray(np.minimum(1, high * weights), np.float64)
+
+
+# --- one dyad ---------------------------------------------------------------------------------------------------
+
+
+def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) -> Dyad:
+    """One stretch, cast, acted and voiced."""
+    person, frames = stretch.person, stretch.frames
+    voice = cast(material.voices, rng)
+    others, own = active(person.others, stretch), active(person.talk, stretch)
+    said, mouth = _own_words(stretch, own_voice(material.voices, voice, rng), rng.spawn(1)[0])
+    score = Score(
+        frames,
+        nods=within(person.nods, stretch),
+        shakes=within(person.shakes, stretch),
+        tilts=within(person.tilts, stretch),
+        laughs=within(person.laughs, stretch),
+        talk=within(person.talk, stretch),
+        backchannels=within(person.backchannels, stretch),
+        mm_hms=within(person.mm_hms, stretch),
+        gaze=_looks(stretch, material.dwell, rng),
+        shared_laughs=within(person.others_laughs, stretch),
+        asked=person.asked[(person.asked > stretch.start_s) & (person.asked < stretch.end_s)] - stretch.start_s,
+        ends=phrase_ends(others, FRAME_HZ),
+        mouth=mouth,
+    )
+    feedback = labels.Voices(
+        own,
+        others,
+        active(person.backchannels, stretch),
+        active(person.others_backchannels, stretch),
+        active(person.nods, stretch),
+    )
+    audio, face = speaker_of(stretch, voice, material.motions, rng, material.laughter)
+    acted = act(score, material.motions, rng)
+    faced = np.isfinite(face).all(axis=1)
+    return Dyad(
+        stretch.name,
+        audio,
+        face,
+        acted.motion,
+        listening_mask(others, FRAME_HZ, own),
+        agent_audio=said,
+        states=labels.label(feedback),
+        events=acted.events,
+        head_of_gaze_rad=acted.head_of_gaze_rad,
+        attention=np.where(faced, attention_of(stretch), np.nan).astype(np.float32),
+    )
+
+
+def _own_words(stretch: Stretch, voice: Voice | None, rng: np.random.Generator) -> tuple[Floats | None, Floats | None]:
+    """The listener's own voice (N * 640,), as a program would send it to a loudspeaker, and its mouth (N, 52)."""
+    if voice is None:
+        return None, None
+    said = np.clip(stretch.person.talk - stretch.start_s, 0, stretch.frames * FRAME_S)
+    speech, mouth = lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
+    return speaking.sent(speech, rng), mouth
+
+
+def speaker_of(
+    stretch: Stretch,
+    voice: Voice,
+    motions: Motions,
+    rng: np.random.Generator,
+    laughter: Sequence[Floats] = (),
+) -> tuple[Floats, Floats]:
+    """What is heard and seen of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen."""
+    person, frames = stretch.person, stretch.frames
+    said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
+    speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
+    laughs, nods = within(person.others_laughs, stretch), within(_spans(person.others_nods), stretch)
+    audio = heard(laugh(speech, laughs, laughter, rng), voice, rng)
+    if rng.random() < _FACELESS:
+        return audio, np.full((frames, MOTION_DIM), np.nan, np.float32)
+    moving = mouth_over(speech, motions.talk, frames, rng) if mouth is None else mouth
+    return audio, seen(speaker_motion(moving, motions, rng, attention_of(stretch), laughs, nods), rng)
+
+
+def attention_of(stretch: Stretch) -> Floats:
+    """(N,) 1 where whoever holds the floor looks at him, 0 where not, NaN where nobody annotated where that one looks.
+
+    The floor is held by who began the latest phrase of a second or more.
+    """
+    person = stretch.person
+    holder = np.full(stretch.frames, "", dtype="<U1")
+    for start, _, agent in (phrase for phrase in person.floor if phrase[1] - phrase[0] >= _FLOOR_S):
+        if start >= stretch.end_s:
+            break
+        holder[max(0, int(round((start - stretch.start_s) * FRAME_HZ))) :] = agent
+    out = np.full(stretch.frames, np.nan, np.float32)
+    for agent in person.gaze_known:
+        looks = active(_spans(person.looked_at, agent), stretch)
+        out[holder == agent] = looks[holder == agent]
+    return out
+
+
+def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+    """(K, 2) of what one agent did, or all."""
+    return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
+
+
+def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
+    """Looks away from whoever has the floor, in seconds of the stretch: annotated ones, or drawn ones."""
+    if stretch.person.gaze is None:
+        return dwell.looks(stretch.frames * FRAME_S, rng)
+    return tuple(
+        (start - stretch.start_s, end - stretch.start_s, where)
+        for start, end, where in away(stretch.person, stretch.start_s, stretch.end_s, rng)
+    )
+
+
+def active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
+    """(N,) frames whose middle lies in a span."""
+    out = np.zeros(stretch.frames, bool)
+    for start, end in spans[(spans[:, 1] > stretch.start_s) & (spans[:, 0] < stretch.end_s)]:
+        first, last = (int(np.ceil((t - stretch.start_s) * FRAME_HZ - 0.5)) for t in (start, end))
+        out[max(0, first) : max(0, last)] = True
+    return out
+
+
+def within(spans: Doubles, stretch: Stretch) -> Doubles:
+    """Spans that begin inside, in seconds of the stretch, with room to be seen before its end."""
+    inside = (spans[:, 0] >= stretch.start_s) & (spans[:, 0] < stretch.end_s - 0.5)
+    return spans[inside] - stretch.start_s

@@ -1,0 +1,82 @@
+"""Dyads in which the agent speaks and nobody answers: filmed recordings as they are, voice and mouth together.
+
+This is the one place where lips and sound are of one moment and one person throughout; the head and the rest of the
+face come from other recordings. What `--agent-audio` asks of a listener is learned and judged here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats
+from sfms_robot.lab.corpora import conversational_states as labels
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.compose.acting import Score, act
+from sfms_robot.lab.corpora.compose.looks import Dwell
+from sfms_robot.lab.corpora.compose.voices import Voice, room
+from sfms_robot.signals.events import phrase_ends, runs, voice_activity
+from sfms_robot.signals.motion_primitives import Motions
+
+LENGTH_S: Final = (15.0, 35.0)
+FILES: Final = "speaking_*_[0-9][0-9][0-9].npz"
+_QUIET: Final = 0.5  # share of dyads in which the other's microphone hears nothing at all, not even the room
+_GAIN_DB: Final = (-10.0, 6.0)
+
+
+def dyads(
+    voices: Sequence[Voice], motions: Motions, dwell: Dwell, seed: Sequence[int], minutes: float
+) -> Iterator[Dyad]:
+    """About `minutes` of pieces of the filmed ones among the voices; none where none was filmed."""
+    filmed = [voice for voice in voices if voice.mouth is not None]
+    weights = np.array([len(voice.recording) for voice in filmed], float)
+    rng = np.random.default_rng(seed)
+    frames, count = minutes * 60 * FRAME_HZ, 0
+    while filmed and frames > 0:
+        voice = filmed[int(rng.choice(len(filmed), p=weights / weights.sum()))]
+        dyad = take(f"speaking_{voice.name}_{count:03d}", voice, motions, dwell, rng)
+        yield dyad
+        frames, count = frames - len(dyad.listener), count + 1
+
+
+def take(name: str, voice: Voice, motions: Motions, dwell: Dwell, rng: np.random.Generator) -> Dyad:
+    """A piece of a filmed recording. Raises ValueError for a voice that was not filmed."""
+    if voice.mouth is None:
+        raise ValueError(f"{voice.name} was not filmed")
+    whole = min(len(voice.recording) // FRAME_SAMPLES, len(voice.mouth) - 1)
+    frames = min(int(rng.uniform(*LENGTH_S) * FRAME_HZ), whole)
+    first = int(rng.integers(whole - frames + 1))
+    said = voice.recording[first * FRAME_SAMPLES : (first + frames) * FRAME_SAMPLES]
+    active = voice_activity(said)
+    score = Score(
+        frames,
+        talk=np.array(runs(active), np.float64).reshape(-1, 2) * FRAME_S,
+        gaze=dwell.looks(frames * FRAME_S, rng),
+        ends=phrase_ends(active, FRAME_HZ),
+        mouth=voice.mouth[first + 1 : first + frames + 1],  # a frame shows the face at its end
+    )
+    acted = act(score, motions, rng)
+    silent = np.zeros(frames, bool)
+    heard = np.zeros(len(said), np.float32) if rng.random() < _QUIET else room(len(said), voice, rng)
+    return Dyad(
+        name,
+        heard,
+        np.full((frames, MOTION_DIM), np.nan, np.float32),
+        acted.motion,
+        silent,
+        agent_audio=sent(said, rng),
+        states=labels.label(labels.of_activity(active, silent)),
+        events=acted.events,
+        head_of_gaze_rad=acted.head_of_gaze_rad,
+        attention=np.full(frames, np.nan, np.float32),
+    )
+
+
+def sent(speech: Floats, rng: np.random.Generator) -> Floats:
+    """Speech as a program sends it to a loudspeaker: some level, and silence that is digital or nearly so."""
+    gain = np.float32(10 ** (rng.uniform(*_GAIN_DB) / 20))
+    hiss = rng.standard_normal(len(speech), np.float32) * np.float32(10 ** (rng.uniform(-90, -60) / 20))
+    floor = hiss if rng.random() < 0.3 else np.float32(0)
+    return np.asarray(np.clip(gain * speech + floor, -1, 1), np.float32)

@@ -1,0 +1,247 @@
+"""Recorded speech, cut at its pauses, to be laid on other people's talk.
+
+A talk segment of the meeting is filled with the speech that *ends* at a phrase end of the recording, so that the fall
+of the voice at the end of a phrase falls where the meeting's phrase ended; earlier phrases fill up the beginning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import oaconvolve
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
+from sfms_robot.lab.corpora.compose.motions import SHAPE, facegood_mouth, table
+from sfms_robot.lab.corpora.splits import SPLITS, Split, by_split, split_of_voice
+from sfms_robot.signals.audio import read_audio
+from sfms_robot.signals.events import runs, voice_activity
+from sfms_robot.signals.tracks import read_track, resample
+
+_SOUNDS: Final = (".wav", ".flac")
+# Two people in one track, hardly audible, hardly any speech, or people talking over one another.
+_UNFIT: Final = (
+    "katiesteve", "audio_ES2003a", "audio_EN2001b", "audio_EN2001d", "audio_EN2002", "audio_EN2009b", "pair_",
+)  # fmt: skip
+_LAUGH_S: Final = 0.4  # shorter ones are a puff of breath
+_GRAIN: Final = AUDIO_HZ // 50  # 20 ms: pauses are cut out down to this
+_PHRASE: Final = AUDIO_HZ // 5  # a pause this long ended a phrase
+_JOIN: Final = AUDIO_HZ // 200  # 5 ms where two phrases meet
+_FADE: Final = AUDIO_HZ // 50
+_LEVEL: Final = 0.06  # RMS of speech
+
+
+@dataclass(frozen=True)
+class Voice:
+    """One person's speech without its pauses.
+
+    Attributes:
+        name: of the recording.
+        audio: (n,) 16 kHz, speech joined, RMS 0.06.
+        origin: (n // 320,) sample of the recording at every 320th sample of `audio`.
+        ends: (P,) samples of `audio` at which a phrase ends.
+        mouth: (F, 52) by frame of the recording, or None.
+        noise: (m,) magnitude spectrum of its pauses, flat where it has none.
+        recording: (r,) 16 kHz, the recording as it is, RMS of its speech 0.06.
+    """
+
+    name: str
+    audio: Floats
+    origin: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    mouth: Floats | None
+    noise: NDArray[np.float64]
+    recording: Floats
+
+
+def find_voices(folders: Sequence[Path]) -> list[Voice]:
+    """Every WAV and FLAC file in the folders, or one level below them. Raises ConfigError when there is none."""
+    files = [file for folder in folders for file in sorted([*folder.glob("*"), *folder.glob("*/*")])]
+    voices = [read_voice(file) for file in files if file.suffix in _SOUNDS and not file.stem.startswith(_UNFIT)]
+    if not voices:
+        raise ConfigError(f"{', '.join(map(str, folders))}: no WAV or FLAC file to take voices from")
+    return voices
+
+
+def split_voices(voices: Sequence[Voice]) -> dict[Split, list[Voice]]:
+    """Whole recordings by part (`splits.VOICES`); a part that has none uses all there are."""
+    parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
+    return {split: parts[split] or list(voices) for split in SPLITS}
+
+
+def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
+    """Laughs that were annotated in clips and that nobody speaks into, (n,) 16 kHz each, by part; maybe none.
+
+    Looks for a table words.csv.gz (clip, start_s, end_s, kind, text) beside the clips. Raises ConfigError when one of
+    them is broken.
+    """
+    found: list[tuple[Split, Floats]] = []
+    for folder in folders:
+        rows = table(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
+        if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
+            continue
+        said = list(
+            zip(rows["clip"], map(float, rows["start_s"]), map(float, rows["end_s"]), rows["kind"], strict=True)
+        )
+        for (clip, start, end, _), text in zip(said, rows["text"], strict=True):
+            spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind in said)
+            if text == "laugh" and end - start >= _LAUGH_S and not spoken_into and (folder / clip).is_file():
+                audio = read_audio(folder / clip)[int(start * AUDIO_HZ) : int(end * AUDIO_HZ)]
+                found.append((split_of_voice(Path(clip).stem), _eased(audio * (_LEVEL / np.sqrt(np.mean(audio**2))))))
+    return by_split(found)
+
+
+def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Floats], rng: np.random.Generator) -> Floats:
+    """Speech (n,) with laughs in the spans (K, 2); as it is where there is no laughter to take."""
+    out = speech.copy()
+    for start_s, end_s in spans_s if laughter else ():
+        at, end = (int(np.clip(t * AUDIO_HZ, 0, len(out))) for t in (start_s, end_s))
+        while end - at > _FADE:
+            piece = laughter[int(rng.integers(len(laughter)))][: end - at]
+            out[at : at + len(piece)] += np.float32(rng.uniform(0.5, 1.2)) * _eased(piece)
+            at += len(piece)
+    return out
+
+
+def _eased(sound: Floats) -> Floats:
+    ramp = np.ones(len(sound), np.float32)
+    fade = min(_FADE, len(sound) // 2)
+    ramp[:fade] = np.linspace(0, 1, fade)
+    ramp[len(ramp) - fade :] = np.linspace(1, 0, fade)
+    return np.asarray(np.clip(sound, -1, 1) * ramp, np.float32)
+
+
+def read_voice(file: Path) -> Voice:
+    """A WAV file, with the mouth recorded beside it (FACEGOOD weights, NAME.npz, or a face track) when there is one."""
+    audio = read_audio(file)
+    active = voice_activity(audio, AUDIO_HZ, _GRAIN / AUDIO_HZ)
+    active = np.convolve(active, [1, 1, 1], "same") > 0  # a grain of margin: soft beginnings and endings
+    speech = [(a * _GRAIN, b * _GRAIN) for a, b in runs(active) if b - a >= 5]
+    if not speech:
+        raise ConfigError(f"{file}: no speech found in it")
+    pieces, breaks, total = [], [], 0
+    for number, (start, end) in enumerate(speech):
+        piece = audio[start:end].copy()
+        piece[:_JOIN] *= np.linspace(0, 1, _JOIN, dtype=np.float32)
+        piece[-_JOIN:] *= np.linspace(1, 0, _JOIN, dtype=np.float32)
+        pieces.append(piece)
+        total += len(piece)
+        if number + 1 == len(speech) or speech[number + 1][0] - end >= _PHRASE:
+            breaks.append(total)
+    joined = np.concatenate(pieces)
+    joined = _levelled(joined)
+    keep = ~_lulls(joined)
+    ends = np.cumsum(keep)[np.array(breaks) // _GRAIN - 1] * _GRAIN
+    joined = joined.reshape(-1, _GRAIN)[keep].reshape(-1)
+    origin = np.concatenate([np.arange(start, end, _GRAIN) for start, end in speech])[keep]
+    name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
+    loudness = np.sqrt(np.mean(np.concatenate([audio[start:end] for start, end in speech]) ** 2))
+    whole = np.asarray(np.clip(audio * (_LEVEL / loudness), -1, 1), np.float32)
+    return Voice(name, joined, origin, ends, _mouth(file), _pause_spectrum(audio, active), whole)
+
+
+def _levelled(speech: Floats) -> Floats:
+    """Slow swings of loudness (somebody further from the microphone) mostly taken out; RMS 0.06."""
+    window = AUDIO_HZ // 2
+    power = uniform_filter1d(speech.astype(np.float64) ** 2, window, mode="nearest")
+    even = speech * (power + 1e-4 * power.max()) ** -0.35
+    return np.asarray(np.clip(even * (_LEVEL / np.sqrt(np.mean(even**2))), -1, 1), np.float32)
+
+
+def _lulls(speech: Floats) -> NDArray[np.bool_]:
+    """Grains (n // 320,) inside pauses that only show once loudness is levelled; 40 ms of each end of one stay."""
+    out = ~voice_activity(speech, AUDIO_HZ, _GRAIN / AUDIO_HZ)
+    for start, end in runs(out):
+        out[start : start + 2] = out[max(start, end - 2) : end] = False
+    return out
+
+
+def _mouth(file: Path) -> Floats | None:
+    weights = file.with_suffix(".npz")
+    if weights.is_file():
+        return facegood_mouth(weights)
+    for track in (*sorted(file.parent.glob("*.csv.gz")), *sorted(file.parent.glob("*.csv"))):
+        if track.name.split(".")[0] in (file.stem, "face"):
+            shapes = resample(read_track(track), FRAME_HZ).motion[:, SHAPES]
+            return np.nan_to_num(shapes)
+    return None
+
+
+def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.float64]:
+    grains = audio[: len(active) * _GRAIN].reshape(-1, _GRAIN)[~active]
+    if len(grains) < 8 or np.sqrt(np.mean(grains**2)) < 1e-5:
+        return np.ones(_GRAIN // 2 + 1)
+    spectrum = np.abs(np.fft.rfft(grains * np.hanning(_GRAIN), axis=1)).mean(axis=0)
+    return np.asarray(spectrum / np.sqrt(np.mean(spectrum**2)), np.float64)
+
+
+def lay(
+    segments_s: NDArray[np.float64], frames: int, voice: Voice, rng: np.random.Generator
+) -> tuple[Floats, Floats | None]:
+    """Fill talk segments (K, 2), seconds from 0, with a voice: audio (frames * 640,), mouth (frames, 52) or None."""
+    audio = np.zeros(frames * FRAME_SAMPLES, np.float32)
+    mouth = None if voice.mouth is None else np.zeros((frames, len(SHAPE)), np.float32)
+    last = int(rng.integers(len(voice.ends)))
+    for start_s, end_s in segments_s:
+        start, end = (int(np.clip(round(t * AUDIO_HZ), 0, len(audio))) for t in (start_s, end_s))
+        if end - start < 2 * _FADE:
+            continue
+        # Recordings go on where they were, a phrase or two further: the same words do not come at once again.
+        last = (last + int(rng.integers(1, 4))) % len(voice.ends)
+        index = np.arange(voice.ends[last] - (end - start), voice.ends[last]) % len(voice.audio)
+        piece = voice.audio[index] * np.float32(rng.uniform(0.8, 1.25))
+        piece[:_FADE] *= np.linspace(0, 1, _FADE, dtype=np.float32)
+        piece[-_FADE:] *= np.linspace(1, 0, _FADE, dtype=np.float32)
+        audio[start:end] = piece
+        if mouth is not None and voice.mouth is not None:
+            covered = np.arange(start // FRAME_SAMPLES, end // FRAME_SAMPLES)  # frames that end inside
+            spoken = index[(covered + 1) * FRAME_SAMPLES - 1 - start] // _GRAIN
+            rows = np.minimum(voice.origin[spoken] // FRAME_SAMPLES + 1, len(voice.mouth) - 1)
+            mouth[covered] = voice.mouth[rows]
+    return audio, None if mouth is None else _soften(mouth)
+
+
+def _soften(mouth: Floats) -> Floats:
+    """Short binomial smoothing: takes the edges off the joints, keeps syllables."""
+    padded = np.pad(mouth, ((1, 1), (0, 0)), mode="edge")
+    return np.asarray(0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:], np.float32)
+
+
+def room(samples: int, voice: Voice, rng: np.random.Generator) -> Floats:
+    """Noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, slowly breathing."""
+    flat = rng.standard_normal(samples, np.float32)
+    kernel = np.fft.irfft(voice.noise).astype(np.float32)
+    kernel = np.roll(kernel, len(kernel) // 2) * np.hanning(len(kernel)).astype(np.float32)
+    coloured = oaconvolve(flat, kernel, mode="same")
+    coloured /= np.sqrt(np.mean(coloured**2)) + 1e-12
+    knots = np.arange(0, samples + AUDIO_HZ, AUDIO_HZ)
+    level_db = rng.uniform(-70, -48) + np.interp(np.arange(samples), knots, rng.normal(0, 1, len(knots)))
+    return np.asarray(coloured * 10 ** (level_db / 20), np.float32)
+
+
+def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
+    """Speech as a room of 0.12 to 0.4 s reverberation gives it back, 6 to 16 dB below the direct sound."""
+    length_s = rng.uniform(0.12, 0.4)
+    times = np.arange(int(length_s * AUDIO_HZ)) / AUDIO_HZ
+    tail = rng.standard_normal(len(times)) * 10 ** (-3 * times / length_s)
+    tail *= 10 ** (-rng.uniform(6, 16) / 20) / np.sqrt(np.sum(tail**2))
+    return np.asarray(speech + oaconvolve(speech, tail)[: len(speech)], np.float32)
+
+
+def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.random.Generator) -> Floats:
+    """A mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
+
+    It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
+    """
+    source = talk[int(rng.integers(len(talk)))]
+    piece = np.roll(source, int(rng.integers(len(source))), axis=0)[np.arange(frames) % len(source)]
+    power = uniform_filter1d(speech[: frames * FRAME_SAMPLES].astype(np.float64) ** 2, 3 * FRAME_SAMPLES)
+    level_db = 10 * np.log10(power[FRAME_SAMPLES - 1 :: FRAME_SAMPLES] + 1e-10)
+    open_share = np.clip((level_db - 20 * np.log10(_LEVEL) + 26) / 20, 0, 1)
+    return _soften(np.asarray(piece * open_share[:, None], np.float32))

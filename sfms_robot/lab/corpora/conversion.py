@@ -1,0 +1,170 @@
+"""Dyads of every space that can become ours, at 25 fps in `arkit58`, and what of the data is lost on the way.
+
+Nothing is invented: a channel without a source stays at rest. What is lost is measured on the data themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, POSE, SHAPES, Doubles, Floats
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.resampling import at_frame_rate
+from sfms_robot.signals.action_units import FAU_VALUE, FULL, WITHOUT_SHAPE, blendshapes_of
+from sfms_robot.signals.flame import FlameMatrix
+from sfms_robot.signals.rotations import rotation
+from sfms_robot.signals.spaces import SPACES, decode, encode, limitation
+
+CONVERTIBLE: Final = ("arkit58", "deca56", "faceverse58", "seamless27")
+_ANGLES: Final = slice(0, 3)  # of a pose: roll, pitch, yaw
+_UNITS: Final = slice(3, 3 + len(FAU_VALUE))  # of seamless27
+_UNSHOWN: Final = [FAU_VALUE.index(unit) for unit in WITHOUT_SHAPE]
+
+
+@dataclass
+class Residual:
+    """What conversion lost, over all clips so far: of listeners' motion, frame by frame.
+
+    Attributes:
+        pose_rad: largest angle between a head as filed and as read back from ours in the source's own terms.
+        resampled_rad2, resampled: squares of the angles' differences, and their count, between the motion as filed and
+            our 25 fps read back at the source's instants.
+        expression2, left2: squares of the source's expression, and of the part that our blendshapes do not give back.
+        beyond, values: how many values lay outside 0..1 and were cut, of how many.
+        stored_rad, stored: largest differences between what was converted and what was written.
+    """
+
+    pose_rad: float = 0.0
+    resampled_rad2: float = 0.0
+    resampled: int = 0
+    expression2: float = 0.0
+    left2: float = 0.0
+    beyond: int = 0
+    values: int = 0
+    stored_rad: float = 0.0
+    stored: float = 0.0
+    notes: dict[str, None] = field(default_factory=dict)
+
+    def told(self) -> dict[str, Any]:
+        """Figures by name, None for what does not apply; degrees and shares, for people."""
+        return {
+            "pose_round_trip_deg": float(np.degrees(self.pose_rad)),
+            "resampling_rms_deg": float(np.degrees(np.sqrt(self.resampled_rad2 / self.resampled)))
+            if self.resampled
+            else None,
+            "expression_lost_share": float(np.sqrt(self.left2 / self.expression2)) if self.expression2 else None,
+            "cut_share": self.beyond / self.values if self.values else None,
+            "stored_pose_deg": float(np.degrees(self.stored_rad)),
+            "stored_blendshape": self.stored,
+        }
+
+    def written(self, converted: Dyad, read_back: Dyad) -> None:
+        """Take in what the file holds of a converted dyad."""
+        apart = np.abs(converted.listener - read_back.listener)
+        self.stored_rad = max(self.stored_rad, float(apart[:, POSE][:, _ANGLES].max()))
+        self.stored = max(self.stored, float(apart[:, SHAPES].max()))
+
+
+def to_ours(dyad: Dyad, residual: Residual, flame: FlameMatrix | None = None) -> Dyad:
+    """The dyad in `arkit58` at 25 fps; a speaker's unknown frames stay unknown. `residual` takes in what is lost.
+
+    Raises ConfigError for a space that cannot become ours, and for a clip of less than one frame.
+    """
+    if dyad.space not in CONVERTIBLE:
+        raise ConfigError(f"{dyad.name}: {dyad.space} cannot become arkit58 ({', '.join(CONVERTIBLE)})")
+    if flame is not None and dyad.space != "deca56":
+        raise ConfigError(f"--flame-matrix: {dyad.space} has no FLAME expression (deca56 has)")
+    speaker, listener = (in_ours(motion, dyad.space, flame) for motion in (dyad.speaker, dyad.listener))
+    ours = replace(dyad, speaker=speaker, listener=listener, space="arkit58")
+    _lost(dyad, listener, residual, flame)
+    slower = at_frame_rate(ours)
+    if slower is not ours:
+        _resampled(ours, slower, residual)
+    return slower
+
+
+def in_ours(motion: Floats, space: str, flame: FlameMatrix | None = None) -> Floats:
+    """(N, D) of a convertible space -> (N, 58) ours; rows that are not known stay so."""
+    known = np.isfinite(motion).all(axis=1)
+    out = np.full((len(motion), 58), np.nan, np.float32)
+    if space == "arkit58":
+        out[known] = motion[known]
+    elif space == "seamless27":
+        turned = np.zeros((int(known.sum()), SPACES["deca56"].dim))
+        turned[:, SPACES["deca56"].rotation] = motion[known, _ANGLES]
+        out[known] = decode(turned, "deca56").motion
+        out[known, SHAPES] = blendshapes_of(motion[known, _UNITS])
+    else:
+        out[known] = decode(motion[known], space, flame=flame).motion
+    return out
+
+
+def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | None) -> None:
+    if dyad.space == "arkit58":
+        return
+    filed = dyad.listener.astype(np.float64)
+    residual.pose_rad = max(residual.pose_rad, float(_apart_rad(filed, ours, dyad.space).max(initial=0.0)))
+    if dyad.space == "seamless27":
+        units = filed[:, _UNITS]
+        lost = np.maximum(units - FULL, 0.0)
+        lost[:, _UNSHOWN] = units[:, _UNSHOWN]
+        _count(residual, np.square(units).sum(), np.square(lost).sum(), int((units > FULL).sum()), units.size)
+    elif dyad.space == "faceverse58":
+        shapes = filed[:, SPACES["faceverse58"].expression]
+        cut = shapes - np.clip(shapes, 0.0, 1.0)
+        _count(residual, np.square(shapes).sum(), np.square(cut).sum(), int((cut != 0).sum()), shapes.size)
+    else:
+        expression = filed[:, SPACES["deca56"].expression]
+        given = ours[:, SHAPES].astype(np.float64) @ flame.rows if flame is not None else 0.0
+        _count(residual, np.square(expression).sum(), np.square(expression - given).sum(), 0, 0)
+        residual.notes |= dict.fromkeys(filter(None, [limitation("deca56", flame)]))
+
+
+def _count(residual: Residual, whole: float, left: float, beyond: int, values: int) -> None:
+    residual.expression2 += float(whole)
+    residual.left2 += float(left)
+    residual.beyond += beyond
+    residual.values += values
+
+
+def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
+    """(N,) between heads as filed, and ours written in the source's terms again."""
+    from scipy.spatial.transform import Rotation
+
+    name = "deca56" if space == "seamless27" else space
+    columns = slice(0, 3) if space == "seamless27" else SPACES[name].rotation
+    back = encode(ours, name)[:, SPACES[name].rotation].astype(np.float64)
+
+    def turns(rows: Doubles) -> Rotation:
+        return Rotation.from_matrix(rotation(rows)) if SPACES[name].euler else Rotation.from_rotvec(rows)
+
+    apart: Doubles = (turns(filed[:, columns]) * turns(back).inv()).magnitude()
+    return apart
+
+
+def _resampled(filed: Dyad, ours: Dyad, residual: Residual) -> None:
+    """Our angles, read back at the instants of the source's frames (a frame stands for its end)."""
+    theirs_s = (np.arange(len(filed.listener)) + 1) / filed.fps
+    ours_s = (np.arange(len(ours.listener)) + 1) / FRAME_HZ
+    inside = (theirs_s >= ours_s[0]) & (theirs_s <= ours_s[-1])
+    for column in range(_ANGLES.stop):
+        back = np.interp(theirs_s[inside], ours_s, ours.listener[:, column])
+        residual.resampled_rad2 += float(np.square(back - filed.listener[inside, column]).sum())
+        residual.resampled += int(inside.sum())
+
+
+def names() -> Mapping[str, str]:
+    """What each figure of `Residual.told` means, for a person."""
+    return {
+        "pose_round_trip_deg": "head turned back into the source's terms: largest difference, degrees",
+        "resampling_rms_deg": "head angles at 25 fps read back at the source's rate: rms difference, degrees",
+        "expression_lost_share": "rms of the expression that blendshapes do not show, of the whole",
+        "cut_share": "values beyond the range and cut",
+        "stored_pose_deg": "head angles as written: largest difference, degrees",
+        "stored_blendshape": "blendshapes as written: largest difference",
+    }

@@ -1,0 +1,140 @@
+"""REACT 2023 and 2024 (reactmultimodalchallenge/baseline_react2023 @ c5a8ff85, _react2024 @ 0c3ce587): 30 s at 25 fps.
+
+`{train,val,test}.csv` list (speaker, listener) as `site/chat/person/clip`; below `{split}/` lie `3D_FV_files/*.npy`
+(751 FaceVerse frames of 58), `Audio_files/*.wav` (44.1 kHz) and `Emotion/*.csv` (25 attributes a frame), one file per
+clip. Metrics use 750 frames. Every pair is read both ways: val and test as the reference doubles them, so that a
+clip's `row` is its row in the appropriateness matrix; train because swapping by chance comes to the same.
+
+Deviation: the reference subtracts a mean face on loading. Here motion stays what the files hold, which is what the
+retargeting of `faceverse58` reads; `faceverse58-centred` is the reference's (`centred`), and never drives a head.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import Floats
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem
+from sfms_robot.lab.corpora.reading import collect, filed_dyad, frames_of, npy, table, track
+
+FPS: Final = 25.0
+WIDTH: Final = 58
+FRAMES: Final = 750
+ATTRIBUTES: Final = 25  # 15 action units | valence, arousal | 8 expressions
+SPLITS: Final = {"train": "train", "validation": "val", "test": "test"}
+FACES, SOUNDS, EMOTIONS = "3D_FV_files", "Audio_files", "Emotion"
+# The cleaned release names the two people of a chat P1 and P2 in the Emotion tree alone.
+FIRST: Final = ("Expert_video", "P25", "P41", "P45")
+SECOND: Final = ("Novice_video", "P26", "P42", "P46")
+MEAN_FACE: Final = ("mean_face.npy", "external/FaceVerse/mean_face.npy")
+
+
+def root(folder: Path) -> Path | None:
+    for place in (folder, folder / "data"):
+        if any((place / split / FACES).is_dir() for split in SPLITS.values()):
+            return place
+    return None
+
+
+def splits(place: Path) -> Mapping[str, str]:
+    return {ours: theirs for ours, theirs in SPLITS.items() if (place / theirs / FACES).is_dir()}
+
+
+def scan(place: Path, split: str, order: Order | None) -> Dataset:
+    pairs = _pairs(place / f"{split}.csv")
+    pairs += [(listener, speaker) for speaker, listener in pairs]
+    folder = place / split
+    heard = (folder / SOUNDS).is_dir()
+
+    def clip(row: int, listener: str) -> Clip:
+        speaker = pairs[row][0]
+        name = listener.replace("/", "+")
+        files = [folder / FACES / f"{person}.npy" for person in (speaker, listener)]
+        frames = min(FRAMES, frames_of(name, *(npy(file).shape for file in files), slack=1))
+        voices = [folder / SOUNDS / f"{person}.wav" for person in (speaker, listener)] if heard else []
+        if voices and not voices[0].is_file():
+            raise ClipError.of("missing sound", voices[0], "no such file")
+        features = {
+            "attributes": partial(attributes, folder, listener, frames),
+            "speaker_attributes": partial(attributes, folder, speaker, frames),
+        }
+        return Clip(
+            name,
+            frames,
+            row,
+            partial(filed_dyad, name, files, voices, frames, "faceverse58", FPS, order == "pose-first"),
+            features,
+        )
+
+    clips, problems = collect([(row, listener) for row, (_, listener) in enumerate(pairs)], clip)
+    notes = [] if heard else [f"{folder / SOUNDS}: no such folder: these clips have no sound"]
+    if not (folder / EMOTIONS).is_dir():
+        notes.append(f"{folder / EMOTIONS}: no such folder: no attributes, which the REACT metrics are defined on")
+    return Dataset("react", split, "faceverse58", FPS, clips, _once(problems), tuple(notes))
+
+
+def _pairs(file: Path) -> list[tuple[str, str]]:
+    """(speaker, listener) of every row. Raises ConfigError for a list that is missing or broken."""
+    if not file.is_file():
+        raise ConfigError(f"{file}: no such file: it lists which clips belong together")
+    rows = table(file)[1:]
+    if broken := [row for row in rows if len(row) < 3]:
+        raise ConfigError(f"{file}: {','.join(broken[0])!r} holds no index, speaker and listener")
+    return [(row[1].strip(), row[2].strip()) for row in rows]
+
+
+def _once(problems: tuple[Problem, ...]) -> tuple[Problem, ...]:
+    """A file that both ways of a pair need is one problem."""
+    return tuple(dict.fromkeys(problems))
+
+
+def attributes(folder: Path, clip: str, frames: int) -> Floats:
+    """(frames, 25) of one clip, as the challenge labels it. Raises ClipError."""
+    named = folder / EMOTIONS / f"{clip}.csv"
+    file = named if named.is_file() else folder / EMOTIONS / f"{_cleaned(clip)}.csv"
+    if not file.is_file():
+        raise ClipError.of("missing feature", named, "no such file")
+    try:
+        rows = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32, ndmin=2)
+    except ValueError as error:
+        raise ClipError.of("unreadable", file, error) from error
+    return track(str(file), rows, frames, ATTRIBUTES)
+
+
+def _cleaned(clip: str) -> str:
+    parts = clip.split("/")
+    return "/".join("P1" if part in FIRST else "P2" if part in SECOND else part for part in parts)
+
+
+def mean_face(place: Path) -> Floats:
+    """(58,) the face that the reference subtracts, where the user has put it. Raises ConfigError."""
+    tried = [base / name for base in (place, place.parent) for name in MEAN_FACE]
+    file = next((file for file in tried if file.is_file()), None)
+    if file is None:
+        raise ConfigError(f"{place}: faceverse58-centred needs {MEAN_FACE[0]} or {MEAN_FACE[1]} there or above")
+    try:
+        mean = np.asarray(npy(file), np.float32).reshape(-1)
+    except ValueError as error:
+        raise ConfigError(f"{file}: holds no mean face: {error}") from error
+    if mean.shape != (WIDTH,) or not np.isfinite(mean).all():
+        raise ConfigError(f"{file}: a mean face is ({WIDTH},) and finite, this is {mean.shape}")
+    return mean
+
+
+def centred(mean: Floats, clip: Dyad) -> Dyad:
+    """A dyad less the mean face."""
+    return replace(clip, speaker=clip.speaker - mean, listener=clip.listener - mean, space="faceverse58-centred")
+
+
+LAYOUT: Final = Layout(
+    "react", "REACT 2023/24: {train,val,test}/3D_FV_files and {split}.csv", "faceverse58", FPS, "exp-first",
+    root, splits, scan, features=("attributes", "speaker_attributes"),
+)  # fmt: skip

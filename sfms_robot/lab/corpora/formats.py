@@ -1,0 +1,234 @@
+"""One door to every data set: which layout a folder has, which splits, and the dyads of one of them.
+
+Some projects write the six pose channels first and some last, under the same file names. The order is an argument, by
+default the layout's own; files that look like the other one are refused before anything is learned from them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Final, get_args
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import Doubles, Floats
+from sfms_robot.lab.corpora import stored
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order
+from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
+from sfms_robot.lab.corpora.external import dualtalk, l2l, lm_listener, react, react2025, seamless, vico
+from sfms_robot.lab.corpora.reading import pose_last
+from sfms_robot.signals.audio_features import Feature, cached
+
+LAYOUTS: Final = {
+    layout.name: layout
+    for layout in (
+        l2l.LAYOUT, lm_listener.LAYOUT, react.LAYOUT, react2025.LAYOUT, dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT,
+        vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
+    )
+}  # fmt: skip
+_SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}
+_ORDERED: Final = ("train", "validation", "test")
+_SAMPLE: Final = 8  # clips looked at for the order of their channels
+_SEED: Final = 0
+
+log = logging.getLogger(__name__)
+
+
+def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
+    """The layout of a folder and where in it the data lie. Raises ConfigError if there is none, naming those known."""
+    if layout != "auto" and layout not in LAYOUTS:
+        raise ConfigError(f"--layout {layout}: is not known (auto, {', '.join(LAYOUTS)})")
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder")
+    tried = list(LAYOUTS.values()) if layout == "auto" else [LAYOUTS[layout]]
+    # Our own first: converted dyads keep the names of their files, and these may be another layout's.
+    for candidate in sorted(tried, key=lambda one: one is not stored.LAYOUT):
+        place = candidate.root(folder)
+        if place is not None:
+            return candidate, place
+    known = "; ".join(f"{candidate.name} ({candidate.about})" for candidate in tried)
+    raise ConfigError(f"{folder}: no data set that is known here: {known}")
+
+
+def split_names(layout: Layout, place: Path) -> tuple[str, ...]:
+    """Splits that `open_dataset` can give, by our names."""
+    found = set(layout.splits(place))
+    if "train" in found and layout.held_out:
+        found.add("validation")
+    return tuple(sorted(found, key=lambda name: (_ORDERED.index(name) if name in _ORDERED else len(_ORDERED), name)))
+
+
+def open_dataset(
+    folder: Path,
+    split: str,
+    layout: str = "auto",
+    order: Order | None = None,
+    space: str | None = None,
+    features: Iterable[str] = (),
+) -> Dataset:
+    """Dyads of one split of a data set on disk, read one at a time when asked for.
+
+    Args:
+        split: train, validation (val, valid, dev), test or what else the layout has. Where it ships no validation, a
+            share of train is held out, the same every time.
+        layout: a key of `LAYOUTS`, or "auto".
+        order: of the channels in the files, by default the layout's; refused unless it is said and they look
+            like the other.
+        space: the layout's own, or "arkit58" for faceverse58 data, or react's "faceverse58-centred".
+        features: names of shipped features each dyad is to carry.
+
+    What cannot be used is in `problems` and counted in a warning. Raises ConfigError when nothing is left.
+    """
+    found, place = detect(folder, layout)
+    dataset = _split(found, place, _SPLITS.get(split, split), _checked(order, found))
+    if not dataset.clips:
+        why = f": {dataset.problems[0]}" if dataset.problems else ""
+        raise ConfigError(f"{place}: no usable clip in {split} ({len(dataset.problems)} problems){why}")
+    if order is None and (said := wrong_order(dataset, found.order)):
+        raise ConfigError(f"{place}: {said}")
+    dataset = replace(dataset, features=_shipped(found, features))
+    if dataset.problems:
+        log.warning("%s", dataset.summary())
+    if dataset.licence is not None and dataset.split == "train":  # what weights come from
+        log.warning("%s: %s", place, dataset.licence)
+    return _in_space(dataset, place, space or dataset.space)
+
+
+def open_for(space: str, folder: Path, split: str, order: Order | None = None, features: Iterable[str] = ()) -> Dataset:
+    """`open_dataset` for a listener that works in `space`: the data in that space, or in ours, which becomes any.
+
+    Every dyad carries those of `features` that its data ship; what they do not is made from the sound.
+    """
+    dataset = open_dataset(folder, split, order=order)
+    dataset = replace(dataset, features=tuple(name for name in features if name in dataset.clips[0].features))
+    if dataset.space in (space, "arkit58"):
+        return dataset
+    if dataset.space != "faceverse58":
+        way = "; `sfms-robot data convert` makes arkit58 of it" if dataset.space in CONVERTIBLE else ""
+        raise ConfigError(f"{folder}: {dataset.layout} is in {dataset.space}, which cannot become {space}{way}")
+    return dataset.map(_as_arkit, "arkit58")
+
+
+def scan_split(layout: Layout, place: Path, split: str, order: Order | None = None) -> Dataset:
+    """One split as it is, empty or in the wrong order: for `data check`."""
+    return _split(layout, place, split, _checked(order, layout))
+
+
+def _checked(order: Order | None, layout: Layout) -> Order | None:
+    if order is not None and order not in get_args(Order):
+        raise ConfigError(f"--order {order}: is no order of channels ({', '.join(get_args(Order))})")
+    if order is not None and layout.order is None:
+        raise ConfigError(f"--order {order}: {layout.name} files name their channels, there is no order to choose")
+    return order or layout.order
+
+
+def _split(layout: Layout, place: Path, split: str, order: Order | None) -> Dataset:
+    theirs = layout.splits(place)
+    if split not in split_names(layout, place):
+        raise ConfigError(f"{place}: has no split {split} ({', '.join(split_names(layout, place)) or 'none'})")
+    held_out = "validation" not in theirs and layout.held_out
+    whole = replace(layout.scan(place, theirs.get(split, theirs.get("train", "")), order), split=split)
+    if not held_out or split not in ("train", "validation"):
+        return whole
+    rank = np.random.default_rng(_SEED).permutation(len(whole))
+    first = rank < max(round(layout.held_out * len(whole)), min(1, len(whole) - 1))
+    wanted = first if split == "validation" else ~first
+    clips = tuple(clip for clip, use in zip(whole.clips, wanted, strict=True) if use)
+    note = f"{layout.name} ships no validation: {layout.held_out:.0%} of train is held out for it"
+    return replace(whole, clips=clips, notes=(*whole.notes, note))
+
+
+def _shipped(layout: Layout, features: Iterable[str]) -> tuple[str, ...]:
+    wanted = tuple(features)
+    for name in wanted:
+        if name not in layout.features and layout.name != stored.LAYOUT.name:
+            raise ConfigError(f"{layout.name} ships no feature {name!r} ({', '.join(layout.features) or 'none'})")
+    return wanted
+
+
+def with_feature(dataset: Dataset, feature: Feature, cache: Path) -> Dataset:
+    """The same set, every dyad carrying a feature of its speaker's voice, computed once and kept in `cache`.
+
+    Raises ConfigError for data without a waveform, and for a feature of another frame rate.
+    """
+    if feature.fps != dataset.fps:
+        raise ConfigError(f"{feature.name} has {feature.fps:g} frames a second, {dataset.layout} {dataset.fps:g}")
+
+    def heard(clip: Dyad) -> Dyad:
+        if clip.audio is None:
+            raise ConfigError(f"{clip.name} has no waveform to compute {feature.name} from")
+        rows = cached(clip.audio, feature, cache)[: len(clip.listener)]
+        short = len(clip.listener) - len(rows)  # where a frame is no whole number of samples
+        return replace(clip, features={**clip.features, feature.name: np.pad(rows, ((0, short), (0, 0)), mode="edge")})
+
+    return dataset.map(heard)
+
+
+# --- spaces -----------------------------------------------------------------------------------------------------
+
+
+def _in_space(dataset: Dataset, place: Path, space: str) -> Dataset:
+    if space == dataset.space:
+        return dataset
+    if dataset.space == "faceverse58" and space == "arkit58":
+        return dataset.map(_as_arkit, space)
+    if dataset.layout == react.LAYOUT.name and space == "faceverse58-centred":
+        return dataset.map(partial(react.centred, react.mean_face(place)), space)
+    choices = [dataset.space]
+    if dataset.space == "faceverse58":
+        choices += ["arkit58"] + ["faceverse58-centred"] * (dataset.layout == react.LAYOUT.name)
+    raise ConfigError(f"--space {space}: {dataset.layout} comes in {', '.join(choices)}")
+
+
+def _as_arkit(clip: Dyad) -> Dyad:
+    """faceverse58 in our units; a speaker's unknown frames stay unknown."""
+    speaker, listener = (in_ours(motion, "faceverse58") for motion in (clip.speaker, clip.listener))
+    return replace(clip, speaker=speaker, listener=listener, space="arkit58")
+
+
+# --- order ------------------------------------------------------------------------------------------------------
+
+
+def wrong_order(dataset: Dataset, declared: Order | None) -> str | None:
+    """One line if a sample of the set looks like the other order than `declared`, naming the option that says so."""
+    if declared is None or not dataset.clips:
+        return None
+    sample = []
+    for index in np.unique(np.linspace(0, len(dataset) - 1, _SAMPLE).astype(int)):
+        try:
+            sample.append(replace(dataset, features=())[int(index)].listener)
+        except ClipError:  # counted by whoever reads them all
+            continue
+    seen = looks_like(sample, dataset.space, declared)
+    if seen is None or seen == declared:
+        return None
+    return f"the files look {seen}, not {declared}: say --order {seen} (or --order {declared} if you know better)"
+
+
+def looks_like(motions: Sequence[Floats], space: str, declared: Order) -> Order | None:
+    """The order that files look to have; `motions` (T, D) were read as if it was the declared one. None: no telling.
+
+    deca56: a jaw hardly turns about y and z, and expressions do vary: two still columns end the six of the pose.
+    faceverse58: the rotation about x stays near pi, which no expression does.
+    """
+    if not motions or space not in ("deca56", "faceverse58"):
+        return None
+    filed: Doubles = np.concatenate(motions).astype(np.float64)
+    if declared == "pose-first":  # undo what reading did
+        filed = np.concatenate([filed[:, -6:], filed[:, :-6]], axis=1)
+    pose = {"pose-first": filed[:, :6], "exp-first": pose_last(filed, False)[:, -6:]}
+    if space == "faceverse58":
+        near = {name: abs(float(np.median(columns[:, 0])) - np.pi) < 0.8 for name, columns in pose.items()}
+        found: list[Order] = [name for name in get_args(Order) if near[name]]
+        return found[0] if len(found) == 1 else None
+    spread = {name: float(np.sqrt(np.prod(columns[:, 4:6].std(axis=0)))) for name, columns in pose.items()}
+    stiller, other = sorted(spread, key=lambda name: spread[name])
+    if spread[other] < 1e-6 or spread[stiller] > 0.5 * spread[other]:
+        return None
+    return "pose-first" if stiller == "pose-first" else "exp-first"

@@ -1,0 +1,249 @@
+"""Arrays out of files that somebody else wrote: headers first, and never code.
+
+Pickles run whatever they say. Those of data sets hold arrays and plain values, so nothing else is let through.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import pickle
+import warnings
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
+from sfms_robot.lab.corpora.collection import ClipError, Problem
+from sfms_robot.signals.audio import read_audio
+from sfms_robot.signals.events import listening_mask, voice_activity
+
+SOUND_SLACK_S: Final = 0.2  # sound may end this much before the face: containers round
+FRAMES_SLACK: Final = 2  # two tracks of one clip may differ by this
+
+# What numpy's arrays are rebuilt from, by the names of numpy 1 and 2; nothing here runs anything else.
+_ARRAY_PARTS: Final = {
+    (module, name)
+    for part in ("numpy.core", "numpy._core")
+    for module, name in (
+        (f"{part}.multiarray", "_reconstruct"),
+        (f"{part}.multiarray", "scalar"),
+        (f"{part}.numeric", "_frombuffer"),
+    )
+} | {("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode"), ("collections", "OrderedDict")}
+
+
+class _ArraysOnly(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ARRAY_PARTS:
+            raise pickle.UnpicklingError(f"asks for {module}.{name}: only arrays and plain values are read")
+        return getattr(_module(module), name)
+
+
+def _module(name: str) -> Any:
+    """numpy 1's modules under the names of the numpy at hand."""
+    return importlib.import_module(name.replace("numpy.core", "numpy._core") if _NUMPY_2 else name)
+
+
+_NUMPY_2: Final = int(np.__version__.split(".")[0]) >= 2
+
+
+def unpickle(file: Path) -> Any:
+    """A pickle of arrays and plain values. Raises UnpicklingError for one that asks for anything else, or is broken."""
+    content = io.BytesIO(file.read_bytes())
+    try:
+        return _ArraysOnly(content).load()
+    except (AttributeError, ImportError, OverflowError, MemoryError, AssertionError, *UNREADABLE) as error:
+        raise pickle.UnpicklingError(str(error) or "broken") from error
+
+
+def torch_load(file: Path) -> Any:
+    """What torch saved: tensors, arrays and plain values, as `weights_only` lets through.
+
+    Raises ClipError for a file that needs more.
+    """
+    import torch
+
+    arrays: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
+        (getattr(_module(module), name), f"{module}.{name}")
+        for module, name in sorted(_ARRAY_PARTS)
+        if _has(module, name)
+    ]
+    arrays += [type(np.dtype(kind)) for kind in ("f2", "f4", "f8", "i2", "i4", "i8", "u1", "?", "U1", "S1")]
+    try:
+        with torch.serialization.safe_globals(arrays), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # scrambled bytes look like a protocol of the future
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        detail = "holds more than tensors, arrays and plain values; save it again with these alone"
+        raise ClipError.of("unreadable", file, detail) from error
+    except (RuntimeError, *UNREADABLE) as error:
+        raise ClipError.of("unreadable", file, error) from error
+
+
+def _has(module: str, name: str) -> bool:
+    try:
+        return hasattr(_module(module), name)
+    except ImportError:
+        return False
+
+
+def npy(file: Path) -> NDArray[Any]:
+    """An array on disk, mapped rather than read. Raises ClipError."""
+    if not file.is_file():
+        raise ClipError.of("missing half", file, "no such file")
+    try:
+        out: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
+    except UNREADABLE as error:
+        raise ClipError.of("unreadable", file, error) from error
+    if not isinstance(out, np.ndarray):
+        out.close()  # an archive of several
+        raise ClipError.of("unreadable", file, "no array")
+    if out.dtype.kind not in "fiu":
+        raise ClipError.of("wrong dims", file, f"holds {out.dtype}, no numbers")
+    return out
+
+
+def table(file: Path) -> list[list[str]]:
+    """Rows of a CSV file, the header among them, empty ones left out. Raises ConfigError."""
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as stream:
+            return [row for row in csv.reader(stream) if row]
+    except (OSError, ValueError, csv.Error) as error:
+        raise ConfigError(f"{file}: not a table: {error}") from error
+
+
+def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of a .npz, from their headers. Raises ClipError."""
+    shapes = {}
+    try:
+        with zipfile.ZipFile(file) as archive:
+            for member in archive.namelist():
+                with archive.open(member) as stream:
+                    version = np.lib.format.read_magic(stream)
+                    header = (
+                        np.lib.format.read_array_header_1_0
+                        if version == (1, 0)
+                        else np.lib.format.read_array_header_2_0
+                    )
+                    shapes[member.removesuffix(".npy")] = header(stream)[0]
+    except UNREADABLE as error:
+        raise ClipError.of("unreadable", file, error) from error
+    return shapes
+
+
+def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) -> int:
+    """Frames that tracks of these shapes share; singleton axes do not count. Raises ClipError if lengths differ."""
+    lengths = [next((size for size in shape[:-1] if size != 1), 1) for shape in tracks]
+    if max(lengths) - min(lengths) > slack:
+        raise ClipError.of("lengths differ", name, f"{max(lengths)} frames beside {min(lengths)}")
+    return min(lengths)
+
+
+def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: bool = False) -> Floats:
+    """The first frames of a track (T, >= width) or with singleton axes, as (frames, width) float32.
+
+    Raises ClipError for other shapes, and for values that are not finite unless `gaps` are allowed.
+    """
+    one_axis_of_time = values.ndim > 2 and sum(size != 1 for size in values.shape[:-1]) <= 1
+    array = values.reshape(-1, values.shape[-1]) if one_axis_of_time else values
+    if array.ndim != 2 or array.shape[1] != width or len(array) < frames:
+        raise ClipError.of("wrong dims", name, f"shape {values.shape}, expected ({frames}, {width})")
+    out = np.array(array[:frames], dtype=np.float32)
+    bad = ~np.isfinite(out).all(axis=1)
+    if bad.any() and not gaps:
+        raise ClipError.of("not finite", name, f"{int(bad.sum())} of {frames} frames, first {int(bad.argmax())}")
+    return out
+
+
+def sound(file: Path, frames: int, fps: float) -> Floats:
+    """A voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
+    if not file.is_file():
+        raise ClipError.of("missing sound", file, "no such file")
+    audio, wanted = read_audio(file), samples_of(frames, fps)
+    if wanted - len(audio) > SOUND_SLACK_S * AUDIO_HZ:
+        detail = f"{len(audio) / AUDIO_HZ:.2f} s of sound for {frames / fps:.2f} s of face"
+        raise ClipError.of("lengths differ", file, detail)
+    return np.pad(audio[:wanted], (0, max(0, wanted - len(audio))))
+
+
+def dyad(
+    name: str,
+    speaker: Floats,
+    listener: Floats,
+    space: str,
+    fps: float,
+    *,
+    audio: Floats | None = None,
+    mel: Floats | None = None,
+    own: Floats | None = None,
+) -> Dyad:
+    """A dyad of a data set without annotations: who listens when is told by the two voices, where both are there.
+
+    Without the listener's `own` voice he listens all the time, as his role in the data says.
+    """
+    frames = len(listener)
+    listening = np.ones(frames, bool)
+    if audio is not None and own is not None:
+        voices = [speaks(voice, frames, fps) for voice in (audio, own)]
+        listening = np.asarray(listening_mask(voices[0], fps, voices[1]), bool)
+    return Dyad(name, audio, speaker, listener, listening, space, fps, mel)
+
+
+def filed_dyad(
+    name: str, faces: Sequence[Path], voices: Sequence[Path], frames: int, space: str, fps: float, pose_first: bool
+) -> Dyad:
+    """A dyad whose motion lies in a .npy of the speaker's and one of the listener's; voices likewise, or none."""
+    speaker, listener = (
+        track(str(file), pose_last(npy(file), pose_first), frames, WIDTHS[space], gaps=gaps)
+        for file, gaps in zip(faces, (True, False), strict=True)
+    )
+    return dyad(name, speaker, listener, space, fps, **voices_of(voices, frames, fps))
+
+
+def voices_of(voices: Sequence[Path], frames: int, fps: float) -> dict[str, Floats | None]:
+    """`audio` of the speaker and `own` of the listener from their files, as `dyad` takes them; the second may lack."""
+    if not voices:
+        return {}
+    own = sound(voices[1], frames, fps) if voices[1].is_file() else None
+    return {"audio": sound(voices[0], frames, fps), "own": own}
+
+
+def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
+    """(frames,) in which somebody is heard to speak; a voice that is over says nothing."""
+    active = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / fps), bool)[:frames]
+    return np.pad(active, (0, frames - len(active)))
+
+
+def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
+    """An array or tensor of a dict. Raises KeyError, or TypeError for anything else."""
+    found = values[key]
+    array = np.asarray(found.numpy() if hasattr(found, "numpy") else found)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{key} holds no numbers")
+    return array
+
+
+def pose_last(values: NDArray[Any], pose_first: bool) -> NDArray[Any]:
+    """Channels with the six pose ones last, from files in which they stand first or already do."""
+    return np.concatenate([values[..., 6:], values[..., :6]], axis=-1) if pose_first else values
+
+
+def collect(
+    names: Sequence[tuple[int, str]], build: Callable[[int, str], Any]
+) -> tuple[tuple[Any, ...], tuple[Problem, ...]]:
+    """`build` for every (row, name): what came out, and the problems of those that failed."""
+    built, problems = [], []
+    for row, name in names:
+        try:
+            built.append(build(row, name))
+        except ClipError as error:
+            problems.append(error.problem)
+    return tuple(built), tuple(problems)

@@ -1,0 +1,287 @@
+"""What ARIG is trained on, frame by frame: both people's sounds and motions, and the state of the conversation."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from sfms_robot import config
+from sfms_robot.config.arig import STATES
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, LATERAL_POSE, Floats
+from sfms_robot.lab.corpora.clips import Dyad as Conversation
+from sfms_robot.lab.corpora.collection import Dataset
+from sfms_robot.lab.corpora.conversational_states import UNKNOWN
+from sfms_robot.lab.corpora.formats import open_dataset
+from sfms_robot.lab.learning import corpus as dyads
+from sfms_robot.lab.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, without_gaze
+from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
+from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.listeners.arig import audio_frontend, told
+from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.modules import StateUnderstanding
+from sfms_robot.listeners.arig.sampler import Denoiser
+from sfms_robot.listeners.arig.sojourns import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import lateral_channels
+from sfms_robot.signals import mel, phase
+from sfms_robot.signals.control import control_track
+from sfms_robot.signals.events import runs
+from sfms_robot.signals.voice_activity import levels_db
+
+SCENES: Final = ("speaking", "listening", "interaction")
+LEAST_STEP: Final = 0.01  # of a frame, in deviations of the motion
+LEAST_SPREAD: Final = 0.25  # of companded innovations: what hardly moves does not weigh more than what moves
+COMPANDED: Final = 4  # innovations above the deviation over this are companded: between what rests and what happens
+LARGEST_RHO: Final = 0.98  # of one frame to the next: what was drawn wrongly is forgotten within 2 s
+AT_REST: Final = 0.99  # of the frames in which nothing moves a face: beyond, it is on its way back
+LEAST_REST: Final = 10 * FRAME_HZ  # frames that tell how a face rests
+PAUSE_FRAMES: Final = FRAME_HZ // 2  # to either side of a word
+RARE: Final = 0.02  # of the frames with the same voices: a state so rare there is a label's edge
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledDyad(Dyad):
+    """What the model takes, sound in half precision while it is kept, and states (..., N) int64, -1 unlabelled.
+
+    `control` is (..., N, 0) for a listener without events. `sway` (..., N, S) is the agent's slow motion, where that is
+    not in `agent_motion`; S = 0 without.
+    """
+
+    states: Tensor
+    sway: Tensor
+
+
+ArigCorpus = Corpus[LabelledDyad]
+
+
+def open_scenes(data: Path, split: str) -> dict[str, Dataset]:
+    """The set in `data` is listening; data/speaking and data/interaction, where they are, the other two."""
+    found = {"listening": open_dataset(data, split)}
+    for scene in ("speaking", "interaction"):
+        if any((data / scene).glob(f"{split}/*.npz")):
+            found[scene] = open_dataset(data / scene, split)
+        else:
+            log.warning("%s: no %s, the curriculum goes on without it", data / scene, split)
+    return found
+
+
+def gather(
+    scenes: Mapping[str, Sequence[Conversation]],
+    window: int,
+    space: MotionSpace,
+    settings: config.Arig,
+    scratch: Scratch | None = None,
+) -> ArigCorpus:
+    """`corpus.gather` in one motion space, for a listener of such settings."""
+    return dyads.gather(scenes, window, partial(frames_of, space=space, settings=settings), scratch)
+
+
+def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
+    """Windows at (B,) starts as the model takes them."""
+    found = corpus.cut(starts, window)
+    return replace(found, user_sound=found.user_sound.float(), agent_sound=found.agent_sound.float())
+
+
+def frames_of(dyad: Conversation, space: MotionSpace, settings: config.Arig) -> LabelledDyad:
+    """One conversation (N, ...). Raises ConfigError for a motion space, sound or events that do not fit."""
+    frames, width = len(dyad.listener), audio_frontend.WIDTHS[settings.sound]
+    control = torch.zeros(frames, 0)
+    if settings.events:
+        if dyad.events is None:
+            raise ConfigError(f"{dyad.name}: what the listener did is not known, which events: true needs")
+        control, dyad = torch.from_numpy(control_track(dyad.events, 0, frames)), without_gaze(dyad)
+    face = in_space(dyad, dyad.speaker, space)
+    seen = face.isfinite().all(-1)
+    user, user_voiced, heard = _audio_features(dyad, "user", width)
+    agent, agent_voiced, says = _audio_features(dyad, "agent", width)
+    states = torch.from_numpy((np.full(frames, UNKNOWN) if dyad.states is None else dyad.states).astype(np.int64))
+    if settings.events:
+        quiet = torch.where((states == FEEDBACK) & ~agent_voiced, LISTENING, states)
+        states = torch.from_numpy(with_feedback(quiet.numpy(), control.numpy()))
+    motion, sway = in_space(dyad, dyad.listener, space), torch.zeros(frames, 0)
+    if settings.sway:
+        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
+    return LabelledDyad(
+        user_sound=user,
+        user_heard=torch.full((frames,), heard),
+        agent_sound=agent,
+        agent_heard=torch.full((frames,), says),
+        user_motion=torch.where(seen[:, None], face, 0.0),
+        user_seen=seen,
+        agent_motion=motion,
+        voiced=torch.stack([agent_voiced, user_voiced], dim=-1),
+        control=control,
+        states=states,
+        sway=sway,
+    )
+
+
+def _audio_features(dyad: Conversation, track: str, width: int) -> tuple[Tensor, Tensor, bool]:
+    """Features (N, A) in half precision, speech (N,), and whether the track is there at all.
+
+    A user's track of zeros is no microphone; an agent's is a robot that says nothing. wav2vec2 features come with the
+    data, as features `wav2vec2` and `agent_wav2vec2`, and take the place of the mel rows.
+    """
+    frames = len(dyad.listener)
+    audio = dyad.audio if track == "user" else dyad.agent_audio
+    if track == "user" and audio is not None and not audio.any():
+        audio = None
+    shipped = dyad.features.get("wav2vec2" if track == "user" else "agent_wav2vec2")
+    if width != audio_frontend.WIDTHS["mel"] and shipped is not None:
+        rows = _beside_phase(shipped, audio)
+        voiced = np.zeros(frames, bool) if audio is None else np.array(phase.hear(levels_db(audio)))
+    elif width != audio_frontend.WIDTHS["mel"] and audio is not None:
+        raise ConfigError(f"{dyad.name}: sound = wav2vec2 needs the feature wav2vec2, agent_wav2vec2 with the data")
+    elif audio is not None and dyad.fps == FRAME_HZ:
+        rows, voiced = audio_frontend.track(audio)
+    elif track == "user" and dyad.mel is not None:
+        rows, voiced = audio_frontend.of_mel(dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
+    else:
+        return torch.zeros(frames, width, dtype=torch.half), torch.zeros(frames, dtype=torch.bool), False
+    return torch.from_numpy(rows).half(), torch.from_numpy(voiced), True
+
+
+def _beside_phase(rows: Floats, audio: Floats | None) -> Floats:
+    place = np.zeros((len(rows), phase.FEATURES), np.float32) if audio is None else phase.of_audio(audio)
+    return np.concatenate([rows, place], axis=1).astype(np.float32)
+
+
+def reflection(before: Tensor, after: Tensor) -> Tensor:
+    """Burg's coefficient (C,) of values of mean 0, (M, C) each: how much of one is the other, whichever comes first.
+
+    Within -1..1: no autoregression with such coefficients grows (J. P. Burg, 1967). What never moves stays as it is.
+    """
+    power = (before.double().square() + after.double().square()).sum(0)
+    found = 2 * (before.double() * after.double()).sum(0) / power.clamp(min=1e-9)
+    return torch.where(power > 0, found, 1.0).float()
+
+
+def _fit_steps(model: ArigModel, of_dyads: Sequence[Tensor], remains: Tensor | None) -> Tensor:
+    """From standardised motion (M, C) of every dyad, less what is told of events; what is to be drawn of it (N, C).
+
+    `remains` (N, C): of `told`; None without events.
+    """
+    last, now = _pairs(of_dyads)
+    if remains is not None:
+        last = remains * last
+    if model.settings.draws != "innovation":
+        model.step_std.copy_((now - last).std(0).clamp(min=LEAST_STEP))
+        return model.moved(now, last)
+    rho = reflection(last, now).clamp(0.0, LARGEST_RHO)
+    model.rho.copy_(rho)
+    left = now - rho * last
+    model.step_std.copy_((left.std(0) / COMPANDED).clamp(min=LEAST_STEP))
+    model.spread.copy_((left / model.step_std).asinh().std(0).clamp(min=LEAST_SPREAD))
+    return model.companded(left / model.step_std)
+
+
+def _pairs(of_dyads: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Rows of every dyad but its last, and those after them."""
+    return torch.cat([one[:-1] for one in of_dyads]), torch.cat([one[1:] for one in of_dyads])
+
+
+def _remains(model: ArigModel, corpus: ArigCorpus) -> Tensor | None:
+    """`told.remains` of every frame but the first of a dyad (N, C); None for a model that is told of nothing."""
+    control = corpus.frames.control
+    if not model.is_told or control is None:
+        return None
+    of_dyads = torch.split(control, list(corpus.lengths))
+    return torch.cat([told.remains(rows[:-1], rows[1:], model.moves) for rows in of_dyads])
+
+
+def _fit_rest(model: ArigModel, of_dyads: Sequence[Tensor], corpus: ArigCorpus) -> None:
+    """How far a face at rest is off what is told of it: (M, C) of every dyad, while no event moves it and no word."""
+    control, talks = corpus.frames.control, corpus.frames.voiced[:, 0].float()
+    if not model.is_told or control is None:
+        return
+    lengths, still = list(corpus.lengths), []
+    for rows, talk in zip(torch.split(control, lengths), torch.split(talks, lengths), strict=True):
+        near = F.max_pool1d(talk[None], 2 * PAUSE_FRAMES + 1, 1, PAUSE_FRAMES)[0] > 0
+        still.append(~(told.moved_channels(rows, model.moves) | near[:, None]))
+    rests, off = torch.cat(still), torch.cat(list(of_dyads)).abs()
+    for channel in range(model.channels):
+        found = off[rests[:, channel], channel]
+        if len(found) >= LEAST_REST:
+            model.rest_range[channel] = found.kthvalue(math.ceil(AT_REST * len(found))).values
+
+
+def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Tensor:
+    """Standardised motion (N, C) less what its events do to a face on average, which is fitted first."""
+    control = corpus.frames.control
+    if not model.is_told or control is None:
+        return standard
+    model.told.copy_(told.fit(control, standard))
+    sides = [name in LATERAL_POSE for name in model.settings.channels]
+    model.told[:, sides] = 0.0  # nobody tells to which side a shake begins, so none is on average
+    lengths = list(corpus.lengths)
+    of_dyads = zip(torch.split(standard, lengths), torch.split(control, lengths), strict=True)
+    return torch.cat([motion - told.features(rows) @ model.told for motion, rows in of_dyads])
+
+
+def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
+    """How long each of the paper's states lasts, and which there are with which voices, as the model hears them."""
+    labels = corpus.frames.states
+    labels = torch.where(labels >= NODDING, LISTENING, labels)  # feedback that is seen lies on top
+    of_dyads = torch.split(labels, list(corpus.lengths))
+    places = torch.linspace(0, 1, QUANTILES)
+    for state in range(len(STATES)):
+        lasted = [float(end - start) for one in of_dyads for start, end in runs(one == state)]
+        if lasted:
+            states.durations[state] = torch.quantile(torch.tensor(lasted), places)
+    known = labels >= 0
+    voices = corpus.frames.voiced[known].long()
+    found = torch.zeros(2, 2, len(STATES))
+    found.index_put_((voices[:, 0], voices[:, 1], labels[known]), torch.ones(()), accumulate=True)
+    share = found / found.sum(-1, keepdim=True).clamp(min=1)
+    states.possible.copy_((share >= RARE) | (share == share.amax(-1, keepdim=True)))
+
+
+def _fit_sway(model: ArigModel, corpus: ArigCorpus) -> None:
+    """On those who listen, where there are any: who speaks sways further, and is told from them by nothing here."""
+    of_dyads = torch.split(corpus.frames.sway, list(corpus.lengths))
+    listening = [slow for slow, scene in zip(of_dyads, corpus.scenes, strict=True) if scene == "listening"]
+    mixture, sizes = fit_sway(listening or of_dyads, lateral_channels(model.settings.channels))
+    model.sway_mixture.copy_(mixture)
+    model.sway_spread.copy_(sizes)
+
+
+def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) -> None:
+    """Set means and deviations of motion and sound, and the range that the sampler keeps to."""
+    frames = corpus.frames
+    mean, spread = motion_scales(frames.agent_motion, channels)
+    if frames.user_seen.any():  # what is not drawn, or made apart, is seen all the same
+        whole = model.is_drawn & model.is_recalled
+        spread = torch.where(whole, spread, motion_scales(frames.user_motion[frames.user_seen], channels)[1])
+    model.motion_mean.copy_(mean)
+    model.motion_std.copy_(spread)
+    standard = model.standardise(frames.agent_motion)
+    model.motion_low.copy_(standard.amin(0))
+    model.motion_high.copy_(standard.amax(0))
+    of_dyads = torch.split(_beside_events(model, standard, corpus), list(corpus.lengths))
+    drawn = _fit_steps(model, of_dyads, _remains(model, corpus))
+    _fit_rest(model, of_dyads, corpus)
+    if model.settings.sway:
+        _fit_sway(model, corpus)
+    if isinstance(model.head, Denoiser) and model.settings.diffusion.clamp:
+        model.head.low.copy_(drawn.amin(0))
+        model.head.high.copy_(drawn.amax(0))
+    if model.settings.events and model.states is not None:
+        _fit_states(model.states, corpus)
+    rows = some_sound((frames.user_sound, frames.user_heard), (frames.agent_sound, frames.agent_heard))
+    if len(rows):
+        mean, spread = sound_scales(rows)
+        model.sound_mean.copy_(mean)
+        model.sound_std.copy_(spread)

@@ -1,0 +1,127 @@
+"""What people did and when they might have: the events that each hazard is taught, of one person of a meeting.
+
+    nod, shake, tilt, laugh, mm_hm     as annotated
+    smile, brow_raise                  nobody annotated them: drawn as in composed dyads, from laughs of others, own
+                                       "mm-hm" and nods, and from questions asked; a reaction late
+    gaze_shift                         a look away from somebody who speaks or holds the floor, where annotated
+
+A hazard is asked every 80 ms; an event belongs to the step in which it begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles
+from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.meeting_evidence import MeetingEvidence
+from sfms_robot.listeners.events.evidence import Bools, Ints
+from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S
+from sfms_robot.signals.events import near
+
+LEARNED: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "gaze_shift")
+REACTION_S: Final = 0.3  # of a smile to a laugh, of brows to a question
+SMILES: Final = {"laugh": 0.6, "mm_hm": 0.3, "nod": 0.12}  # shares followed by a smile: others' laughs, own the rest
+BROWS: Final = {"question": 0.5, "nod": 0.15}
+SMILE_S, BROW_S = 1.6, 0.8
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """One kind of event of one person, M steps of 80 ms.
+
+    Attributes:
+        onsets: (K,) steps in which one begins that could.
+        may: (M,) steps in which it could begin: he listens and is not inside one.
+    """
+
+    onsets: Ints
+    may: Bools
+
+
+def steps_of(mask: Bools) -> Bools:
+    """(N,) frames -> (N // 2,) steps, by the last frame before each; nothing holds before the first."""
+    before: Bools = np.r_[False, mask[STEP_FRAMES - 1 :: STEP_FRAMES]]
+    return before[: len(mask) // STEP_FRAMES]
+
+
+def spans_of(person: Person, meeting: MeetingEvidence, rng: np.random.Generator) -> dict[str, Doubles]:
+    """(K, 2) of everything he did, those that nobody annotated drawn."""
+    others = person.others_laughs[:, 0]
+    smiles = _some(others, SMILES["laugh"], rng), _some(person.mm_hms[:, 0], SMILES["mm_hm"], rng)
+    brows = _some(person.asked, BROWS["question"], rng)
+    nods = person.nods[:, 0]
+    return {
+        **meeting.spans_s,
+        "smile": _spans(np.r_[smiles[0] + REACTION_S, smiles[1], _some(nods, SMILES["nod"], rng)], SMILE_S),
+        "brow_raise": _spans(np.r_[brows + REACTION_S, _some(nods, BROWS["nod"], rng)], BROW_S),
+    }
+
+
+def _some(at_s: Doubles, share: float, rng: np.random.Generator) -> Doubles:
+    return at_s[rng.random(len(at_s)) < share]
+
+
+def _spans(starts_s: Doubles, length_s: float) -> Doubles:
+    starts = np.sort(starts_s)
+    return np.stack([starts, starts + length_s], axis=1)
+
+
+def lesson(spans_s: Doubles, listening: Bools, inside: Doubles | None = None) -> Lesson:
+    """Of events (K, 2); `inside` are the spans in which none can begin, their own if not said."""
+    taken = near((spans_s if inside is None else inside) + [0.0, -FRAME_S], len(listening), FRAME_HZ, 0.0)
+    begins = np.floor(spans_s[:, 0] / STEP_S + 1e-6).astype(np.int64)
+    heard = steps_of(listening)
+    onsets = np.unique(begins[(begins >= 0) & (begins < len(heard))])
+    onsets = onsets[heard[onsets]]
+    may = heard & ~taken[: len(heard) * STEP_FRAMES : STEP_FRAMES]  # that one is over is known as it ends
+    may[onsets] = True
+    return Lesson(onsets, may)
+
+
+@dataclass(frozen=True)
+class Looks:
+    """Where somebody's eyes went.
+
+    Attributes:
+        shifts_s: (K, 2) from each shift to the next.
+        aside: (K,) not to somebody who speaks or holds the floor.
+        at_speaker: (N,) frames in which he looks at such a one.
+        away_s: (J,) instants at which he looks away from one.
+    """
+
+    shifts_s: Doubles
+    aside: Bools
+    at_speaker: Bools
+    away_s: Doubles
+
+
+def looks_of(person: Person, meeting: MeetingEvidence, counts: Bools) -> Looks:
+    """Of somebody whose gaze was annotated; `counts` (N, P) is who speaks or holds the floor (`evidence.counts_in`)."""
+    frames, gaze = len(counts), person.gaze or ()
+    target = np.zeros(frames, np.int64)  # column of whom he looks at; 0, himself, for anything else
+    columns = [max(0, meeting.agents.index(where)) if where in meeting.agents else 0 for _, _, where in gaze]
+    first = [min(max(round(start * FRAME_HZ), 0), frames - 1) for start, _, _ in gaze]
+    for column, begin, (_, end, _) in zip(columns, first, gaze, strict=True):
+        target[begin : max(begin, round(end * FRAME_HZ))] = column
+    at_speaker = (target > 0) & counts[np.arange(frames), target]
+    aside = np.array(
+        [not (column and counts[begin, column]) for column, begin in zip(columns, first, strict=True)], bool
+    )
+    away = [start for (start, _, _), begin, goes in zip(gaze, first, aside, strict=True)
+            if goes and begin and at_speaker[begin - 1]]  # fmt: skip
+    return Looks(np.array([look[:2] for look in gaze], np.float64).reshape(-1, 2), aside, at_speaker, np.array(away))
+
+
+def minutes(mask: Bools) -> float:
+    return float(mask.sum()) * STEP_S / 60
+
+
+def per_minute(lessons: Mapping[str, Lesson]) -> float:
+    """Events a minute of the time in which they could happen."""
+    total = sum(minutes(one.may) for one in lessons.values())
+    return sum(len(one.onsets) for one in lessons.values()) / total if total else 0.0

@@ -1,0 +1,138 @@
+"""What the training loop is told, and what it tells: the values that travel between a trainer, `fit` and its watchers.
+
+A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `learning.training_loop.fit`:
+
+    torch.manual_seed(settings.seed)                       # weights of a new model
+    model = MyModel(settings.listener).to(run.device)
+    job = Job(
+        name="mine",                                       # of the bar, the checkpoint file, the TensorBoard folder
+        model=model,                                       # all of its state dict goes into checkpoints
+        optimizers=[optimizer(model.parameters(), phase.learning_rate, phase.weight_decay)],
+        loss_of=lambda step, generator, batch: ...,        # scalar loss on `batch` samples drawn with `generator`
+        held_out=lambda: ...,                              # loss or error to watch, the same data each time; or None
+        frames_per_step=phase.batch * window,
+        phase=phase,                                       # a config.Phase: steps, clipping, precision, patience, ...
+        seed=settings.seed,
+        identity={"seed": ..., "listener": ..., "mine": phase.identity(), "data": fingerprint},
+    )
+    outcome = fit(job, out, run)                           # the model now holds its best weights: save them
+
+Five duties make a resumed run bit-identical on a CPU:
+ - `loss_of` draws every random number from the generator it is given (a CPU one: draw there, then move to the device)
+   or from torch's global one (dropout); never from numpy, the clock or a generator of its own;
+ - it takes as many samples as it is told: `phase.batch`, or the part of them that is a piece of a step
+   (`learning.process_group`), and its loss is their mean;
+ - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
+ - `held_out` may draw what it likes (its draws leave no trace) but gives the same number for the same weights;
+ - everything before `fit` follows from the settings and the data, and `identity` names them: plain JSON data, and a
+   checkpoint whose identity differs is refused by the key that differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from sfms_robot import config
+from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.staged_frames import Scratch
+
+LossOf = Callable[[int, torch.Generator, int], Tensor]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One phase of training; see the module's text.
+
+    Attributes:
+        loss_of: (step from 0, CPU generator, samples) -> scalar loss. The model is in training mode, under autocast if
+            asked.
+        held_out: error on held-out data, less is better. The model is in evaluation mode, gradients are off.
+        frames_per_step: motion frames a step learns from, for the speed that is shown.
+    """
+
+    name: str
+    model: nn.Module
+    optimizers: Sequence[torch.optim.Optimizer]
+    loss_of: LossOf
+    held_out: Callable[[], float] | None
+    frames_per_step: int
+    phase: config.Phase
+    seed: int
+    identity: Mapping[str, Any]
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.model.parameters()).device
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a run stands after `step` steps. `loss` is smoothed; `worse` counts looks since the best held-out loss."""
+
+    step: int = 0
+    loss: float | None = None
+    held_out: float | None = None
+    best: float | None = None
+    best_step: int = 0
+    worse: int = 0
+    finished: bool = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a watcher sees after every step. `position.held_out` is fresh when `looked`."""
+
+    name: str
+    steps: int
+    position: Position
+    loss: float
+    gradient_norm: float
+    learning_rate: float
+    frames_per_s: float
+    looked: bool
+
+
+def unwatched(report: Report) -> None:
+    """Shows nothing to anybody."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a job is run rather than what it is: the same job gives the same weights whoever watches.
+
+    Attributes:
+        group: the processes that run it together.
+        accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
+            Into how many pieces a batch is cut is part of what a run is, who takes them is not: a run goes on with any
+            number of processes that can share its pieces.
+        scratch: folder for frames that are read from disk as they are drawn; None: they are held in memory.
+    """
+
+    resume: bool = False
+    device: torch.device = torch.device("cpu")
+    watch: Callable[[Report], None] = unwatched
+    group: ProcessGroup = ProcessGroup()
+    accumulate: int | None = None
+    scratch: Path | None = None
+
+    def staging(self, name: str) -> Scratch | None:
+        """Where frames of this name are staged, if they are."""
+        return None if self.scratch is None else Scratch(self.scratch / name, self.group)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended. `loss` is smoothed and of the last step; `held_out` is of the weights the model now holds."""
+
+    loss: float
+    held_out: float | None
+    steps: int
+    best_step: int
+    stopped: Literal["steps", "patience"]
+    resumed_at: int | None

@@ -1,0 +1,214 @@
+"""What an SFMS listener is trained on, frame by frame: both motions, the speaker's sound and the place in a phrase."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sfms_robot import config
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
+from sfms_robot.lab.corpora.clips import Dyad, at_rate
+from sfms_robot.lab.learning import corpus as dyads
+from sfms_robot.lab.learning.corpus import (
+    Corpus,
+    in_space,
+    motion_scales,
+    some_sound,
+    sound_scales,
+    windows,
+    without_gaze,
+)
+from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
+from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.sway import lateral_channels
+from sfms_robot.signals import mel
+from sfms_robot.signals import phase as phases
+from sfms_robot.signals.control import control_track
+
+FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
+LEAST_SPEED = 0.05  # deviations a frame
+
+
+@dataclass(frozen=True)
+class SfmsFrames:
+    """N frames of dyads.
+
+    Attributes:
+        motion: (N, C) listener, in the motion space of the model; what the model draws of it.
+        face: (N, C) speaker, likewise, 0 where unknown; face_known: (N,) bool.
+        sound: (N, R, bins) half precision, features of the speaker's voice; heard: (N,) bool.
+        phase: (N, F) where he is in a phrase.
+        control: (N, K) what is told of the listener's events; K = 0 without.
+        sway: (N, S) the listener's slow motion, where it is not in `motion`; S = 0 without.
+    """
+
+    motion: Tensor
+    face: Tensor
+    face_known: Tensor
+    sound: Tensor
+    heard: Tensor
+    phase: Tensor
+    control: Tensor
+    sway: Tensor
+
+
+SfmsCorpus = Corpus[SfmsFrames]
+
+
+def gather(
+    listened: Sequence[Dyad],
+    window: int,
+    space: MotionSpace,
+    frontend: AudioFrontend | None = None,
+    settings: config.Sfms | None = None,
+    scratch: Scratch | None = None,
+) -> SfmsCorpus:
+    """`corpus.gather` in one motion space.
+
+    `frontend` says what is taken from the sound; None: nothing, and nobody is heard, which is enough for a tokenizer.
+    `settings`: of a listener that may be told of events; None: one that is not.
+    """
+    one = partial(frames_of, space=space, frontend=frontend, settings=settings)
+    return dyads.gather({"listening": listened}, window, one, scratch)
+
+
+def frames_of(
+    dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None, settings: config.Sfms | None = None
+) -> SfmsFrames:
+    """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one, and for a listener
+    that is told of events where the dyad does not say them.
+    """
+    control = np.zeros((len(dyad.listener), 0), np.float32)
+    if settings is not None and settings.events:
+        control = _control(dyad)
+        dyad = without_gaze(dyad)
+    face = in_space(dyad, dyad.speaker, space)
+    known = face.isfinite().all(-1)
+    sound, phase = _audio_features(dyad, frontend)
+    motion = in_space(dyad, dyad.listener, space)
+    sway = torch.zeros(len(motion), 0)
+    if settings is not None and settings.sway:
+        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
+    return SfmsFrames(
+        motion=motion,
+        face=torch.where(known[:, None], face, 0.0),
+        face_known=known,
+        sound=sound,
+        heard=torch.full((len(sound),), bool(sound.any())),
+        phase=phase,
+        control=torch.from_numpy(control),
+        sway=sway,
+    )
+
+
+def _control(dyad: Dyad) -> Floats:
+    """(N, K). Raises ConfigError where the dyad does not say its events, or not at our rate."""
+    if dyad.events is None:
+        raise ConfigError(
+            f"dyad {dyad.name} does not say when its listener nods and smiles; a listener with events needs it"
+        )
+    if dyad.fps != FRAME_HZ:
+        raise ConfigError(f"dyad {dyad.name} has {dyad.fps:g} frames a second; a listener with events takes {FRAME_HZ}")
+    return control_track(dyad.events, 0, len(dyad.listener))
+
+
+def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
+    """Sound (N, R, bins) in half precision and phase (N, F): zeros without sound, which then nobody hears."""
+    frames = len(dyad.listener)
+    if frontend is None:
+        return torch.zeros(frames, 0, 0, dtype=torch.half), torch.zeros(frames, 0)
+    audio = dyad.audio if dyad.audio is not None and dyad.audio.any() else None  # zeros are no voice, not a still one
+    found: Floats | None = dyad.features.get(frontend.audio)
+    if found is None and frontend.audio == "mel" and (audio is not None or dyad.mel is not None):
+        found = dyad.mel_rows()
+    elif found is None and audio is not None:
+        found = at_rate(frontend.rows(_whole(audio)), FRAME_HZ, frames, dyad.fps)
+    phase = np.zeros((frames, frontend.phase_features), np.float32)
+    if frontend.phased and audio is not None:
+        phase = at_rate(phases.of_audio(_whole(audio)), FRAME_HZ, frames, dyad.fps)
+    elif frontend.phased and dyad.mel is not None:
+        rows = dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS)
+        ours = at_rate(rows, dyad.fps, math.ceil(frames * FRAME_HZ / dyad.fps), FRAME_HZ)  # phases count our frames
+        phase = at_rate(phases.of_mel(ours), FRAME_HZ, frames, dyad.fps)
+    sound = (
+        torch.zeros(frames, *frontend.shape) if found is None else torch.from_numpy(found).view(frames, *frontend.shape)
+    )
+    return sound.half(), torch.from_numpy(phase)
+
+
+def _whole(audio: Floats) -> Floats:
+    """Samples up to a whole number of our frames, the last one ending in silence."""
+    return np.pad(audio, (0, -len(audio) % FRAME_SAMPLES))
+
+
+def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) -> None:
+    """Set the means, deviations and speeds of the model's motion, and its sway where that is apart."""
+    mean, spread = motion_scales(corpus.frames.motion, channels)
+    model.motion_mean.copy_(mean)
+    model.motion_std.copy_(spread)
+    steps = (corpus.steps(corpus.frames.motion) / model.motion_std).abs().sort(dim=0).values
+    model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
+    if model.head:
+        slow = torch.split(corpus.frames.sway, list(corpus.lengths))
+        mixture, sizes = fit_sway(slow, lateral_channels(channels))
+        model.sway_mixture.copy_(mixture)
+        model.sway_spread.copy_(sizes)
+
+
+def fit_sound_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
+    """Set the means and deviations of the sound; without any they stay."""
+    rows = some_sound((corpus.frames.sound, corpus.frames.heard))
+    if len(rows):
+        mean, spread = sound_scales(rows)
+        model.sound_mean.copy_(mean)
+        model.sound_std.copy_(spread)
+
+
+def context(
+    model: SfmsModel,
+    corpus: SfmsCorpus,
+    tokens: Tensor,
+    starts: Tensor,
+    past: int,
+    future: int,
+    louder: Tensor | None = None,
+    held: Tensor | None = None,
+) -> Context:
+    """What the predictor sees at the seam of each window; `tokens` (N, G), those of the future undecided.
+
+    `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms.
+    `held` (N, G): what stands at a window's first frame, where the last keyframe is held on to (`tokens.held_tokens`).
+    """
+    frames, device = corpus.frames, model.motion_mean.device
+    index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it
+    heard = frames.heard[index]
+    heard[:, 0] &= ~corpus.begins[starts]
+    heard, sound = heard.to(device), frames.sound[index].to(device).float()
+    if louder is not None:
+        sound = sound + louder.view(-1, 1, 1, 1)
+    sound = torch.where(heard[..., None, None], model.standardise_sound(sound), 0.0)
+    own = windows(tokens, starts, past)
+    if held is not None:
+        own[:, 0] = held[starts]
+    undecided = own.new_full((len(own), future, own.shape[2]), UNDECIDED)
+    return Context(
+        face=model.standardise(windows(frames.face, starts, past).to(device)),
+        face_known=windows(frames.face_known, starts, past).to(device),
+        voice=model.predictor.speaker.listen(sound.flatten(1, 2)),
+        heard=heard[:, 1:],
+        phase=windows(frames.phase, starts, past).to(device),
+        tokens=torch.cat([own, undecided], dim=1),
+        control=windows(frames.control, starts, past + future).to(device),
+    )

@@ -1,0 +1,286 @@
+"""Phase 2 (IV-D3): the next-token predictor, teacher-forced on the tokens of phase 1."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sfms_robot import config
+from sfms_robot.lab.corpora.collection import Order
+from sfms_robot.lab.corpora.formats import open_for
+from sfms_robot.lab.learning.corpus import windows
+from sfms_robot.lab.learning.job import Job, Run
+from sfms_robot.lab.learning.resume import digest_of
+from sfms_robot.lab.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
+from sfms_robot.lab.learning.sfms.losses import next_tokens
+from sfms_robot.lab.learning.sfms.missed_keyframes import without_last_keyframes
+from sfms_robot.lab.learning.sfms.soft_dtw import keyframe_dtw
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
+from sfms_robot.lab.learning.sfms.tokens import held_tokens, keyframe_tokens, tokenise
+from sfms_robot.lab.learning.training_loop import fit, optimizer
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
+from sfms_robot.listeners.sfms.keyframes import UNDECIDED
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.networks import neutral_tokens
+from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.control import COLUMNS
+from sfms_robot.signals.mel import LN_PER_DB
+
+HELD_OUT_BATCHES, HELD_OUT_BATCH = 20, 64
+
+
+def train_listener(
+    settings: config.Training,
+    data: Path,
+    out: Path,
+    run: Run = Run(),  # noqa: B008
+    order: Order | None = None,
+) -> dict[str, Any]:
+    """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
+
+    How it is sampled is calibrated afterwards, by roll-outs (`evaluation.sampling_calibration`).
+
+    `order`: of the channels in the files, if not the layout's own (`open_dataset`).
+
+    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on; the weights
+    are written when the run is finished.
+    """
+    listener, space = settings.listener, MotionSpace.of(settings.listener)
+    dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
+    frontend = AudioFrontend.of(listener)
+    corpus, held_out = (
+        gather(some, listener.window_frames, space, frontend, listener, run.staging(split))
+        for some, split in ((dyads, "train"), (unseen, "validation"))
+    )
+    torch.manual_seed(settings.seed)
+    model = SfmsModel(listener)
+    checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
+    fit_sound_scales(model, corpus)
+    job = listener_job(settings, model, corpus, held_out, run.device)
+    outcome = fit(job, out, run)
+    last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
+    if run.group.first:
+        checkpoint.save_config(out, corrected(settings))
+        checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
+    scores = keyframe_scores(model.cpu(), held_out, listener)
+    return {**asdict(outcome), "held_out_loss": last, **scores}
+
+
+def listener_job(
+    settings: config.Training, model: SfmsModel, corpus: SfmsCorpus, held_out: SfmsCorpus, device: torch.device
+) -> Job:
+    """Phase 2 as the loop takes it, on a model whose tokenizer is trained; moves the model to `device`."""
+    phase, listener = settings.predictor, settings.listener
+    starts = corpus.starts(listener.window_frames)
+    eventful = starts_with_events(corpus, starts, listener) if phase.event_windows else starts
+    fingerprint = corpus.fingerprint()
+    neutral = neutral_tokens(model, MotionSpace.of(listener), listener.past_frames).to(device)
+    tokenizer_digest = digest_of(model.tokenizer)
+    model.to(device)
+    corpus, held_out = corpus.to(device), held_out.to(device)
+    tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
+    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
+
+    levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
+
+    def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
+        chosen = starts[torch.randint(len(starts), (batch,), generator=generator)]
+        if phase.event_windows and len(eventful):
+            busy = torch.rand(batch, generator=generator) < phase.event_windows
+            chosen = torch.where(busy, eventful[torch.randint(len(eventful), (batch,), generator=generator)], chosen)
+        gain = None
+        if listener.audio == "mel":  # microphones differ
+            gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
+            gain = gain.to(device)
+        seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
+        seen = augment(seen, levels, neutral, phase, generator)
+        target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
+        return _loss(model, seen, target, settings, generator, partial(missing, chosen, generator))
+
+    def missing(chosen: Tensor, generator: torch.Generator, meant: Tensor, first: Tensor) -> Tensor:
+        if not phase.missed_keyframes:
+            return meant
+        tokenizer, window = model.tokenizer, listener.window_frames
+        return without_last_keyframes(
+            meant,
+            windows(dense, chosen, window),
+            windows(motion, chosen, window),
+            first,
+            tokenizer.member,
+            torch.tensor(tokenizer.costs, device=device),
+            phase.missed_keyframes,
+            generator,
+        )
+
+    return Job(
+        name="listener",
+        model=model,
+        optimizers=[optimizer(model.predictor.parameters(), phase.learning_rate, phase.weight_decay)],
+        loss_of=loss_of,
+        held_out=lambda: held_out_loss(model, held_out, settings, held_out_tokens),
+        frames_per_step=phase.batch * listener.window_frames,
+        phase=phase,
+        seed=settings.seed,
+        identity={
+            "seed": settings.seed,
+            "listener": listener.model_dump(mode="json"),
+            "predictor": phase.identity(),
+            "data": fingerprint,
+            "tokenizer weights": tokenizer_digest,
+        },
+    )
+
+
+def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
+    """Those of the `starts` in whose future something other than a blink is under way."""
+    active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
+    busy = (corpus.frames.control[:, active] > 0).any(-1)
+    return starts[windows(busy, starts + listener.past_frames, listener.future_frames).any(1)]
+
+
+def corrected(settings: config.Training) -> config.Sfms:
+    """The listener with the weight of class 0 in (14) taken out of its probability again: p' ~ w p, if it is to be."""
+    if not settings.predictor.undo_weight:
+        return settings.listener
+    bias = -math.log(settings.predictor.transition_weight)
+    groups = {
+        name: group.model_copy(update={"transition_bias": round(group.transition_bias + bias, 3)})
+        for name, group in settings.listener.groups.items()
+    }
+    return settings.listener.model_copy(update={"groups": groups})
+
+
+def _loss(
+    model: SfmsModel,
+    seen: Context,
+    target: Tensor,
+    settings: config.Training,
+    generator: torch.Generator,
+    missing: Callable[[Tensor, Tensor], Tensor] = lambda meant, first: meant,
+) -> Tensor:
+    """Cross-entropy (14) and soft-DTW on the future behind a random number of frames that are drawn already.
+
+    None of them drawn is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left
+    of the one before. A stream of hop 4 plans with 4 of them drawn. `missing`: tokens
+    (B, P + H, G) and the first frame to draw (B,) -> those that are seen and learned instead.
+    """
+    training, (b, h, _) = settings.predictor, target.shape
+    most = h if settings.listener.hop_frames < h else 1
+    count = torch.randint(most, (b, 1), generator=generator).to(target.device)
+    drawn = torch.arange(h, device=target.device) < count  # (B, H)
+    past = seen.tokens[:, :-h]
+    meant = missing(torch.cat([past, target], dim=1), past.shape[1] + count[:, 0])
+    seen, target = replace(seen, tokens=torch.cat([meant[:, :-h], seen.tokens[:, -h:]], dim=1)), meant[:, -h:]
+    future = torch.where(drawn[..., None], target, UNDECIDED)
+    seen = replace(seen, tokens=torch.cat([seen.tokens[:, :-h], future], dim=1))
+    logits = model.predictor.teacher_forced(seen, target)
+    weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
+    loss = next_tokens(logits.unbind(-2), target, ~drawn, training.transition_weight, weights)
+    if training.dtw_weight:
+        key = (target > 0).float()
+        expected = 1 - torch.softmax(logits, dim=-1)[..., 0]
+        expected = torch.where(drawn[..., None], key, expected)
+        loss = loss + training.dtw_weight * keyframe_dtw(expected, key, training.dtw_gamma)
+    return loss
+
+
+def augment(
+    seen: Context,
+    levels: Tensor | None,
+    neutral: Tensor,
+    training: config.PredictorTraining,
+    generator: torch.Generator | None = None,
+) -> Context:
+    """Missing modalities, a cold start, and a past that is not quite what was meant. `neutral` (P, G)."""
+    b, p = seen.heard.shape
+    device = seen.tokens.device
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator).to(device)
+
+    heard = seen.heard & (uniform(b, 1) >= training.drop_audio)
+    known = seen.face_known & (uniform(b, 1) >= training.drop_face)
+    past = perturb(seen.tokens[:, :p], levels, training.history_noise, generator)
+    # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
+    cold = uniform(b, 1) < training.neutral_prefix
+    cut = torch.randint(1, p + 1, (b, 1), generator=generator).to(device)
+    frame = torch.arange(p, device=device)
+    before = cold & (frame < cut)
+    shifted = neutral[(frame - cut) % p]  # (B, P, G): its end at the cut
+    past = torch.where(before[..., None], shifted, past)
+    tokens = torch.cat([past, seen.tokens[:, p:]], dim=1)
+    nothing_yet = torch.cat([before, before.new_zeros(b, tokens.shape[1] - p)], dim=1)
+    control = seen.control.masked_fill(nothing_yet[..., None], 0.0)
+    return replace(seen, heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
+
+
+def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator | None = None) -> Tensor:
+    """A share of the keyframes one level off in one dimension: in a roll-out the past is the model's own.
+
+    Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
+    """
+    changed = (tokens > 0) & (torch.rand(tokens.shape, generator=generator).to(tokens.device) < share)
+    if levels is None:
+        return torch.where(changed, 0, tokens)
+    codes = indices_to_codes((tokens - 1).clamp(min=0), levels)
+    dims = levels.shape[1]
+    dimension = torch.randint(dims, tokens.shape, generator=generator)
+    sign = torch.randint(2, tokens.shape, generator=generator)[..., None] * 2 - 1
+    moved = (torch.nn.functional.one_hot(dimension, dims) * sign).to(tokens.device)
+    noisy = (codes + moved * 2 / (levels - 1)).clamp(-1.0, 1.0)
+    return torch.where(changed, codes_to_indices(noisy, levels) + 1, tokens)
+
+
+@torch.no_grad()
+def held_out_loss(
+    model: SfmsModel, corpus: SfmsCorpus, settings: config.Training, tokens: Tensor | None = None
+) -> float:
+    """The loss without augmentation on windows drawn with a fixed seed; `tokens` (N, G) of the corpus, if at hand."""
+    model.eval()
+    tokens = tokenise(model, corpus) if tokens is None else tokens
+    generator = torch.Generator().manual_seed(0)
+    losses = [
+        float(_loss(model, seen, target, settings, generator))
+        for seen, target in some_windows(model, corpus, tokens, settings.listener, generator)
+    ]
+    return sum(losses) / len(losses)
+
+
+def some_windows(
+    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
+) -> Iterator[tuple[Context, Tensor]]:
+    """Batches of contexts and the tokens (B, H, G) that came next."""
+    starts = corpus.starts(listener.window_frames)
+    past, future = listener.past_frames, listener.future_frames
+    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+    for _ in range(HELD_OUT_BATCHES):
+        chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
+        yield context(model, corpus, tokens, chosen, past, future, held=held), windows(tokens, chosen + past, future)
+
+
+@torch.no_grad()
+def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms) -> dict[str, float]:
+    """Recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
+
+    All groups and future frames pooled, on windows drawn with a fixed seed.
+    """
+    model.eval()
+    tokens = tokenise(model, corpus)
+    hit = said = true = 0
+    for seen, target in some_windows(model, corpus, tokens, listener, torch.Generator().manual_seed(0)):
+        expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
+        key = target > 0
+        hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())
+    return {"keyframe_recall": hit / max(1, true), "keyframe_precision": hit / max(1, said)}

@@ -1,0 +1,223 @@
+"""The training loop every model shares: `fit` runs a `Job` to its end and survives whatever interrupts it.
+
+One step: draw data, loss, gradients, clip, AdamW with a warmed-up cosine rate. Between steps: the held-out loss with
+early stop, and checkpoints from which a run goes on bit for bit (on a CPU). How to write a trainer: `learning.job`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+import torch
+from torch import nn
+
+from sfms_robot import config
+from sfms_robot.errors import ConfigError, GroupError, ModelError
+from sfms_robot.lab.learning import resume
+from sfms_robot.lab.learning.gradients import Gradients, pieces_of
+from sfms_robot.lab.learning.job import Job, Outcome, Position, Report, Run
+
+SMOOTHING = 0.98  # of the loss that is shown
+SPEED_SMOOTHING = 0.9
+
+log = logging.getLogger(__name__)
+
+
+def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> torch.optim.Optimizer:
+    """AdamW with the paper's betas (V-A)."""
+    return torch.optim.AdamW(parameters, lr=rate, betas=(0.9, 0.98), weight_decay=decay)
+
+
+def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> Outcome:  # noqa: B008
+    """Run `job` to its last step or until its patience ends; the model then holds its best weights.
+
+    Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` goes on from there, and a run that had finished
+    only restores its weights. Ctrl-C ends the step, writes a checkpoint and raises KeyboardInterrupt with a line for
+    the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite: the last
+    checkpoint stays. `clock` (s) decides when to write checkpoints and how fast frames go, and no weights.
+
+    Of a group of processes (`run.group`) all make the same steps; the first one looks at held-out data and writes. Then
+    it also raises GroupError when another process is gone, and ConfigError when they cannot share the batch.
+    """
+    file = resume.checkpoint_file(out, job.name)
+    group, pieces = run.group, pieces_of(job, run, file)
+    if pieces > 1:
+        job = replace(job, identity={**job.identity, "pieces": pieces})
+    try:
+        out.mkdir(parents=True, exist_ok=True)  # hours before it is needed
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
+    generator = torch.Generator().manual_seed(job.seed)
+    torch.manual_seed(job.seed)  # dropout does not depend on what was drawn before
+    base = [[group["lr"] for group in one.param_groups] for one in job.optimizers]
+    position, best = Position(), None
+    if run.resume:
+        position, best = resume.load(file, job, generator)
+    elif group.first and (left := resume.peek(file)) is not None and not left.finished:
+        log.warning("%s: was at step %d, begins anew; --resume would have gone on", file, left.step)
+    began_at = position.step
+
+    saved_s = before_s = clock()
+    frames_per_s = 0.0
+    job.model.train()
+    gradients = Gradients(job, group, pieces, file)
+    with _interruptions(patient=group.size > 1) as pressed:
+        while not position.finished:
+            rate = _set_rates(job, base, position.step)
+            loss, norm, interrupted = make_step(gradients, position.step, generator, pressed())
+            smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
+            position = replace(position, step=position.step + 1, loss=smooth)
+            looked = _look_is_due(job, position.step)
+            if looked:
+                position = _compared(position, group.told_by_first(partial(_held_out, job)))
+                best = resume.weights_of(job) if position.worse == 0 else best
+            position = replace(position, finished=_over(job.phase, position))
+
+            now_s = clock()
+            frames_per_s = _speed(frames_per_s, job.frames_per_step, now_s - before_s)
+            before_s = now_s
+            run.watch(Report(job.name, job.phase.steps, position, loss, norm, rate, frames_per_s, looked))
+            interrupted = interrupted or (group.size == 1 and pressed())
+            if group.first and (interrupted or _save_is_due(job.phase, position, now_s - saved_s)):
+                resume.save(file, job, position, generator, best)
+                saved_s = now_s
+            if interrupted:
+                raise KeyboardInterrupt(
+                    f"{job.name}: interrupted after step {position.step} of {job.phase.steps}, saved in {file}; "
+                    "the same command with --resume goes on"
+                )
+    if best is not None:
+        job.model.load_state_dict(best)
+    return Outcome(
+        loss=math.nan if position.loss is None else position.loss,
+        held_out=position.best,
+        steps=position.step,
+        best_step=position.best_step if best is not None else position.step,
+        stopped="steps" if position.step == job.phase.steps else "patience",
+        resumed_at=began_at if run.resume else None,
+    )
+
+
+def schedule(step: int, phase: config.Phase) -> float:
+    """Share of the learning rate at `step`: linear warm-up, then cosine to zero (V-A; the warm-up is ours)."""
+    warm = min(phase.warm_up_steps, max(1, phase.steps // 10))
+    if step < warm:
+        return (step + 1) / warm
+    return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, phase.steps - warm)))
+
+
+def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
+    """Rates of `step` from those the optimizers were made with; returns the first."""
+    share = schedule(step, job.phase)
+    for one, rates in zip(job.optimizers, base, strict=True):
+        for group, rate in zip(one.param_groups, rates, strict=True):
+            group["lr"] = rate * share
+    return base[0][0] * share
+
+
+def make_step(
+    gradients: Gradients, step: int, generator: torch.Generator, pressed: bool = False
+) -> tuple[float, float, bool]:
+    """One update of the weights; returns loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
+
+    Raises ModelError when loss or norm is not finite, and nothing is updated then; GroupError.
+    """
+    job, file = gradients.job, gradients.file
+    for one in job.optimizers:
+        one.zero_grad(set_to_none=True)
+    try:
+        value, asked = gradients.group.mean([gradients.of(step, generator), float(pressed)])
+    except GroupError as error:
+        raise GroupError(f"{job.name}: {error}; at step {step} ({_kept(file)}; --resume goes on)") from error
+    norm = max(_clip(one, job.phase.clip_norm) for one in job.optimizers)
+    if not math.isfinite(value) or not math.isfinite(norm):
+        broken = f"loss {value:g}, gradient norm {norm:g} at step {step}: not finite"
+        raise ModelError(f"{job.name}: {broken} ({_kept(file)})")
+    for one in job.optimizers:
+        one.step()
+    return value, norm, asked > 0
+
+
+def _kept(file: Path) -> str:
+    left = resume.peek(file)
+    return f"{file} holds step {left.step}" if left is not None else "there is no checkpoint yet"
+
+
+def _clip(one: torch.optim.Optimizer, norm: float) -> float:
+    parameters = [p for group in one.param_groups for p in group["params"] if p.grad is not None]
+    return float(nn.utils.clip_grad_norm_(parameters, norm)) if parameters else 0.0
+
+
+def _look_is_due(job: Job, step: int) -> bool:
+    if job.held_out is None or job.phase.evaluate_every == 0:
+        return False
+    return step % job.phase.evaluate_every == 0 or step == job.phase.steps
+
+
+def _held_out(job: Job) -> float:
+    """The held-out loss, leaving random states and the model's mode as they were. Raises ModelError if not finite."""
+    if job.held_out is None:
+        raise ValueError(f"{job.name} has nothing held out")
+    job.model.eval()
+    devices = [job.device] if job.device.type == "cuda" else []
+    with torch.random.fork_rng(devices), torch.no_grad():
+        value = float(job.held_out())
+    job.model.train()
+    if not math.isfinite(value):
+        raise ModelError(f"{job.name}: held-out loss {value:g}: not finite")
+    return value
+
+
+def _compared(position: Position, held_out: float) -> Position:
+    if position.best is None or held_out < position.best:
+        return replace(position, held_out=held_out, best=held_out, best_step=position.step, worse=0)
+    return replace(position, held_out=held_out, worse=position.worse + 1)
+
+
+def _over(phase: config.Phase, position: Position) -> bool:
+    return position.step >= phase.steps or (phase.patience is not None and position.worse >= phase.patience)
+
+
+def _save_is_due(phase: config.Phase, position: Position, since_s: float) -> bool:
+    return position.finished or position.step % phase.checkpoint_every == 0 or since_s >= 60 * phase.checkpoint_minutes
+
+
+def _speed(frames_per_s: float, frames: int, took_s: float) -> float:
+    if took_s <= 0:
+        return frames_per_s
+    now = frames / took_s
+    return now if frames_per_s == 0 else SPEED_SMOOTHING * frames_per_s + (1 - SPEED_SMOOTHING) * now
+
+
+@contextmanager
+def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C was pressed; inside, the first one only raises the flag. Signals reach the main thread alone.
+
+    `patient`: so do all others; whoever started this process (torchrun) passes the terminal's on as its own.
+    """
+    pressed = threading.Event()
+
+    def press(number: int, frame: FrameType | None) -> None:
+        pressed.set()
+        if not patient:
+            signal.signal(signal.SIGINT, before)  # the second one does what it always did
+
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed.is_set
+        return
+    before = signal.getsignal(signal.SIGINT) or signal.default_int_handler
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)

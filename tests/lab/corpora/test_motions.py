@@ -1,0 +1,77 @@
+"""Cutting: a swing is cut whole, a resting face is zero, and what is saved is loaded."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import BLENDSHAPES, FRAME_HZ
+from sfms_robot.lab.corpora.compose.motions import (
+    cycles,
+    facegood_mouth,
+    neutral,
+    save,
+    slow,
+    table,
+)
+from sfms_robot.lab.corpora.splits import SPLITS
+from sfms_robot.signals.motion_primitives import KINDS, read_motions
+
+TAKE = {"train": "yes1", "validation": "apfel", "test": "facial"}
+
+
+def test_every_swing_of_a_nodding_head_is_cut_and_normalised():
+    times = np.arange(10 * FRAME_HZ) / FRAME_HZ
+    found = cycles(np.deg2rad(4) * (0.5 - 0.5 * np.cos(2 * np.pi * 2 * times)), FRAME_HZ)
+    assert 16 <= len(found) <= 20
+    for cycle in found:
+        assert cycle[0] == cycle[-1] == 0 and cycle.max() == pytest.approx(1)
+
+
+def test_a_still_head_has_no_swings():
+    assert cycles(np.full(250, 0.1), FRAME_HZ) == []
+
+
+def test_slow_motion_is_kept_and_fast_motion_is_not():
+    times = np.arange(40 * FRAME_HZ) / FRAME_HZ
+    drift, tremor = np.sin(2 * np.pi * 0.1 * times), np.sin(2 * np.pi * 4 * times)
+    kept = slow(np.stack([drift, tremor], axis=1))[100:-100]
+    assert np.ptp(kept[:, 0]) == pytest.approx(2, abs=0.1) and np.ptp(kept[:, 1]) < 0.05
+
+
+def test_a_resting_face_is_zero_and_a_lost_one_holds():
+    face = np.full((40, len(BLENDSHAPES)), 0.3, np.float32)
+    face[10:20] = np.nan
+    assert not neutral(face, 50).any()
+
+
+def test_saved_primitives_are_loaded_in_their_split(tmp_path):
+    rng = np.random.default_rng(0)
+    named = [(kind, TAKE[split], rng.uniform(0, 1, (5, 52))) for split in SPLITS for kind in KINDS]
+    save(tmp_path / "motions.npz", named)
+    loaded = read_motions(tmp_path / "motions.npz")
+    for (kind, _, array), split in zip(named, np.repeat(SPLITS, len(KINDS)), strict=True):
+        np.testing.assert_allclose(getattr(loaded[split], kind)[0], array, atol=6e-4)
+
+
+def test_a_file_without_a_kind_is_refused(tmp_path):
+    save(tmp_path / "motions.npz", [("nods", "yes1", np.zeros(24, np.float32))])
+    with pytest.raises(ConfigError, match="no shakes for train"):
+        read_motions(tmp_path / "motions.npz")
+
+
+def test_rig_weights_become_arkit_channels_at_25_fps(tmp_path):
+    names = np.array(["mouth_stretch_c", "mouth_oh_c", "mouth_lipCornerPull_l", "tooth_d_d"])
+    weights = np.tile(np.float32([0.5, 0.8, 0.3, 1.0]), (61, 1))
+    np.savez(tmp_path / "take.npz", weights=weights, names=names, fps=30.0)
+    mouth = facegood_mouth(tmp_path / "take.npz")
+    moving = {name: mouth[0, index] for index, name in enumerate(BLENDSHAPES) if mouth[0, index]}
+    assert len(mouth) == 50
+    assert moving == pytest.approx({"jawOpen": 0.5, "mouthPucker": 0.4, "mouthSmileLeft": 0.3})
+
+
+def test_a_table_that_is_none_is_named(tmp_path):
+    (tmp_path / "words.csv").write_text("a,b\n1\n")
+    with pytest.raises(ConfigError, match="words.csv: not a table"):
+        table(tmp_path / "words.csv")
+    with pytest.raises(ConfigError, match="gone.csv: no such file"):
+        table(tmp_path / "gone.csv")

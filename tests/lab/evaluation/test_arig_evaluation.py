@@ -1,0 +1,127 @@
+"""`evaluate interaction` and the ARIG tables on half a minute of made-up conversation."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from tiny_arig_training import dyad, settings, write
+
+from sfms_robot.cli.main import main
+from sfms_robot.lab.corpora import clips
+from sfms_robot.lab.evaluation.paper.arig_tables import PAPER_1, PAPER_2, PAPER_4
+from sfms_robot.lab.learning.arig.trainer import train_arig
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def lively(data, tmp_path_factory):
+    """The same, but nothing in a held-out face is ever the same twice."""
+    folder, rng = tmp_path_factory.mktemp("lively"), np.random.default_rng(0)
+    shutil.copytree(data, folder, dirs_exist_ok=True)
+    for place, scene in ((".", "listening"), ("interaction", "interaction")):
+        motion = rng.uniform(0.1, 0.3, (2, 300, 58)).astype(np.float32)
+        clips.save(folder / place / "validation", [replace(dyad("v", scene, 2), speaker=motion[0], listener=motion[1])])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def listener(data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("listener")
+    train_arig(settings(steps=2), data, folder)
+    return folder
+
+
+@pytest.fixture
+def evaluate(capsys):
+    """Exit code, stdout and stderr of a command line of `evaluate`."""
+
+    def run(*words: object) -> tuple[object, str, str]:
+        with pytest.raises(SystemExit) as ended:
+            main(["evaluate", *map(str, words)])
+        told = capsys.readouterr()
+        return ended.value.code, told.out, told.err
+
+    return run
+
+
+def test_interaction_tells_states_lips_and_borders_beside_what_a_rule_on_voices_gets(evaluate, listener, data):
+    code, out, _ = evaluate("interaction", "--listener", listener, "--data", data, "--json")
+    found = json.loads(out)
+    assert code == 0 and found["dyads"] == {"listening": 1, "speaking": 1, "interaction": 1}
+    assert found["voice_rule_accuracy"] > 0.8 > 0.6 > found["majority_accuracy"] > 0.3, "it hears turns a little late"
+    assert 0 <= found["state_accuracy"] <= 1 and -1 <= found["lips_speaking_correlation"] <= 1
+    table = found["confusion"]["label_by_answer"]
+    assert sum(map(sum, table)) == 3 * (300 - 1), "every frame but the first of each dyad"
+
+
+def test_without_labels_to_learn_from_there_is_no_rule_to_stand_beside(evaluate, listener, data, tmp_path):
+    shutil.copytree(data, tmp_path, dirs_exist_ok=True)
+    for place, scene in ((".", "listening"), ("speaking", "speaking"), ("interaction", "interaction")):
+        shutil.rmtree(tmp_path / place / "train")
+        clips.save(tmp_path / place / "train", [replace(dyad("a0", scene, 0), states=None)])
+    code, out, _ = evaluate("interaction", "--listener", listener, "--data", tmp_path, "--json")
+    found = json.loads(out)
+    assert code == 0 and "state_accuracy" in found and "voice_rule_accuracy" not in found
+
+
+def test_interaction_is_for_listeners_that_speak(evaluate, data):
+    code, _, err = evaluate("interaction", "--listener", "sfms-small", "--data", data)
+    assert code == 2 and "--listener sfms-small: does not speak; this looks at listeners of kind arig" in err
+
+
+def test_table_2_has_a_row_for_every_listener_given_and_the_papers(evaluate, listener, lively):
+    code, out, _ = evaluate(
+        "listener", "--table", "arig-2", "--listener", listener, "--listener", "sfms-small", "--data", lively, "--json"
+    )
+    rows = json.loads(out)["rows"]
+    assert code == 0
+    assert [row["name"] for row in rows] == ["Ground truth", str(listener), "sfms-small", *PAPER_2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("table", "paper"), [("arig-1", PAPER_1), ("arig-4", PAPER_4)])
+def test_ablations_that_are_missing_are_trained_and_kept(evaluate, listener, lively, tmp_path, table, paper):
+    file = tmp_path / "arig.yaml"
+    file.write_text(yaml.safe_dump(settings(steps=2).model_dump(mode="json")))
+    words = ("listener", "--table", table, "--data", lively, "--models", tmp_path / "m", "--config", file, "--json")
+    words += ("--listener", listener)
+    code, out, _ = evaluate(*words)
+    assert code == 0 and {row["name"] for row in json.loads(out)["rows"]} == {"GT", *paper, str(listener)}
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.safetensors")}
+    assert evaluate(*words)[1] == out and before == {path: path.stat().st_mtime_ns for path in before}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--table", "arig-1"), "--table arig-1: needs --models DIR, where its listeners are trained and kept"),
+        (("--table", "arig-2", "--order", "motion_first"), "--order"),
+        (("--table", "arig-3"), "'arig-3' is not one of"),
+    ],
+)
+def test_what_a_table_cannot_do_without_is_named(evaluate, data, words, said):
+    code, _, err = evaluate("listener", *words, "--data", data)
+    assert code == 2 and said in err
+
+
+def test_a_table_needs_faces_that_move(evaluate, listener, data):
+    code, _, err = evaluate("listener", "--table", "arig-2", "--listener", listener, "--data", data)
+    assert code == 2 and "the clips' own motion: 250 frames differ too little to make 40 clusters" in err
+
+
+def test_a_table_needs_clips_that_are_long_enough(evaluate, listener, tmp_path):
+    one = dyad("short", "listening", 0)
+    parts = {
+        name: getattr(one, name)[:200] for name in ("speaker", "listener", "listening", "states", "head_of_gaze_rad")
+    }
+    sounds = {name: getattr(one, name)[: 200 * 640] for name in ("audio", "agent_audio")}
+    clips.save(tmp_path / "validation", [replace(one, **parts, **sounds)])
+    code, _, err = evaluate("listener", "--table", "arig-2", "--listener", listener, "--data", tmp_path)
+    assert code == 2 and "no validation dyad is as long as a clip of 250 frames" in err

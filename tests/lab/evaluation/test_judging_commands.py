@@ -1,0 +1,210 @@
+"""`evaluate naturalness`, `timing`, `robustness`: what their documents hold, and one line for what cannot be judged."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ami_tables import write_tables
+from tiny_arig_training import dyad
+
+from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES
+from sfms_robot.lab.corpora import clips
+from sfms_robot.lab.evaluate.naturalness import asked_for, figures, listening, notes, of_training
+from sfms_robot.lab.evaluation import two_sample
+from sfms_robot.lab.evaluation.manners import manners
+from sfms_robot.lab.evaluation.robustness import RANGES, Speaker, cases
+from sfms_robot.lab.evaluation.two_sample import FOLDS, REGIONS
+
+LEAST = 2 * FOLDS
+SERIES = {"train": "ES2008a", "validation": "IS1000a", "test": "ES2003a"}
+NOBODY_KNOWS = ("nod_deg", "nod_s", "nod_swings", "blink_s", "smile_s")
+
+
+def people(folder: Path, parts, count=LEAST, **changed) -> Path:
+    """Dyads of 12 s, whose listeners nod, blink and smile, each in their own way."""
+    for split in parts:
+        made = []
+        for number in range(count):
+            rng = np.random.default_rng([len(split), number])
+            one = dyad(f"{split}{number}", "listening", number)
+            motion = one.listener + rng.normal(0, 0.005, one.listener.shape).astype(np.float32)
+            motion[5 * FRAME_HZ : 8 * FRAME_HZ, CHANNEL_INDEX["mouthSmileLeft"]] = 0.6
+            motion[:: 3 * FRAME_HZ, CHANNEL_INDEX["eyeBlinkLeft"]] = 0.9
+            attention = (np.arange(len(motion)) // FRAME_HZ % 2).astype(np.float32)
+            made.append(replace(one, **{"listener": motion, "attention": attention} | changed))
+        clips.save(folder / split, made)
+    return folder
+
+
+def one_line(ended, *said: str) -> None:
+    """A wrong value is told in one line that names it."""
+    assert ended.code == 2
+    for part in said:
+        assert part in ended.complaint
+
+
+# --- naturalness ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tmp_path, monkeypatch):
+    monkeypatch.setattr(two_sample, "STEPS", 6)  # the document is looked at here, not how well the nets tell apart
+    data = people(tmp_path / "dyads", ("train", "test"))
+    found = command_line("evaluate", "naturalness", "--data", data, "--drift", 30, "--json").told
+    assert found["listener"] == "sfms-small" and found["split"] == "test" and found["dyads"] == LEAST
+    assert found["minutes"] == pytest.approx(LEAST * 12 / 60, abs=0.05) and "onnx" in found["engine"]
+    rows = [f"{who}two_sample_auc" for who in ("", "person_", "training_", "imitated_")]
+    for name in (*rows, *(f"levelled_{row}" for row in rows)):
+        assert set(found[name]) == set(found["interval"][name]) == set(REGIONS)
+        for region, auc in found[name].items():
+            low, high = found["interval"][name][region]
+            assert 0 <= low <= high <= 1 and 0 <= auc <= 1
+    assert found["people_smile_s"] == pytest.approx(3.0, abs=0.3) and found["people_gaze_on_person"] > 0.9
+    assert found["drift_deg"] >= 0 and set(found["people_pose_deg"]) == {"roll", "pitch", "yaw"}
+
+
+def test_windows_in_which_the_listener_talks_himself_are_not_judged(tmp_path):
+    (dyads,) = [clips.load(people(tmp_path, ("validation",), count=1) / "validation")]
+    one = replace(dyads[0], agent_audio=None)
+    (every,) = listening([one], [one.listener])
+    audio = np.zeros(len(one.listener) * FRAME_SAMPLES, np.float32)
+    audio[3 * AUDIO_HZ : 5 * AUDIO_HZ] = np.random.default_rng(0).normal(0, 0.1, 2 * AUDIO_HZ)
+    (some,) = listening([replace(one, agent_audio=audio)], [one.listener])
+    np.testing.assert_array_equal(some, np.delete(every, [1, 2], axis=0))
+
+
+def test_people_who_do_nothing_and_whose_gaze_nobody_knows_leave_figures_out(tmp_path):
+    """No laugh, no nod, no annotated gaze, nobody to be trained on: None and a note, no number made up."""
+    still = np.zeros((12 * FRAME_HZ, 58), np.float32)
+    data = people(tmp_path, ("validation",), count=3, listener=still, attention=None, events=())
+    dyads = clips.load(data / "validation")
+    nothing = manners([dyad.listener for dyad in dyads], [asked_for(dyad) for dyad in dyads])
+    found = figures(nothing, nothing)
+    assert [found[who + name] for who in ("", "people_") for name in NOBODY_KNOWS] == [None] * 2 * len(NOBODY_KNOWS)
+    assert found["nod_amplitude_ratio"] is None and found["gaze_on_person"] == 1.0
+    gaze, training = notes(dyads, of_training(data, 3))
+    assert "in 3 dyads: gaze" in gaze and "training" in training
+
+
+@pytest.mark.parametrize(
+    ("parts", "split", "said"),
+    [
+        (("train", "test"), "train", "--split train: listeners were trained on these people"),
+        (("train", "test"), "validation", "has no split validation (train, test)"),
+        (("test",), "holdout", "has no split holdout (test)"),
+    ],
+)
+def test_naturalness_is_held_against_people_nobody_was_trained_on(command_line, tmp_path, parts, split, said):
+    data = people(tmp_path / "dyads", parts, count=1)
+    one_line(command_line("evaluate", "naturalness", "--data", data, "--split", split), said)
+
+
+def test_a_few_dyads_are_too_few_to_tell_people_apart(command_line, tmp_path):
+    data = people(tmp_path / "dyads", ("test",), count=3)
+    one_line(command_line("evaluate", "naturalness", "--data", data), str(data), "3 dyads of test", "10 or more")
+
+
+# --- timing -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory) -> Path:
+    """Two minutes of a meeting in each part."""
+    return write_tables(tmp_path_factory.mktemp("tables"), meetings=tuple(SERIES.values()), until_s=120.0)
+
+
+@pytest.mark.slow
+def test_timing_tells_people_decisions_motion_and_the_reference_apart(command_line, tables):
+    words = ("evaluate", "timing", "--data", tables, "--minutes", 0.5, "--seeds", 2, "--jobs", 1, "--json")
+    found = command_line(*words).told
+    assert (found["split"], found["people"], found["meetings"], found["seeds"]) == ("test", 2, 2, 2)
+    for prefix in ("", "people_", "decided_"):
+        for name in ("nods_per_minute", "addressed_nods_per_minute", "bystander_nods_per_minute", "phrase_end_ratio"):
+            assert prefix + name in found and prefix + name in found["interval"]
+    auc = ("nod_hazard_auc", "nod_hazard_auc_without_own_speech", "shifted_nod_hazard_auc")
+    assert all(0 <= found[who + name] <= 1 for name in auc for who in ("", "annotated_", "r2_"))
+    assert found["people_nods_per_minute"] == pytest.approx(5, abs=1.5)
+    assert {"interval_ks", "table_nod_auc", "blinks_per_minute", "smiles_per_minute", "detector"} <= set(found)
+    assert found["people_smiles_per_minute"] is None and found["notes"]
+
+
+@pytest.mark.slow
+def test_a_listener_that_speaks_when_the_person_did_is_told_so_and_nothing_of_how_its_nods_hang_on_the_others(
+    command_line, tables
+):
+    words = ("evaluate", "timing", "--data", tables, "--minutes", 0.5, "--seeds", 2, "--jobs", 1, "--json")
+    silent, speaking = (command_line(*words, *more).told for more in ((), ("--own-voice",)))
+    assert (silent["own_voice"], speaking["own_voice"]) == (False, True)
+    assert speaking["decided_gaze_shifts_per_minute"] > silent["decided_gaze_shifts_per_minute"], "talk looks aside"
+    assert speaking["gaze_shifts_per_minute"] != silent["gaze_shifts_per_minute"]
+    for name in ("nod_hazard_auc", "shifted_nod_hazard_auc", "people_nods_per_minute"):
+        assert speaking[name] == silent[name]
+    assert {name for name in silent if name.startswith(("nod_auc", "decided_nod_auc"))}
+    assert not {name for name in speaking if name.startswith(("nod_auc", "decided_nod_auc"))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lacking", "figure"), [("gaze_shift", "gaze_shifts"), ("laugh", "laughs")])
+def test_what_nobody_annotated_of_the_people_is_not_told(command_line, tmp_path, lacking, figure):
+    data = write_tables(tmp_path, lacking, tuple(SERIES.values()), 120.0)
+    words = ("evaluate", "timing", "--data", data, "--minutes", 0, "--seeds", 1, "--jobs", 1, "--json")
+    found = command_line(*words).told
+    assert not found[f"people_{figure}_per_minute"] and found["people_nods_per_minute"] > 0
+    assert found["nod_hazard_auc"] is not None and found[f"{lacking}_hazard_auc"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--split", "train"), "--split train: listeners were trained on these people"),
+        (("--data", "gone"), "--data gone: no such folder"),
+        (("--listener", "nobody"), "nobody"),
+    ],
+)
+def test_timing_names_what_it_cannot_play(command_line, tables, words, said):
+    one_line(command_line("evaluate", "timing", "--data", tables, *words), said)
+
+
+def test_tables_without_people_of_validation_say_who_is_there(command_line, tmp_path):
+    data = write_tables(tmp_path, meetings=(SERIES["train"], SERIES["test"]), until_s=120.0)
+    ended = command_line("evaluate", "timing", "--data", data, "--split", "validation")
+    one_line(ended, "--split validation: the tables hold nobody of it (train 2, test 2)")
+
+
+def test_tables_of_which_one_is_missing_name_it(command_line, tmp_path):
+    (write_tables(tmp_path, until_s=120.0) / "gaze_focus.csv").unlink()
+    one_line(command_line("evaluate", "timing", "--data", tmp_path), "gaze_focus.csv", "no such file")
+
+
+# --- robustness -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_robustness_has_a_row_for_every_way_and_names_those_outside(command_line):
+    words = ("evaluate", "robustness", "--speakers", 1, "--minutes", 0.1, "--seeds", 2, "--jobs", 1, "--json")
+    found = command_line(*words).told
+    ways = list(cases(Speaker("any", np.zeros(1, np.float32), np.zeros((1, 58), np.float32))))
+    assert [(row["inputs"], row["condition"]) for row in found["rows"]] == [(one, how.name) for one, how in ways]
+    for kind in RANGES:
+        rates = [row[f"{kind}s_per_minute"] for row in found["rows"]]
+        assert found[f"{kind}s_per_minute"] == [min(rates), max(rates)]
+    named = {(row["inputs"], row["condition"]) for row in found["outside"]}
+    low, high = found["people"]["nods_per_minute"]
+    assert named >= {
+        (row["inputs"], row["condition"])
+        for row in found["rows"]
+        if row["nods_per_minute"] > high or (row["tells_speech"] and row["nods_per_minute"] < low)
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--data", "gone"), "--data gone: no such folder"),
+        (("--listener", "nobody"), "nobody"),
+        (("--split", "train"), "--split train: listeners were trained on these voices"),
+    ],
+)
+def test_robustness_names_what_is_not_there(command_line, words, said):
+    one_line(command_line("evaluate", "robustness", *words), said)

@@ -1,0 +1,150 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sfms_robot import config
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.collection import Clip, Dataset
+from sfms_robot.lab.evaluation import metrics
+from sfms_robot.lab.evaluation.paper.listener_clips import collect, shared_space, spread
+from sfms_robot.lab.evaluation.paper.listener_tables import TABLE_1, TABLE_2, Clips, cut, table
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
+from sfms_robot.listeners.sfms import torch_engine
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.stream import SfmsListener
+
+
+def listener(space: str = "arkit58", **changes) -> SfmsListener:
+    raw = {
+        "kind": "sfms",
+        "motion_space": space,
+        "groups": {"preset": "one", "levels": [3, 2], "keyframes": 6},
+        "tokenizer_width": 16,
+        "predictor_width": 16,
+        "predictor_layers": 1,
+        "heads": 2,
+    }
+    settings = config.parse(config.Sfms, raw | changes, "tiny")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return SfmsListener(settings, torch_engine(settings, SfmsModel(settings)))
+
+
+def dyad(name: str, frames: int = 70, seed: int = 0, space: str = "arkit58") -> Dyad:
+    rng = np.random.default_rng(seed)
+    width = len(SPACE_CHANNELS[space])
+    time_s = np.arange(frames)[:, None] / 25
+    swing = rng.uniform(0.05, 0.2, width) * np.cos(0.9 * time_s)
+    motion = (0.3 + swing * np.sin(3 * time_s + rng.uniform(0, 6, width))).astype(np.float32)
+    speaker = motion[::-1].copy()
+    speaker[10:20] = np.nan
+    if space == "arkit58":
+        audio, rows = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32), None
+    else:  # as L2L comes: mel rows and no waveform
+        audio, rows = None, rng.normal(-5, 1, (4 * frames, 128)).astype(np.float32)
+    return Dyad(name, audio, speaker, motion, np.ones(frames, bool), space, mel=rows)
+
+
+@pytest.mark.parametrize("changes", [{}, {"hop": 1}, {"phase": False, "sequential": False}, {"audio": "mfcc78"}])
+def test_a_rollout_from_arrays_is_that_of_a_stream(changes):
+    model, one = listener(**changes), dyad("a", 45)
+    streamed = rollout(model, frames_of_dyad(one), [4]).motion[0]
+    whole = offline_rollout(model, one, [3, 4]).motion
+    shown = model.space.decode(whole[1].numpy())[0]
+    np.testing.assert_allclose(shown[1:], streamed[1:], atol=2e-3)  # sound is kept in half precision
+
+
+@pytest.mark.parametrize("space", ["arkit58", "faceverse58", "deca56"])
+@pytest.mark.parametrize("number, columns", [(1, TABLE_1), (2, TABLE_2)])
+def test_a_table_has_the_truth_the_heuristics_the_listener_and_the_paper(space, number, columns):
+    one = listener(space)
+    data = [dyad("a", 130, 1, space), dyad("b", 130, 2, space)]
+    clips, given = collect(number, {"tiny": one}, shared_space({"tiny": one}), data, data, range(2))
+    result = table(number, clips, given, samples=2)
+    json.dumps(result, allow_nan=False)
+    rows = {row["name"]: row for row in result["rows"] if row["source"] == "here"}
+    assert list(rows) == ["Ground truth", "Random", "Median", "Mime", "MeanFr", "tiny"]
+    assert {row["name"] for row in result["rows"] if row["source"] == "paper"} >= {"Ground truth", "Random", "SFMS"}
+    wanted = [f"{part} {key}" for part in ("expression", "rotation") for key in columns] if number == 1 else columns
+    assert all(isinstance(rows["tiny"][key], float) for key in wanted)
+    assert result["features"].startswith("L2L-standardised" if (number, space) == (1, "deca56") else space)
+
+
+def test_the_truth_has_no_error_and_random_the_most():
+    rng = np.random.default_rng(0)
+    truth, speaker, train = (rng.uniform(0.4, 0.6, (6, 64, 58)) for _ in range(3))
+    rows = {row["name"]: row for row in table(1, Clips("arkit58", truth, speaker, train), {}, 2)["rows"][:5]}
+    assert rows["Ground truth"]["expression L2"] == 0
+    assert rows["Ground truth"]["expression FD"] == pytest.approx(0, abs=1e-9)
+    assert rows["Random"]["expression L2"] == max(row["expression L2"] for row in rows.values())
+    assert rows["Median"]["expression Var"] < rows["Ground truth"]["expression Var"] < rows["Random"]["expression Var"]
+
+
+def test_mime_of_a_speaker_who_copies_the_listener_is_the_truth():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 1, (3, 60, 58))
+    rows = {row["name"]: row for row in table(2, Clips("arkit58", truth, truth, truth), {}, 2)["rows"][:5]}
+    assert rows["Mime"]["FRDist"] == pytest.approx(0, abs=1e-4) and rows["Mime"]["FRSyn"] == 0
+    assert rows["Mime"]["FRCorr per sample"] == pytest.approx(1, abs=1e-6)
+    assert rows["Mime"]["FRCorr"] == pytest.approx(2, abs=1e-6)  # the challenge's sum over the samples
+
+
+def test_what_clips_say_one_by_one_is_what_the_metrics_say_of_them_together():
+    rng = np.random.default_rng(3)
+    truth, speaker, train = rng.normal(0, 1, (3, 4, 60, 58))
+    made = rng.normal(0, 1, (4, 2, 60, 58)).cumsum(axis=2)
+    made[1, 0] = 0.5  # no lag can be told of what never moves
+    found = table(2, Clips("arkit58", truth, speaker, train, [*"aabc"]), {"ours": made}, 2)["rows"][5]
+    assert found["FRCorr"] == pytest.approx(metrics.frc(made, truth, np.eye(4)))
+    assert found["FRDist"] == pytest.approx(metrics.reactface_frd(made, truth, np.eye(4)))
+    assert found["FRDiv"] == pytest.approx(metrics.frdiv(made)) and found["FRVar"] == pytest.approx(metrics.frvar(made))
+    assert found["FRSyn"] == pytest.approx(metrics.frsyn(made, speaker, "skip", "all"))
+    assert set(found["interval"]) == {*TABLE_2, "FRCorr per sample"}
+
+
+def test_what_is_no_whole_clip_is_not_played():
+    one, model = dyad("a", 45), listener()
+    heard = frames_of_dyad(one)
+    assert [len(whole_clips(heard, frames)) for frames in (1, 10, 45, 50)] == [45, 40, 45, 0]
+    whole, clips = (rollouts(model, [one], 3, clip_frames=frames)[0].motion for frames in (1, 10))
+    np.testing.assert_array_equal(clips, whole[:, :40])
+
+
+def test_clips_are_cut_one_behind_the_other():
+    motion = np.arange(10.0)[:, None]
+    assert cut([motion, motion[:3], motion[:4]], 4)[..., 0].tolist() == [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 2, 3]]
+    with pytest.raises(ConfigError, match="no clip is as long as 11 frames"):
+        cut([motion], 11)
+
+
+def test_some_dyads_are_spread_over_all():
+    one = dyad("one", 60)
+    clips = tuple(Clip(str(row), 60, row, lambda row=row: replace(one, name=str(row))) for row in range(10))
+    clips = (*clips[:3], Clip("broken", 60, 3, lambda: open("gone")), *clips[4:])
+    whole = Dataset("composed", "train", "arkit58", 25.0, clips)
+    assert [each.name for each in spread(whole, 4)] == ["0", "2", "5", "7"]
+    assert [each.name for each in spread(whole, None)] == [*"012456789"], "what cannot be read is left out"
+    with pytest.raises(ConfigError, match="none of 1 clips can be read"):
+        spread(whole[3:4], None)
+
+
+def test_listeners_of_several_spaces_have_no_common_table():
+    with pytest.raises(ConfigError, match=r"a: arkit58, b: faceverse58\): evaluate them one by one"):
+        shared_space({"a": listener(), "b": listener("faceverse58")})
+
+
+def test_too_short_dyads_are_refused_by_the_table_that_needs_longer_ones():
+    one, data = listener(), [dyad("a", 49)]
+    with pytest.raises(ConfigError, match="table 2 needs clips of 51 frames, the longest has 49"):
+        collect(2, {"tiny": one}, shared_space({"tiny": one}), data, data, range(1))
+
+
+def test_one_training_clip_does_not_say_how_clips_differ():
+    clip = np.random.default_rng(0).uniform(0, 1, (1, 64, 56))
+    with pytest.raises(ConfigError, match="L2L's units need training clips that differ, there is 1"):
+        table(1, Clips("deca56", clip, clip, clip), {}, 1)

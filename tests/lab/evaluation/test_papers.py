@@ -1,0 +1,88 @@
+"""`evaluate papers`: the papers as written, trained where they are missing and kept, beside the shipped listeners."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import t as student_t
+from tiny_arig_training import dyad, write
+
+from sfms_robot.lab.corpora import clips
+from sfms_robot.lab.evaluate.as_written import LABELS, training_file
+from sfms_robot.lab.evaluation.paper.over_people import intervals, people_of
+from sfms_robot.listeners import checkpoint
+
+
+@pytest.fixture
+def lively(tmp_path: Path) -> Path:
+    """Dyads of three scenes; nothing in a held-out face is ever the same twice."""
+    folder, rng = write(tmp_path / "data"), np.random.default_rng(0)
+    for place, scene in ((".", "listening"), ("interaction", "interaction")):
+        motion = rng.uniform(0.1, 0.3, (2, 300, 58)).astype(np.float32)
+        clips.save(folder / place / "validation", [replace(dyad("v", scene, 2), speaker=motion[0], listener=motion[1])])
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("table", "kind", "ours"), [("1", "sfms", "sfms-small"), ("arig-2", "arig", "arig-small")])
+def test_a_table_has_the_paper_as_written_beside_ours(command_line, lively, tmp_path, table, kind, ours) -> None:
+    words = ("evaluate", "papers", "--data", lively, "--models", tmp_path / "m", "--table", table, "--steps", 1)
+    words += ("--clips", 1, "--samples", 2, "--json")
+    trained = command_line(*words)
+    assert trained.code == 0
+    rows = {row["name"]: row for row in trained.told["tables"][table]["rows"]}
+    assert rows[LABELS[kind]]["source"] == rows[ours]["source"] == "here"
+    assert rows[kind.upper()]["source"] == "paper"
+    weights = tmp_path / "m" / f"{kind}-as-written" / checkpoint.WEIGHTS
+    before = weights.stat().st_mtime_ns
+    again = command_line(*words)
+    assert json.dumps(again.told) == json.dumps(trained.told) and weights.stat().st_mtime_ns == before
+
+
+def test_a_table_that_neither_paper_has_is_named(command_line, tmp_path) -> None:
+    ended = command_line("evaluate", "papers", "--data", tmp_path, "--models", tmp_path / "m", "--table", "5")
+    assert ended.code == 2 and "--table 5: is not one of 1, 2, 3, 4, arig-1, arig-2, arig-4" in ended.err
+    assert not (tmp_path / "m").exists()
+
+
+@pytest.mark.parametrize("kind", ["sfms", "arig"])
+def test_how_the_papers_are_trained_is_there(kind) -> None:
+    assert training_file(kind).is_file()
+
+
+@pytest.mark.slow
+def test_without_a_folder_for_models_a_table_says_what_is_not_trained_and_how_it_would_be(command_line, lively) -> None:
+    words = ("evaluate", "papers", "--data", lively, "--clips", 1, "--samples", 2)
+    words += ("--table", "1", "--table", "arig-1")
+    tables = command_line(*words, "--json").told["tables"]
+    for name, label in (("1", LABELS["sfms"]), ("arig-1", "ARIG")):
+        assert label not in {row["name"] for row in tables[name]["rows"] if row.get("source") == "here"}
+        assert tables[name]["not_trained"][label]
+    assert "configs/training/arig-as-written.yaml" in tables["arig-1"]["not_trained"]["w/o long-range context"]
+
+
+def _mean_of(values):
+    return lambda clips: {"mean": float(values[clips].mean()), "unknown": float("nan")}
+
+
+def test_intervals_over_people_are_those_of_their_means() -> None:
+    """One clip each: the jackknife of a mean is Student's interval."""
+    values = np.random.default_rng(0).normal(3.0, 2.0, 20)
+    found = intervals(_mean_of(values), [str(number) for number in range(20)])
+    low, high = student_t.interval(0.95, 19, values.mean(), values.std(ddof=1) / np.sqrt(20))
+    assert found == {"mean": (pytest.approx(low), pytest.approx(high))}
+
+
+def test_clips_of_one_person_hang_together() -> None:
+    values = np.repeat(np.random.default_rng(1).normal(0, 1, 6), 50)
+    (low, high) = intervals(_mean_of(values), [str(number) for number in np.repeat(range(6), 50)])["mean"]
+    (near, far) = intervals(_mean_of(values), [str(number) for number in range(300)])["mean"]
+    assert high - low > 3 * (far - near)
+    assert intervals(_mean_of(values), ["a", "b"] * 150) == {}
+
+
+def test_who_listens_is_told_by_seat_and_series_or_by_name() -> None:
+    dyads = [dyad(name, "listening", 0) for name in ("IS1000a_B_0120", "IS1000d_B_0007", "IS1000a_C_0120", "clip_7")]
+    assert people_of(dyads, [250, 600, 249, 300], 250) == ["IS1000 B"] * 3 + ["clip_7"]

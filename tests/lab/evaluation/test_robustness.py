@@ -1,0 +1,134 @@
+"""What spoils a voice or a face keeps its length and bounds; counts become rates and scatter."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, ListenerEvent
+from sfms_robot.lab.evaluation.robustness import (
+    CONDITIONS,
+    FLICKER,
+    PLAIN,
+    Speaker,
+    cases,
+    counted,
+    heard_and_seen,
+    listened_minutes,
+    outside,
+    rates,
+    room,
+    telephone,
+    upside_down,
+)
+from sfms_robot.lab.evaluation.rollout import Rollout
+
+VOICE = (0.1 * np.sin(np.arange(3 * AUDIO_HZ) * 0.3)).astype(np.float32)
+FACE = np.full((3 * FRAME_HZ, 58), 0.2, np.float32)
+SPEAKER = Speaker("someone", VOICE, FACE)
+
+
+@pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
+def test_whatever_is_spoilt_stays_a_voice_and_a_face(condition):
+    rng = np.random.default_rng(1)
+    for spoil, given in ((condition.voice, VOICE), (condition.face, FACE)):
+        if spoil is not None:
+            before, after = given.copy(), spoil(given, rng)
+            assert after.shape == given.shape and after.dtype == np.float32
+            np.testing.assert_array_equal(given, before)
+            assert not np.array_equal(after, given) or spoil.__name__ == "constant"
+    if condition.voice is not None:
+        after = condition.voice(VOICE, rng)
+        assert np.isfinite(after).all() and np.abs(after).max() <= 1
+
+
+def test_a_room_rings_after_the_voice_has_ended():
+    cut = np.r_[VOICE[:AUDIO_HZ], np.zeros(AUDIO_HZ, np.float32)]
+    rung = room(cut, np.random.default_rng(1))
+    tail = np.abs(rung[AUDIO_HZ:])
+    assert tail[: AUDIO_HZ // 10].mean() > 10 * tail[AUDIO_HZ // 2 : AUDIO_HZ * 6 // 10].mean() > 0
+    assert tail[-1000:].max() < 1e-6
+
+
+def test_a_telephone_passes_nothing_above_4_khz():
+    whole = np.random.default_rng(1).standard_normal(AUDIO_HZ).astype(np.float32) * 0.1
+    power = np.abs(np.fft.rfft(telephone(whole, np.random.default_rng(1)))) ** 2
+    assert power[4_400:].sum() < 0.01 * power[:3_600].sum()
+
+
+def test_upside_down_is_upside_down():
+    after = upside_down(FACE, np.random.default_rng(1))
+    assert after[0, CHANNEL_INDEX["roll"]] == pytest.approx(np.pi - 0.2) and after[0, 1] == pytest.approx(-0.2)
+
+
+def test_each_way_is_played_where_it_changes_something():
+    every = list(cases(SPEAKER))
+    assert len(every) == len(set((inputs, condition.name) for inputs, condition in every))
+    assert {inputs for inputs, _ in every} == {"voice", "face", "both"}
+    assert all((inputs, PLAIN) in every for inputs in ("voice", "face", "both"))
+    for inputs, condition in every:
+        assert inputs != "voice" or (condition.face is None and condition is not FLICKER)
+        assert inputs != "face" or condition.voice is None
+    assert {inputs for inputs, _ in cases(Speaker("unfilmed", VOICE, None))} == {"voice"}
+
+
+def test_a_short_recording_begins_again():
+    frames = heard_and_seen(SPEAKER, "both", PLAIN, 0.1, np.random.default_rng(1))
+    assert len(frames) == 6 * FRAME_HZ
+    np.testing.assert_array_equal(frames[75].audio, frames[0].audio)
+    assert frames[0].attention == 1.0 and frames[149].face is not None
+
+
+def test_what_is_not_an_input_is_not_there():
+    voice = heard_and_seen(SPEAKER, "voice", PLAIN, 0.1, np.random.default_rng(1))
+    face = heard_and_seen(SPEAKER, "face", PLAIN, 0.1, np.random.default_rng(1))
+    assert all(frame.face is None and frame.attention is None for frame in voice)
+    assert all(not len(frame.audio) and frame.face is not None for frame in face)
+
+
+def test_attention_flickers():
+    frames = heard_and_seen(SPEAKER, "both", FLICKER, 0.1, np.random.default_rng(1))
+    assert [frame.attention for frame in frames[:4]] == [0, 1, 0, 1]
+
+
+def test_counts_are_of_what_is_seen_and_of_what_was_decided():
+    nod = ListenerEvent("nod", 1.0, 0.5, 0.1)
+    found = counted(Rollout(np.zeros((2, 500, 58), np.float32), np.zeros((2, 500), np.int8), ((nod, nod), (nod,))))
+    assert found == {"nod": [0, 0], "blink": [0, 0], "smile": [0, 0], "decided_nod": [2, 1]}
+
+
+def test_rates_and_their_scatter():
+    found = rates({"nod": [4, 6, 5, 5], "smile": [0, 0, 0, 0]}, minutes=2.0)
+    assert found["nods_per_minute"] == 2.5 and found["nods_variance_over_mean"] == pytest.approx(0.667 / 5, abs=1e-3)
+    assert found["smiles_per_minute"] == 0 and found["smiles_variance_over_mean"] is None
+
+
+def test_a_minute_of_nods_is_one_of_listening():
+    found = rates({"nod": [4, 4], "decided_nod": [2, 2], "blink": [8, 8]}, minutes=2.0, listened=0.5)
+    assert [found[f"{kind}s_per_minute"] for kind in ("nod", "decided_nod", "blink")] == [8.0, 4.0, 4.0]
+
+
+def test_who_is_silent_is_listened_to_for_two_seconds_more():
+    talk = np.random.default_rng(0).normal(0, 0.1, 10 * AUDIO_HZ).astype(np.float32)
+    hiss = np.random.default_rng(1).normal(0, 1e-5, 20 * AUDIO_HZ).astype(np.float32)
+    listened = listened_minutes(Speaker("someone", np.r_[talk, hiss], None), 0.5)
+    assert listened == pytest.approx(12 / 60, abs=0.5 / 60)
+
+
+def test_counts_by_lot_scatter_by_their_mean():
+    counts = np.random.default_rng(1).poisson(5, 4000).tolist()
+    assert rates({"nod": counts}, 1.0)["nods_variance_over_mean"] == pytest.approx(1, abs=0.1)
+
+
+def test_what_people_do_not_do_is_named():
+    row = {"nods_per_minute": 21.0, "blinks_per_minute": 15.0, "smiles_per_minute": 0.0}
+    assert outside(row) == ["nods_per_minute", "smiles_per_minute"]
+
+
+def test_nobody_has_to_answer_whom_nothing_tells_to_speak():
+    row = {"nods_per_minute": 0.0, "blinks_per_minute": 15.0, "smiles_per_minute": 0.0}
+    assert outside(row) and not outside(row, tells_speech=False)
+    assert outside(row | {"blinks_per_minute": 0.0, "nods_per_minute": 9.0}, tells_speech=False) == [
+        "nods_per_minute",
+        "blinks_per_minute",
+    ]
+    mute = {(inputs, how.name) for inputs, how in cases(SPEAKER) if not how.tells_speech(inputs)}
+    assert mute == {("face", "face constant"), ("face", "face saturated")}

@@ -1,0 +1,331 @@
+"""Who nods as people do has their figures, at random none; what follows others is lost when they are shifted."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
+from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.evaluate.meetings import middle, people_of, spread
+from sfms_robot.lab.evaluation import timing
+from sfms_robot.lab.evaluation.bootstrap import estimates
+from sfms_robot.lab.evaluation.detection import Calibration, Sightings
+from sfms_robot.lab.evaluation.listener_meetings import ListenerMeeting
+from sfms_robot.lab.evaluation.rollout import rollout, speaker_frames
+from sfms_robot.signals.phase import times
+
+NONE = np.zeros((0, 2))
+MINUTES = 40
+FRAMES = MINUTES * 60 * FRAME_HZ
+
+
+def spans(starts_s, length_s=0.6):
+    starts = np.asarray(starts_s, float)
+    return np.stack([starts, starts + length_s], axis=1)
+
+
+def talk(seed=0):
+    """(N,) talk in phrases of 1 to 8 s with pauses of 0.4 to 3 s."""
+    rng = np.random.default_rng(seed)
+    pieces, total = [], 0
+    while total < FRAMES:
+        piece = np.r_[np.ones(rng.integers(25, 200), bool), np.zeros(rng.integers(10, 75), bool)]
+        pieces.append(piece)
+        total += len(piece)
+    return np.concatenate(pieces)[:FRAMES]
+
+
+def meeting(nods_s, others=None, participant="A", **changed):
+    others = talk() if others is None else others
+    silent = np.zeros(len(others), bool)
+    whole = {
+        "name": f"M1a_{participant}", "participant": participant, "speaker": (), "spans_s": {"nod": spans(nods_s)},
+        "aside": np.zeros(0, bool), "others": others, "own": silent, "unseen": silent, "alone": others,
+        "attention": np.full(len(others), np.nan),
+    }  # fmt: skip
+    return ListenerMeeting(**whole | changed)
+
+
+def ends_of(others):
+    """Seconds at which talk ends."""
+    return np.flatnonzero(np.diff(others.astype(int)) == -1) / FRAME_HZ + FRAME_S
+
+
+def answering(others, share=0.4, seed=0):
+    """Nods of somebody who answers a share of the phrases 0.2 to 0.7 s after their end."""
+    rng = np.random.default_rng(seed)
+    ends = ends_of(others)
+    return (ends + rng.uniform(0.2, 0.7, len(ends)))[rng.random(len(ends)) < share]
+
+
+def anywhere(count, seed=0):
+    return np.sort(np.random.default_rng(seed).uniform(0, MINUTES * 60 - 2, count))
+
+
+def figures(*meetings):
+    """Of (meeting, sums of a listener in it)."""
+    everything = np.ones(FRAMES, bool)
+    rows = timing.per_person((one.participant, timing.people_sums(one, everything) | sums) for one, sums in meetings)
+    return {name: one.value for name, one in estimates(timing.figures_of(rows[0]), rows, seed=1, draws=50).items()}
+
+
+# --- how often --------------------------------------------------------------------------------------------------
+
+
+def test_people_judged_against_themselves_are_themselves():
+    one = meeting(answering(talk()))
+    runs = [one.spans_s["nod"]] * 3
+    found = figures((one, timing.nod_sums("", one, runs) | timing.nod_sums("decided_", one, runs)
+                     | {"nod_deg_sizes": np.zeros(400)}))  # fmt: skip
+    assert found["interval_ks"] == found["decided_interval_ks"] == 0.0
+    for key in ("nods_per_minute", "phrase_end_ratio", "nods_long_silence"):
+        assert found[key] == found[f"decided_{key}"] == found[f"people_{key}"]
+    assert found["phrase_end_ratio"] > 3
+
+
+def test_nods_at_random_know_no_phrase_ends_and_rank_nothing():
+    one = meeting(answering(talk()))
+    runs = [spans(anywhere(4000, seed)) for seed in range(8)]
+    everything = np.ones(FRAMES, bool)
+    found = figures(
+        (one, timing.nod_sums("decided_", one, runs) | timing.nod_contingency("decided_", runs, one, everything))
+    )
+    assert found["decided_phrase_end_ratio"] == pytest.approx(1.0, abs=0.05)
+    assert found["decided_nod_auc"] == pytest.approx(0.5, abs=0.05)
+
+
+def test_rates_are_means_over_seeds():
+    one = meeting([])
+    once, twice = ([spans(anywhere(100))] * count for count in (1, 2))
+    assert figures((one, timing.nod_sums("decided_", one, once))) == figures(
+        (one, timing.nod_sums("decided_", one, twice))
+    )
+
+
+def test_who_is_spoken_to_is_told_from_who_only_hears():
+    half = np.arange(FRAMES) < FRAMES // 2
+    one = meeting(anywhere(400), attention=np.where(half, 1.0, 0.0))
+    counted = timing.nod_sums("", one, [one.spans_s["nod"]])
+    addressed, bystander = counted["addressed_nods_per_minute"], counted["bystander_nods_per_minute"]
+    assert addressed[1] + bystander[1] == pytest.approx((one.listening & one.alone).sum() / FRAME_HZ / 60)
+    assert 0 < addressed[0] and 0 < bystander[0]
+    for changed in (np.full(FRAMES, np.nan), one.attention):
+        busy = meeting(anywhere(400), attention=changed, alone=one.alone & np.isnan(changed))
+        assert not busy.addressed.any() and not busy.bystander.any()
+
+
+def test_who_has_just_spoken_is_not_spoken_to():
+    own = np.zeros(FRAMES, bool)
+    own[FRAME_HZ : 2 * FRAME_HZ] = True
+    one = meeting([], others=np.ones(FRAMES, bool), own=own, attention=np.ones(FRAMES))
+    assert not one.addressed[FRAME_HZ : 3 * FRAME_HZ].any() and one.addressed[3 * FRAME_HZ :].all()
+
+
+def test_time_off_camera_and_own_talk_are_no_listening():
+    hidden = np.arange(FRAMES) < FRAMES // 2
+    for changed in ({"unseen": hidden}, {"own": hidden}):
+        one = meeting([], **changed)
+        assert not one.listening[: FRAMES // 2].any()
+        assert not timing.times_of(one)["nods_long_silence"][: FRAMES // 2].any()
+
+
+def test_intervals_leave_out_what_was_not_listened_in():
+    listening = np.ones(1000, bool)
+    listening[100:350] = False
+    np.testing.assert_allclose(timing.intervals_s(np.array([50, 200, 400]), listening), [4.0])
+
+
+def test_nods_by_lot_scatter_by_their_mean_and_bouts_by_more():
+    everywhere = np.ones(FRAMES, bool)
+    lot, bouts = anywhere(400), np.sort((anywhere(100)[:, None] + np.arange(4)).ravel())
+    for nods_s, low, high in ((lot, 0.7, 1.4), (bouts, 2.5, 5.5)):
+        scaled, total = timing.scatter((nods_s * FRAME_HZ).astype(int).clip(0, FRAMES - 1), everywhere)
+        assert low < scaled / total < high
+    assert not timing.scatter(np.array([3]), np.arange(FRAMES) < 60 * FRAME_HZ).any(), "one stretch has no variance"
+
+
+def test_what_a_finder_misses_is_made_up_for():
+    one, motion = meeting([]), np.zeros((1, 3000, 58), np.float32)
+    when_s = np.arange(3000) / FRAME_HZ
+    for start in range(5, 115, 10):
+        inside = (when_s >= start) & (when_s < start + 0.5)
+        motion[0, inside, 1] = np.radians(5) * np.sin(np.pi * (when_s[inside] - start) / 0.5) ** 2
+    half = Calibration({"nod": Sightings(np.ones(4), np.array([1.0, 1, 0, 0]), 2, np.full(2, 0.08))})
+    plain, made_up = (timing.motion_sums(one, motion, 0, known) for known in (Calibration({}), half))
+    assert plain["nods_per_minute"][0] > 0
+    assert made_up["nods_per_minute"][0] == 2 * plain["nods_per_minute"][0]
+    assert plain["blinks_per_minute"].tolist() == [0, pytest.approx(2.0)]
+
+
+# --- ranking ----------------------------------------------------------------------------------------------------
+
+
+def phase_hazard(others):
+    """High in the first second of a pause."""
+    silence_s = times(others.tolist())[:, 1]
+    return np.where((silence_s > 0) & (silence_s <= 1), 1.0, 0.1)
+
+
+def history_hazard(one):
+    """High for three seconds after his last nod."""
+    last = np.full(one.frames, -1e9)
+    starts = one.instants("nod")
+    last[starts + 1] = starts
+    since = np.arange(one.frames) - np.maximum.accumulate(last)
+    return np.where((since > 0) & (since < 3 * FRAME_HZ), 1.0, 0.1)
+
+
+def shift(values):
+    return np.roll(values, round(timing.SHIFT_S * FRAME_HZ))
+
+
+def test_shifting_the_others_takes_all_from_a_listener_that_copies_their_phase():
+    one = meeting(answering(talk()))
+    found = timing.contingent("", "x", phase_hazard(one.others), [phase_hazard(shift(one.others))], one)
+    matched, shifted, difference = (numbers[0] / numbers[1] for numbers in found.values())
+    assert matched > 0.9 and shifted == pytest.approx(0.5, abs=0.05)
+    assert difference == pytest.approx(matched - shifted)
+
+
+def test_shifting_the_others_takes_nothing_from_a_listener_that_follows_its_own_history():
+    first = anywhere(60)
+    one = meeting(np.sort(np.r_[first, first + 1.5]))
+    hazard = history_hazard(one)
+    found = timing.contingent("", "x", hazard, [hazard], one)
+    assert found["x"][0] / found["x"][1] > 0.65
+    assert found["x_matched_minus_shifted"][0] == 0
+
+
+def test_moving_a_listeners_own_nods_tells_the_same():
+    one = meeting(answering(talk()))
+    everything = np.ones(FRAMES, bool)
+    runs = [spans(answering(talk(), seed=seed)) for seed in range(1, 9)]
+    found = timing.nod_contingency("", runs, one, everything)
+    assert found["nod_auc"][0] / found["nod_auc"][1] > 0.8
+    assert found["shifted_nod_auc"][0] / found["shifted_nod_auc"][1] == pytest.approx(0.5, abs=0.03)
+    own = timing.nod_contingency("", [spans(anywhere(80, seed)) for seed in range(8)], one, everything)
+    assert own["nod_auc_matched_minus_shifted"][0] / own["nod_auc"][1] == pytest.approx(0, abs=0.05)
+
+
+def test_too_short_a_part_cannot_be_shifted():
+    one = meeting(answering(talk()))
+    found = timing.nod_contingency("", [one.spans_s["nod"]], one, np.arange(FRAMES) < 90 * FRAME_HZ)
+    assert (
+        found["nod_auc"][1] > 0
+        and not found["shifted_nod_auc"].any()
+        and not found["nod_auc_matched_minus_shifted"].any()
+    )
+
+
+def test_an_instant_is_ranked_by_what_is_known_before_it():
+    """A score that is high only once a nod has begun knows nothing of when it begins."""
+    one = meeting(anywhere(200))
+    assert timing.ranked(one.inside("nod").astype(float), one)[0] / timing.ranked(np.zeros(FRAMES), one)[
+        1
+    ] == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_array_equal(meeting([10.0, 10.06]).instants("nod"), [249, 250])
+
+
+def test_nothing_is_ranked_of_few_nods_or_of_what_nobody_annotated():
+    assert not timing.ranked(np.zeros(FRAMES), meeting([5.0, 9.0])).any()
+    assert not timing.ranked(np.zeros(FRAMES), meeting(anywhere(99)), "gaze_shift").any()
+
+
+def test_the_nod_table_ranks_those_it_was_counted_on_and_not_random_people():
+    others = talk(5)
+    person = someone(others=spans_of(others), nods=spans(answering(others)), until_s=float(MINUTES * 60))
+    rates = timing.table_rates([person])
+    phase, random = (
+        timing.table_sums(meeting(nods), rates)["table_nod_auc"] for nods in (answering(talk()), anywhere(1500))
+    )
+    assert phase[0] / phase[1] > 0.8
+    assert random[0] / random[1] == pytest.approx(0.5, abs=0.04)
+
+
+# --- people -----------------------------------------------------------------------------------------------------
+
+
+def test_a_persons_auc_is_the_mean_over_his_nods_and_counts_once():
+    def sums(auc, nods):
+        return {"x_auc": np.array([auc * nods, nods]), "nods_per_minute": np.array([nods, 10.0])}
+
+    rows = timing.per_person([("A", sums(0.6, 30)), ("A", sums(0.9, 10)), ("B", sums(0.5, 400)), ("C", sums(0, 0))])
+    assert [row["x_auc"].tolist() for row in rows] == [[pytest.approx(0.675), 1], [0.5, 1], [0, 0]]
+    found = {name: one.value for name, one in estimates(timing.figures_of(rows[0]), rows, seed=1).items()}
+    assert found["x_auc"] == pytest.approx((0.675 + 0.5) / 2)
+    assert found["nods_per_minute"] == pytest.approx(440 / 40)
+
+
+def spans_of(mask):
+    edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(int), 0])) / FRAME_HZ
+    return edges.reshape(-1, 2)
+
+
+def someone(meeting="TS3003a", participant="P1", **changed):
+    whole = {
+        "meeting": meeting, "agent": "B", "participant": participant, "until_s": 300.0, "nods": NONE, "shakes": NONE,
+        "tilts": NONE, "unseen": NONE, "gaze": None, "laughs": NONE, "talk": NONE, "backchannels": NONE, "others": NONE,
+        "floor": (), "others_laughs": NONE, "asked": np.zeros(0),
+    }  # fmt: skip
+    return Person(**whole | changed)
+
+
+def test_people_who_were_trained_on_are_refused_unless_asked_for():
+    everybody = [someone("TS3003a", "P1"), someone("ES2003a", "P2"), someone("ES2003b", "P1")]
+    with pytest.raises(ConfigError, match="--split train: .*--allow-training"):
+        people_of(everybody, "train", False)
+    assert [person.meeting for person in people_of(everybody, "train", True)] == ["TS3003a"]
+    assert [person.meeting for person in people_of(everybody, "test", False)] == ["ES2003a"]  # P1 was trained on
+
+
+def test_a_part_without_people_says_who_is_there():
+    with pytest.raises(ConfigError, match=r"--split validation: the tables hold nobody of it \(train 1\)"):
+        people_of([someone()], "validation", False)
+
+
+def test_meetings_are_spread_evenly():
+    people = list(range(134))
+    assert spread(people, 3) == [0, 66, 133]
+    assert spread(people, None) == spread(people, 500) == people
+
+
+def test_the_middle_of_a_meeting():
+    assert middle(30_000, 5.0) == (11_250, 7_500)
+    assert middle(100, 5.0) == (0, 100)
+    assert middle(100, 0.0)[1] == 0
+
+
+# --- rolling out ------------------------------------------------------------------------------------------------
+
+
+class Metronome:
+    """Listens to nobody: after every 4th frame a plan of 8, whose pitch is the seed plus the frames heard so far."""
+
+    hop, horizon = 4, 8
+
+    def start(self, seed):
+        return (seed, 0)
+
+    def step(self, speaker, memory):
+        seed, heard = memory
+        plan = None
+        if heard % self.hop == 0:
+            times_s = speaker.time_s + FRAME_S * np.arange(1, 9)
+            plan = Plan(speaker.time_s, times_s, np.full((8, 58), seed + heard / 100, np.float32))
+        return plan, (seed, heard + 1)
+
+
+class Choir(Metronome):
+    """The same, all streams at once."""
+
+    def step_many(self, speaker, memories):
+        steps = [self.step(speaker, memory) for memory in memories]
+        return [plan for plan, _ in steps if plan is not None], [memory for _, memory in steps]
+
+
+def test_streams_one_by_one_and_side_by_side_are_rolled_out_alike():
+    speaker = speaker_frames(None, np.full((30, 58), np.nan, np.float32))
+    alone = rollout(Metronome(), speaker, [3, 5]).motion
+    np.testing.assert_array_equal(alone, rollout(Choir(), speaker, [3, 5]).motion)
+    np.testing.assert_allclose(alone[:, [1, 4, 5, 29], 1], [[3, 3, 3.04, 3.28], [5, 5, 5.04, 5.28]], rtol=1e-6)
+    assert not alone[:, 0].any()  # nothing is planned yet while the first frame is heard

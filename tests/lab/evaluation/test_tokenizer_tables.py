@@ -1,0 +1,194 @@
+"""Tables of tokenizers: takes, folders, scores, rows, what they need and what they say."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot import config
+from sfms_robot.config import parse
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.lab.corpora import takes
+from sfms_robot.lab.evaluation.paper import compared_tokenizer, score_history, tokenizer_tables
+from sfms_robot.lab.evaluation.paper.compared_tokenizer import TableModel
+from sfms_robot.lab.evaluation.paper.recipes import recipes
+from sfms_robot.lab.evaluation.paper.restoration import Score, Windows, score
+from sfms_robot.lab.evaluation.paper.table_trainer import train
+from sfms_robot.lab.learning.corpus import first_frames
+from sfms_robot.lab.learning.job import Run
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import amplified
+from sfms_robot.listeners.sfms.placement import place_exact
+from sfms_robot.signals.tracks import Take
+
+RECIPES = recipes(steps=3)
+TRAINING = {"steps": 3, "batch": 2, "learning_rate": 1e-3, "evaluate_every": 0, "score_tracks": 4}
+
+
+def sparse(placement: str = "static", preset: str = "four", k: int = 3) -> config.Recipe:
+    listener = {
+        "kind": "sfms",
+        "placement": placement,
+        "groups": {"preset": preset, "levels": [4, 4], "keyframes": k},
+        "tokenizer_width": 16,
+        "scores": {"width": 8},
+    }
+    return parse(config.Recipe, {"model": listener, "training": TRAINING}, "sparse")
+
+
+def dense() -> config.Recipe:
+    raw = {"kind": "dense", "quantizer": "fsq", "levels": [4, 4], "width": 16, "layers": 1}
+    return parse(config.Recipe, {"model": raw, "training": TRAINING}, "dense")
+
+
+def faces(frames: int = 200, seed: int = 1) -> list[Take]:
+    drawn = np.random.default_rng(seed)
+    steps = drawn.normal(0, 0.02, (frames, 58)).cumsum(axis=0)
+    return [Take("walk", np.clip(0.3 + steps, 0, 1).astype(np.float32))]
+
+
+def test_takes_come_back_within_their_resolution(tmp_path: Path) -> None:
+    wanted = faces(90)[0]
+    takes.save(tmp_path / "t.npz", [(takes.TRAIN, wanted), (takes.HELD_OUT, wanted), (takes.HELD_OUT, wanted)])
+    found = takes.load(tmp_path / "t.npz")
+    assert len(found[takes.TRAIN]) == 1 and len(found[takes.HELD_OUT]) == 2
+    np.testing.assert_allclose(found[takes.TRAIN][0].motion, wanted.motion, atol=0.51 * takes.STEP)
+
+
+def test_the_bundled_takes_hold_out_what_they_say() -> None:
+    found = takes.load(data_dir("sim") / "listeners" / "takes.npz")
+    held_out, trained = ({take.name for take in found[split]} for split in (takes.HELD_OUT, takes.TRAIN))
+    assert held_out == {"apfel", "d12", "d18", "alex_rom_4"}
+    assert held_out & trained == {"alex_rom_4"}, "its first half is learned from, its second is not"
+    assert sum(len(take.motion) for take in found[takes.TRAIN]) > 9_000
+
+
+def test_a_broken_file_of_takes_is_named(tmp_path: Path) -> None:
+    (tmp_path / "t.npz").write_bytes(b"nothing")
+    with pytest.raises(ConfigError, match=r"t\.npz: not a file of recorded takes"):
+        takes.load(tmp_path / "t.npz")
+
+
+def test_windows_lie_in_one_take_and_do_not_overlap() -> None:
+    motion = faces(130)[0].motion
+    seen = Windows.of([Take("a", motion[:100]), Take("short", motion[:20]), Take("b", motion[80:])], 48)
+    assert seen.takes == ("a", "a", "b")
+    np.testing.assert_array_equal(seen.motion[1].numpy(), motion[48:96])
+    np.testing.assert_array_equal(seen.motion[2].numpy(), motion[80:128])
+
+
+def test_takes_that_are_all_too_short_are_refused() -> None:
+    with pytest.raises(ConfigError, match="none of 1 stretches .* as long as a window of 48 frames"):
+        Windows.of([Take("a", faces(40)[0].motion)], 48)
+
+
+def test_first_frames_of_short_takes_are_none() -> None:
+    assert first_frames([10, 50, 49], 48).tolist() == [10, 11, 12, 60, 61]
+    assert first_frames([10], 48).tolist() == []
+
+
+@pytest.mark.parametrize(
+    "recipe", [sparse(), sparse("learned"), sparse("learned_paper"), dense()], ids=lambda r: r.model.kind
+)
+def test_any_recipe_trains_is_kept_and_scores_the_same_again(recipe: config.Recipe, tmp_path: Path) -> None:
+    seen = Windows.of(faces(seed=2), 48)
+    trained = train("one", recipe, faces(), tmp_path, Run(), seen.motion[:1])
+    assert not list((tmp_path / "one").glob("checkpoint-*")), "a finished tokenizer needs no checkpoint"
+    read = compared_tokenizer.read(tmp_path / "one")
+    assert read.recipe == recipe
+    ours, again = score(trained, seen), score(read, seen)
+    assert again.mse == pytest.approx(ours.mse, rel=0.05)  # half precision on disk may move a code
+    assert again.per_take == {"walk": pytest.approx(again.mse)}
+
+
+def test_weights_of_another_recipe_are_refused(tmp_path: Path) -> None:
+    compared_tokenizer.save(tmp_path / "a", TableModel(sparse()))
+    compared_tokenizer.save(tmp_path / "b", TableModel(dense()))
+    (tmp_path / "a" / compared_tokenizer.WEIGHTS).replace(tmp_path / "b" / compared_tokenizer.WEIGHTS)
+    with pytest.raises(ModelError, match="the weights belong to another configuration"):
+        compared_tokenizer.read(tmp_path / "b")
+
+
+def test_places_cost_bits_only_where_nobody_expects_them() -> None:
+    static, learned = TableModel(sparse("static")), TableModel(sparse("learned"))
+    codes = 4 * 3 * np.log2(16)
+    assert static.bits() == static.bits("static_paper") == pytest.approx(codes)
+    assert learned.bits() == static.bits("exact") == pytest.approx(codes + 4 * np.log2(48 * 47 * 46 / 6))
+    assert learned.bits(k=5) > learned.bits(k=4) > learned.bits()
+
+
+def test_a_score_is_in_deviations_of_the_training_motion() -> None:
+    one = TableModel(dense())
+    motion = torch.from_numpy(faces()[0].motion)
+    one.fit_scales(motion)
+    found = one.standardise(motion)
+    assert float(found.mean()) == pytest.approx(0, abs=1e-4)
+    assert float(found.std(0).mean()) == pytest.approx(1, abs=0.01)
+    one.fit_scales(torch.zeros(50, 58))
+    assert float(one.motion_std.min()) == pytest.approx(0.005), "a still channel is not blown up"
+
+
+def test_a_window_error_counts_every_channel_the_same() -> None:
+    found = Score(("a", "a", "b"), np.array([[1.0, 3.0], [0.0, 0.0], [4.0, 6.0]]), 0.0, 0.0)
+    assert found.of_windows.tolist() == [2.0, 0.0, 5.0]
+    assert found.median == 2.0 and found.mse == pytest.approx(7 / 3)
+    assert found.per_take == {"a": 1.0, "b": 5.0}
+
+
+def test_every_table_needs_only_tokenizers_that_have_a_recipe() -> None:
+    for name in tokenizer_tables.TABLES:
+        assert set(tokenizer_tables.needed(name)) <= set(RECIPES)
+    every = {name for table in tokenizer_tables.TABLES for name in tokenizer_tables.needed(table)}
+    assert every == set(RECIPES), "none is trained in vain"
+
+
+def test_the_paper_rows_of_the_tables_are_those_of_the_paper() -> None:
+    three = {(spec.name, spec.k): spec.paper_e2 for spec in tokenizer_tables.TABLE_3 if spec.paper_e2 is not None}
+    assert three["Dynamic (Algorithm 1, as written)", 3] / three["Static (every N/k-th)", 3] == pytest.approx(
+        0.17, abs=0.005
+    )
+    four = {spec.name: spec.paper_e2 for spec in tokenizer_tables.TABLE_4}
+    assert four["Dense-FSQ-1024"] / four["Sparse-FSQ-256"] == pytest.approx(24, abs=0.5)
+    assert four["L2L (VQ-256)"] / four["Sparse-FSQ-256"] == 48
+
+
+def test_a_broken_history_is_named(tmp_path: Path) -> None:
+    assert score_history.load(tmp_path) == []
+    (tmp_path / score_history.FILE).write_text('[{"stride": 1}]')
+    with pytest.raises(ModelError, match=r"history\.json: not the history of a tokenizer"):
+        score_history.load(tmp_path)
+
+
+def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> None:
+    seen = Windows.of(faces(), 48)
+    train("one", sparse("learned"), faces(), tmp_path, Run(), seen.motion[:2])
+    snapshots = score_history.load(tmp_path / "one")
+    assert {snapshot.window for snapshot in snapshots} == {0, 1}
+    assert snapshots[0].step == 0 and snapshots[-1].step == 2
+    for snapshot in snapshots:
+        assert len(snapshot.keyframes) == 3 and len(snapshot.scores) == len(snapshot.errors) == 48
+        assert np.exp(snapshot.scores).sum() == pytest.approx(1, abs=0.01)
+
+
+def test_amplified_windows_keep_their_shape_and_their_best_masks() -> None:
+    batch = torch.randn(4, 48, 3, generator=torch.Generator().manual_seed(1))
+    louder = amplified(batch, 0.4, torch.Generator().manual_seed(2))
+    gain = louder / batch
+    assert torch.allclose(gain, gain[:, :1, :1].expand_as(gain), rtol=1e-4)
+    assert float(gain.min()) > 0 and float(gain.std()) > 0.05
+    member = torch.eye(3)
+    assert torch.equal(place_exact(batch, [5] * 3, member), place_exact(louder, [5] * 3, member))
+
+
+@given(st.integers(1, 60), st.data())
+def test_bits_are_the_logarithm_of_how_many_codes_there_are(frames, data):
+    k = data.draw(st.integers(0, frames))
+    codes = data.draw(st.integers(1, 1024))
+    bits = compared_tokenizer.keyframe_bits(frames, k, codes)
+    assert 2**bits == pytest.approx(math.comb(frames, k) * codes**k, rel=1e-6)
+    with pytest.raises(ValueError, match="9 keyframes in 8"):
+        compared_tokenizer.keyframe_bits(8, 9, 2)

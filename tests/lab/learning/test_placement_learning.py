@@ -1,0 +1,123 @@
+import math
+
+import pytest
+import torch
+
+from sfms_robot import config
+from sfms_robot.lab.learning.sfms.imitation import imitation, lively, regrets, states
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import tokenizer_loss
+from sfms_robot.listeners.sfms.exact import best_frames, completion_errors, mask_cost
+from sfms_robot.listeners.sfms.model import Tokenizer
+from sfms_robot.listeners.sfms.placement import choose, place_static
+from sfms_robot.listeners.sfms.score import ConditionalScore, tracks
+
+ONE = torch.ones(1, 1)
+
+
+def bumps(count: int, frames: int = 24, seed: int = 0) -> torch.Tensor:
+    """Motion (count, frames, 1) that rests, rises and falls at its own times: what even keyframes miss."""
+    drawn = torch.Generator().manual_seed(seed)
+    at = torch.rand(count, 1, generator=drawn) * (frames - 8) + 4
+    width = 1.5 + 2 * torch.rand(count, 1, generator=drawn)
+    rise = ((torch.arange(frames) - at) / width).clamp(-1, 1)
+    return (0.5 + 0.5 * torch.cos(math.pi * rise))[..., None]
+
+
+def score_network() -> ConditionalScore:
+    torch.manual_seed(0)
+    return ConditionalScore(1, 16, 2, 1)
+
+
+def test_what_is_best_has_no_regret_and_what_cannot_be_has_infinite():
+    track = tracks(bumps(4), ONE, 1)
+    chosen = torch.zeros(4, 24)
+    chosen[:, 3] = 1.0
+    regret = regrets(track, chosen, torch.full((4,), 5), 5)
+    assert regret[:, 3].isinf().all()
+    assert (regret >= 0).all()
+    assert (regret.amin(1) < 1e-5).all()
+
+
+def test_following_the_teacher_ends_at_the_best_mask():
+    track = tracks(torch.randn(6, 24, 1).cumsum(1), ONE, 1)
+    mask = torch.zeros(6, 24)
+    for _ in range(5):
+        regret = regrets(track, mask, torch.full((6,), 5), 5)
+        mask = mask.scatter(1, regret.argmin(1, keepdim=True), 1.0)
+    best = torch.zeros(6, 24).scatter(1, best_frames(track.cost, 5), 1.0)
+    torch.testing.assert_close(mask_cost(track.cost, mask), mask_cost(track.cost, best), rtol=1e-3, atol=1e-4)
+
+
+def test_states_are_those_of_one_choice_each():
+    score, drawn = score_network(), torch.Generator().manual_seed(1)
+    track = tracks(bumps(3), ONE, 1)
+    k = torch.tensor([1, 4, 2])
+    rows, chosen, remaining = states(score, track, k, drawn)
+    assert rows.bincount().tolist() == k.tolist()
+    for row, count, coming in zip(rows.tolist(), chosen.sum(1).tolist(), remaining.tolist(), strict=True):
+        assert coming == k[row] - count
+
+
+def test_imitation_is_the_same_for_the_same_generator_and_reaches_every_weight():
+    score, track = score_network(), tracks(bumps(4), ONE, 1)
+    losses = [imitation(score, track, 4, torch.Generator().manual_seed(2)) for _ in range(2)]
+    assert losses[0] == losses[1]
+    losses[0].backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in score.parameters())
+
+
+def test_lively_tracks_are_drawn_before_still_ones():
+    motion = torch.zeros(8, 24, 2)
+    motion[..., 1] = torch.randn(8, 24) * 3
+    found = lively(motion, torch.eye(2), 1, 4, torch.Generator().manual_seed(0))
+    assert len(found.curves) == 4
+    assert (found.curves.square().sum((1, 2)) > 1).sum() >= 3
+
+
+def test_teacher_errors_never_fall_as_more_is_chosen():
+    track = tracks(torch.randn(5, 16, 1).cumsum(1), ONE, 1)
+    nothing, one = torch.zeros(5, 16), torch.zeros(5, 16)
+    one[:, 8] = 1.0
+    free, bound = (completion_errors(track.cost, state, 5)[:, 4].amin(1) for state in (nothing, one))
+    assert (bound >= free - 1e-6).all()
+
+
+@pytest.mark.slow
+def test_scores_that_learned_from_the_teacher_beat_even_keyframes_on_unseen_motion():
+    score, drawn = score_network(), torch.Generator().manual_seed(0)
+    optimizer = torch.optim.AdamW(score.parameters(), 3e-3)
+    for step in range(100):
+        optimizer.zero_grad()
+        imitation(score, tracks(bumps(16, seed=step + 1), ONE, 1), 5, drawn).backward()
+        optimizer.step()
+    unseen = bumps(100, seed=999)
+    track = tracks(unseen, ONE, 1)
+    k = torch.full((100,), 4)
+    even = mask_cost(track.cost, place_static(unseen, [4])[..., 0]).sum()
+    assert mask_cost(track.cost, choose(score, track, k)).sum() < 0.5 * even
+
+
+@pytest.mark.parametrize("quantizer", ["fsq", "vq"])
+def test_a_step_in_half_precision_is_finite_and_reaches_codes_inpainter_and_scores(quantizer):
+    raw = {
+        "kind": "sfms",
+        "placement": "learned",
+        "quantizer": quantizer,
+        "groups": {"preset": "four", "levels": [4, 4], "keyframes": 3},
+        "scores": {"width": 8, "layers": 1, "heads": 2},
+        "tokenizer_width": 16,
+        "heads": 2,
+    }
+    torch.manual_seed(0)
+    tokenizer, drawn = Tokenizer(config.parse(config.Sfms, raw, "tiny")), torch.Generator().manual_seed(0)
+    phase = config.TokenizerTraining(steps=1, batch=4, learning_rate=1e-3)
+    batch = torch.randn(4, 48, 58).cumsum(1) / 4
+    torch.nn.init.normal_(tokenizer.inpainter.out.weight)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = tokenizer_loss(tokenizer, batch, tokenizer.place(batch, strategy="exact"), phase, drawn)[0]
+        some = lively(batch, tokenizer.member, tokenizer.score.curves, 6, drawn)
+        loss = loss + imitation(tokenizer.score, some, 3, drawn)
+    loss.backward()
+    assert loss.isfinite()
+    for name, weights in tokenizer.named_parameters():
+        assert weights.grad is not None and weights.grad.isfinite().all(), name

@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfms_robot.lab.evaluation.metrics import dtw
+from sfms_robot.lab.learning.sfms.soft_dtw import keyframe_dtw, soft_dtw
+
+
+def cost_of(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return ((a[:, :, None] - b[:, None, :]) ** 2).sum(-1) if a.ndim == 3 else (a[:, :, None] - b[:, None, :]) ** 2
+
+
+@pytest.mark.parametrize("frames", [(8, 8), (3, 7), (1, 4), (5, 1)])
+def test_the_gradient_is_that_of_finite_differences(frames: tuple[int, int]):
+    cost = torch.rand(3, *frames, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    assert torch.autograd.gradcheck(lambda c: soft_dtw(c, 0.3), (cost,))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31))
+def test_with_hard_minima_it_is_the_squared_dtw(rows: int, columns: int, seed: int):
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(rows, 1)), rng.normal(size=(columns, 1))
+    cost = cost_of(torch.from_numpy(a[None, :, 0]), torch.from_numpy(b[None, :, 0]))
+    assert float(soft_dtw(cost, 1e-4)) == pytest.approx(dtw(a, b) ** 2, abs=5e-3)
+
+
+def test_softer_minima_lie_lower():
+    cost = torch.rand(16, 8, 8, generator=torch.Generator().manual_seed(1))
+    values = torch.stack([soft_dtw(cost, gamma) for gamma in (0.01, 0.1, 1.0)])
+    assert (values.diff(dim=0) < 0).all()
+
+
+def test_a_batch_is_its_samples():
+    cost = torch.rand(5, 8, 8, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(soft_dtw(cost, 0.1), torch.cat([soft_dtw(one[None], 0.1) for one in cost]))
+
+
+def test_a_keyframe_one_frame_late_costs_less_than_none_and_more_than_in_time():
+    def indicator(*frames: int) -> torch.Tensor:
+        out = torch.zeros(1, 8, 1)
+        out[:, list(frames)] = 1.0
+        return out
+
+    in_time, late, none = (float(keyframe_dtw(one, indicator(3), 0.01)) for one in
+                           (indicator(3), indicator(4), indicator()))  # fmt: skip
+    assert in_time <= late < none
+
+
+def test_a_gamma_that_is_not_above_0_is_refused():
+    with pytest.raises(ValueError, match="gamma 0 must be above 0"):
+        soft_dtw(torch.zeros(1, 2, 2), 0.0)
