@@ -2,7 +2,7 @@
 
 RobotError                      base; `exit_code` is what the command line returns
 +-- ConfigError          (2)    a file, a flag or a value in it is wrong; names file, key, value, choices
-|   +-- MissingExtra     (2)    a feature needs a package that is not installed; names the pip install
+|   +-- MissingExtra     (2)    a feature needs an optional package that is not installed; names the pip install
 |   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
 +-- PortError            (3)    a port cannot be opened, or another program holds it
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
@@ -16,8 +16,10 @@ RobotError                      base; `exit_code` is what the command line retur
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 
 class RobotError(Exception):
@@ -47,11 +49,7 @@ class ConfigError(RobotError):
 
 
 class MissingExtra(ConfigError):
-    """A feature needs an optional dependency: says which `pip install` brings it."""
-
-    @classmethod
-    def of(cls, feature: str, extra: str) -> MissingExtra:
-        return cls(f"{feature} needs an optional part: pip install 'sfms-robot[{extra}]'")
+    """A feature needs an optional package that is not installed; names the command that installs it."""
 
 
 class InputError(ConfigError, ValueError):
@@ -107,3 +105,34 @@ class HaltedError(RobotError):
 
 class GroupError(RobotError):
     """A process that trains with this one is gone. The last checkpoint stands."""
+
+
+# Optional packages by the name that is imported, with the extra of pyproject.toml that brings each.
+EXTRA_OF: Final[Mapping[str, str]] = {
+    "torch": "train",
+    "tensorboard": "train",
+    "matplotlib": "plots",
+    "vtkmodules": "pictures",
+    "mediapipe": "webcam",
+    "cv2": "webcam",
+    "zenoh": "remote",
+    "prometheus_client": "remote",
+    "onnx": "export",
+    "onnx_ir": "export",
+    "onnxscript": "export",
+    "transformers": "wav2vec2",
+    "pyroomacoustics": "bench",
+}
+
+
+@contextmanager
+def optional(feature: str) -> Iterator[None]:
+    """Raise MissingExtra where an optional package is missing that is imported inside. `feature` names its user."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").split(".")[0]
+        if package not in EXTRA_OF:
+            raise
+        install = f"pip install 'sfms-robot[{EXTRA_OF[package]}]'"
+        raise MissingExtra(f"{feature} needs {package}, which is not installed: {install}") from error

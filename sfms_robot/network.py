@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from sfms_robot.errors import ConfigError, MissingExtra, PortError
+from sfms_robot.errors import ConfigError, PortError, optional
 from sfms_robot.origin import is_loopback
 
 if TYPE_CHECKING:
@@ -54,10 +54,8 @@ LOCAL: Final = Router()
 
 def check_zenoh() -> None:
     """Raises MissingExtra where zenoh is not installed."""
-    try:
+    with optional("listening from another machine"):
         import zenoh  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra.of("listening from another machine, and fleets,", "remote") from error
 
 
 def check_name(name: str, what: str) -> str:

@@ -1,4 +1,9 @@
-"""`--port FAMILY=DEVICE[,MODEL:IDS[@BAUD]]` runs the contract of the servo buses on real servos."""
+"""Options, profiles and fixtures of all tests.
+
+`--port FAMILY=DEVICE[,MODEL:IDS[@BAUD]]` runs the contract of the servo buses on real servos.
+`--all-tools` fails a run in which a test was skipped for a missing program or package.
+`--hypothesis-profile thorough` draws 100 examples of each property, with a new seed, in place of 20 fixed ones.
+"""
 
 import os
 import sys
@@ -9,20 +14,31 @@ os.environ.update(ONE_THREAD)  # before numpy and torch are loaded, here and in 
 
 import pytest
 from ended import Ended
+from hypothesis import settings
 from sound_server import SoundServer
 
 from sfms_robot.cli.main import main
+from sfms_robot.config import head_names
+
+# A busy computer is not a failure: no deadlines.
+settings.register_profile("quick", max_examples=20, deadline=None, derandomize=True)
+settings.register_profile("thorough", max_examples=100, deadline=None, print_blob=True)
+settings.load_profile("quick")
+
+EVERY_RUN = {"face28", "reachy_mini"}  # heads of `make test`; tests of the others are marked slow
+MISSING = ("needs ", "could not import ")  # reasons to skip that a complete machine does not have
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_overlays_of_whoever_runs_the_tests(tmp_path_factory):
-    """Shipped heads are what is tested, not the build on this desk."""
+def _no_overlays(tmp_path_factory):
+    """Test the shipped heads, without the overlays of this user."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
         yield
 
 
 def pytest_addoption(parser):
+    parser.addoption("--all-tools", action="store_true", help="fail where a test was skipped for a missing tool")
     parser.addoption(
         "--port",
         action="append",
@@ -33,12 +49,24 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
-    if config.getoption("--port"):
-        return
-    skip = pytest.mark.skip(reason="needs real servos: --port FAMILY=DEVICE")
+    skip = pytest.mark.skip(reason="real servos: --port FAMILY=DEVICE")
+    left_out = set(head_names()) - EVERY_RUN
     for item in items:
-        if "hardware" in item.keywords:
+        if "hardware" in item.keywords and not config.getoption("--port"):
             item.add_marker(skip)
+        parameters = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        if any(isinstance(value, str) and value.split(",")[0] in left_out for value in parameters):
+            item.add_marker("slow")
+
+
+def pytest_sessionfinish(session):
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if not session.config.getoption("--all-tools") or reporter is None:
+        return
+    reasons = [skipped.longrepr[2].removeprefix("Skipped: ") for skipped in reporter.stats.get("skipped", ())]
+    if missing := sorted({reason for reason in reasons if reason.startswith(MISSING)}):
+        reporter.write_line(f"--all-tools: {'; '.join(missing)}", red=True)
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture(scope="session")

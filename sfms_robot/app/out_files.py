@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from sfms_robot.errors import ConfigError, MissingExtra
+from sfms_robot.errors import ConfigError, optional
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,10 +46,8 @@ def checked_png(png: Path, option: str) -> Path:
 
 def new_figure(width_in: float, height_in: float, dpi: int = _DPI) -> Figure:
     """Return an empty figure. Raises MissingExtra without matplotlib."""
-    try:
+    with optional("a plot"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra.of("a plot", "pictures") from error
     return Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
 
 

@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import typer
@@ -34,7 +34,7 @@ from sfms_robot.cli import (
     train_command,
 )
 from sfms_robot.cli.json_line import print_json
-from sfms_robot.errors import ConfigError, RobotError
+from sfms_robot.errors import ConfigError, RobotError, optional
 
 NAME = "sfms-robot"
 INTERRUPTED = 130
@@ -142,7 +142,7 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
     """Run the command: its exit code, and what went wrong, said on stderr already; None where it told that itself."""
     try:
         command = typer.main.get_command(app)
-        with command.make_context(NAME, words) as context:
+        with command.make_context(NAME, words) as context, optional(_typed(words)):
             command.invoke(context)
         sys.stdout.flush()
     except typer.Exit as ended:
@@ -183,6 +183,11 @@ def _completed(words: Sequence[str]) -> list[str]:
         if word in run_command.OPTIONAL and following.startswith("-"):
             completed.append(run_command.OPTIONAL[word])
     return completed
+
+
+def _typed(words: Sequence[str]) -> str:
+    """Return the command that `words` begin with, as it is typed."""
+    return " ".join([NAME, *takewhile(lambda word: not word.startswith("-"), words[:2])])
 
 
 def _flagged(path: str, words: Sequence[str]) -> str:

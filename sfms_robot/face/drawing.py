@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.errors import ConfigError, MissingExtra
+from sfms_robot.errors import ConfigError, optional
 from sfms_robot.face.human import HumanHead, grid_triangles, load_human
 from sfms_robot.frames import Doubles, Floats
 
@@ -26,7 +26,7 @@ Point = Sequence[float] | Doubles  # x, y, z
 
 def load_vtk() -> Any:
     """The parts of vtk that are used. Importing the whole takes a second more. Raises MissingExtra without it."""
-    try:
+    with optional("a picture of the head"):
         import vtkmodules.vtkRenderingFreeType
         import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
         from vtkmodules import (
@@ -37,8 +37,6 @@ def load_vtk() -> Any:
             vtkRenderingCore,
         )
         from vtkmodules.util import numpy_support
-    except ImportError as error:
-        raise MissingExtra.of("a picture of the head", "pictures") from error
     vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # no display is no warning
     names: dict[str, Any] = {"arrays": numpy_support}
     for module in (vtkCommonCore, vtkCommonDataModel, vtkFiltersCore, vtkIOImage, vtkRenderingCore):

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
-from sfms_robot.errors import MissingExtra, ModelError
+from sfms_robot.errors import ModelError, optional
 from sfms_robot.listeners.graph_folder import FOLDER, FORMAT, MANIFEST, digest
 
 MODEL: Final = "model."  # before the name of a weight, in every network
@@ -76,10 +76,8 @@ def export(
 
 def _graph(network: nn.Module, example: Mapping[str, Tensor], several: bool) -> Any:
     """An `onnx_ir.Model` whose weights are values without content; simplified, without a word of where it is from."""
-    try:
+    with optional("sfms-robot export"):
         import onnxscript
-    except ImportError as error:
-        raise MissingExtra.of("sfms-robot export", "export") from error
     streams = torch.export.Dim("streams", min=1, max=MOST_STREAMS)
     free = torch.export.Dim("free", min=1, max=MOST_STREAMS)
     also = {name: {1: free} for name in getattr(network, "free", ())}

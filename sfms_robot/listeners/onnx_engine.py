@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot import config
-from sfms_robot.errors import MissingExtra, ModelError
+from sfms_robot.errors import ModelError, optional
 from sfms_robot.frames import Floats
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.engine import Array, Engine, EngineName, one_of
@@ -142,16 +142,9 @@ def _session(folder: Path, name: str, graph: Graph, values: _Values, threads: in
 
 def _onnxruntime() -> Any:
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it looks up its maker's host
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise MissingExtra("engine onnx needs onnxruntime: pip install onnxruntime") from error
+    import onnxruntime
+
     return onnxruntime
-
-
-def available() -> bool:
-    """Whether onnxruntime is installed. Does not import it."""
-    return find_spec("onnxruntime") is not None
 
 
 def integers(weight: Floats) -> tuple[Array, Floats]:
@@ -208,9 +201,8 @@ def engine_of(
     if graphs is not None:
         file = folder / checkpoint.WEIGHTS
         return OnnxEngine(folder, graphs, lambda: checkpoint.stored_tensors(file, graphs.wanted), threads or 1)
-    if find_spec("torch") is None:
-        raise MissingExtra(f"{folder}: no graphs for engine onnx, and torch is not installed: pip install torch")
-    engine = torch_engine()
+    with optional(f"{folder}: a listener without graphs of engine onnx"):
+        engine = torch_engine()
     if threads is not None:
         engine.set_threads(threads)
     return engine
@@ -218,7 +210,7 @@ def engine_of(
 
 def _graphs(folder: Path, settings: config.Listener, wanted: EngineName, precision: str) -> GraphFolder | None:
     """The graphs to run; None for torch."""
-    if wanted == "torch" or (wanted == "auto" and not (available() and has_graphs(folder))):
+    if wanted == "torch" or (wanted == "auto" and not has_graphs(folder)):
         return None
     try:
         graphs = read_graphs(folder, settings, integers=precision != "fp32")

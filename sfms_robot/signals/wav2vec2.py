@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from sfms_robot.errors import MissingExtra, ModelError
+from sfms_robot.errors import ModelError, optional
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.signals.audio_features import Feature
 
@@ -40,10 +40,8 @@ class Wav2Vec2:
 
     def __init__(self, folder: Path | str, device: str = "cpu", hop_frames: int = 1) -> None:
         """Raises MissingExtra without transformers, ModelError for a folder that holds no such model."""
-        try:
+        with optional("wav2vec2"):
             import transformers
-        except ImportError as error:
-            raise MissingExtra.of("wav2vec2", "wav2vec2") from error
         self.folder = Path(folder)
         settings = _json(self.folder / _CONFIG)
         if settings.get("model_type") != "wav2vec2":

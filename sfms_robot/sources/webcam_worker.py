@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
 from sfms_robot.endpoint import whole_number
-from sfms_robot.errors import ConfigError, MissingExtra, PortError
+from sfms_robot.errors import ConfigError, PortError, optional
 from sfms_robot.frames import BLENDSHAPES, Floats
 
 MOST_FACES: Final = 3
@@ -147,8 +147,9 @@ def watch(argument: str) -> Generator[Opened | Seen | None, float | None, None]:
 
 def need_extra() -> None:
     """Raises MissingExtra without MediaPipe."""
-    if importlib.util.find_spec("mediapipe") is None:
-        raise MissingExtra.of("--face webcam", "webcam")
+    with optional("--face webcam"):
+        if importlib.util.find_spec("mediapipe") is None:
+            raise ModuleNotFoundError(name="mediapipe")
 
 
 def open_camera(number: int) -> Any:

@@ -12,7 +12,7 @@ from sfms_robot.app.wiring import emulated
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 HEAD = "reachy_mini"
 PITCH = CHANNEL_INDEX["pitch"]
 

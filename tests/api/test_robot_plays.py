@@ -6,7 +6,7 @@ import pytest
 import sfms_robot as sr
 from sfms_robot.frames import FRAME_S, MOTION_DIM
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 LIMIT_S = 60.0
 LOOK_S = 0.02
 

@@ -57,4 +57,10 @@ def test_without_the_packages_of_pictures_the_run_is_kept_and_the_pip_install_na
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
     told = demo(DemoOptions("op3_head", duration_s=1.0, fast=True, folder=tmp_path / "demo"))
     assert told["exit"] == "done" and told["pictures"] == [] and (tmp_path / "demo" / "run.mcap").is_file()
-    assert told["missing"].count("\n") == 0 and "pip install 'sfms-robot[pictures]'" in told["missing"]
+    assert told["missing"].count("\n") == 0 and "pip install 'sfms-robot[plots]'" in told["missing"]
+
+
+def test_without_vtk_the_plot_is_drawn(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "vtkmodules", None)  # as if it were not installed
+    told = demo(DemoOptions("op3_head", duration_s=1.0, fast=True, folder=tmp_path / "demo"))
+    assert told["pictures"] == [str(tmp_path / "demo" / "run.png")] and "sfms-robot[pictures]" in told["missing"]

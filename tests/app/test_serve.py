@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 pytest.importorskip("zenoh", reason="needs the extra [remote]")
 pytest.importorskip("prometheus_client", reason="needs the extra [remote]")

@@ -16,7 +16,7 @@ from dynamixel_sdk import (
 
 from sfms_robot.emulator.launch import EmulatedServo
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 IDS = (1, 2, 3)
 NO_ERROR = (COMM_SUCCESS, 0)

@@ -6,7 +6,7 @@ from sfms_robot.emulator.launch import EmulatedServo
 
 sdk = pytest.importorskip("scservo_sdk")
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 IDS = (1, 2)
 LITTLE, BIG = 0, 1

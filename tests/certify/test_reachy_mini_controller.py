@@ -13,7 +13,7 @@ from sfms_robot.app.servo.emulated_chains import EmulateOptions, emulators
 
 controller = pytest.importorskip("reachy_mini_motor_controller")
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 IDS = range(10, 19)
 

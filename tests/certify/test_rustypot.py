@@ -8,7 +8,7 @@ from sfms_robot.emulator.launch import EmulatedServo
 
 rustypot = pytest.importorskip("rustypot")
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 IDS = [1, 2, 3]
 

@@ -4,7 +4,7 @@ import pytest
 
 from sfms_robot.cli.show import LevelMeter, meter_line
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 
 def test_port_list_shows_serial_ports_and_what_records_and_plays(sound_server, command_line):

@@ -9,7 +9,7 @@ from drill_rig import HEAD, PAN, TILT, command, gone, listening, run
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.flaky(reruns=2),  # against clocks that all programs of this machine share
+    pytest.mark.realtime,
     pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here"),
 ]
 

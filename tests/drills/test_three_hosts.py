@@ -37,7 +37,7 @@ def namespaces_work():
 
 
 pytestmark = [
-    pytest.mark.flaky(reruns=2),  # against clocks that all programs of this machine share
+    pytest.mark.realtime,
     pytest.mark.slow,
     pytest.mark.skipif(not namespaces_work(), reason="network namespaces need root, Linux and iproute2"),
 ]

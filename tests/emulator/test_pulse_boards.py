@@ -1,6 +1,6 @@
 import pytest
 from emulated_devices import device_of, servos_of
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.servo.codecs import maestro, ssc32
@@ -188,7 +188,6 @@ def test_ssc32_hears_no_other_baud_rate():
 
 
 @given(st.lists(st.binary(max_size=64), max_size=20), st.sampled_from(["maestro-24", "maestro-6", "ssc-32"]))
-@settings(deadline=None)
 def test_rubbish_moves_no_channel_out_of_its_limits(chunks, model):
     board = device_of(*servos_of(model, *range(6), baud=9600))
     now_s = 0.0

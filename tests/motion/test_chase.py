@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 import ruckig
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.motion.chase import StopChase, TimeOptimalChase
@@ -38,7 +38,6 @@ def assert_lawful(sent):
         assert (np.abs(np.diff(sent, order)) / DT_S**order <= rate * (1 + 1e-6)).all()
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.floats(-2, 2), st.floats(-2, 2))
 def test_a_move_from_rest_to_rest_takes_hardly_longer_than_the_fastest(start, end):
     plan = ruckig.InputParameter(1)
@@ -54,7 +53,6 @@ def test_a_move_from_rest_to_rest_takes_hardly_longer_than_the_fastest(start, en
 
 
 @pytest.mark.parametrize("chase", [TimeOptimalChase, StopChase])
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30))
 def test_no_reference_takes_it_over_a_limit(chase, seed, hold):
     rng = np.random.default_rng(seed)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import ruckig
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
@@ -100,7 +100,6 @@ def test_no_command_ever_exceeds_a_limit(adversary, ruckig_there, ticks):
     assert excess(sent) < 1e-6
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from(ADVERSARIES), min_size=1, max_size=4))
 def test_no_mixture_of_adversaries_exceeds_a_limit(seed, adversaries):
     rng = np.random.default_rng(seed)
@@ -109,7 +108,6 @@ def test_no_mixture_of_adversaries_exceeds_a_limit(seed, adversaries):
     assert excess(sent) < 1e-6
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_any_pose_is_a_fixed_point(seed):
     pose = np.random.default_rng(seed).uniform(LIMITS.low, LIMITS.high)
@@ -194,7 +192,6 @@ def test_a_step_leaves_its_state_alone():
     assert not state.motion.any() and (after.motion[0] <= LIMITS.high).all()
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.floats(-3, 3), st.floats(-30, 30))
 def test_the_stop_is_the_one_that_ruckig_finds(speed, acceleration):
     given_ = ruckig.InputParameter(1)

@@ -124,7 +124,7 @@ def tormented(law: Law, seed: int, kinds, ticks: int) -> None:
 @pytest.mark.parametrize("chase", CHASES)
 @pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
 @pytest.mark.parametrize("name", HEADS)
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
 def test_no_goal_is_refused_and_no_joint_goes_farther_out(name, size, chase, seed, kinds):
     tormented(Law(size(load_head(name)), chase), seed, kinds, 120)
@@ -133,7 +133,7 @@ def test_no_goal_is_refused_and_no_joint_goes_farther_out(name, size, chase, see
 @pytest.mark.parametrize("chase", CHASES)
 @pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
 @pytest.mark.parametrize("name", ["op3_head", "face28"])
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
 def test_every_joint_is_inside_its_range_in_the_stated_time_and_stays(name, size, chase, seed, kinds):
     law = Law(size(load_head(name)), chase)
@@ -151,7 +151,7 @@ def test_every_joint_is_inside_its_range_in_the_stated_time_and_stays(name, size
 
 @pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
 @pytest.mark.parametrize("name", ["op3_head", "open_duck_mini_v2_head", "face28"])
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
 def test_braking_stops_every_joint_where_no_limit_is_broken_and_nobody_goes_farther_out(name, size, seed, kinds):
     law = Law(size(load_head(name)), TimeOptimalChase)
@@ -185,7 +185,7 @@ def needed_s(limits: JointLimits, way_rad) -> np.ndarray:
 @pytest.mark.parametrize("chase", CHASES)
 @pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
 @pytest.mark.parametrize("name", ["op3_head", "face28", "inmoov2_maestro"])
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(seed=st.integers(0, 2**32 - 1), ticks=st.integers(0, 60))
 def test_whatever_a_joint_does_it_is_at_rest_in_the_stated_time_once_it_is_asked_to(name, size, chase, seed, ticks):
     head = size(load_head(name))

@@ -28,7 +28,7 @@ def wild_goals(seed: int, ticks: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("every", [2, 3, 4, 5, 10])
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), phase=st.integers(0, 9))
 def test_every_kth_goal_keeps_the_limits_at_its_own_rate(every, seed, phase):
     sent = wild_goals(seed, 120)[phase::every]

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from motion_rows import motions
 
@@ -56,7 +56,6 @@ def test_frames_are_met_at_their_times():
     assert (played[:, ~still] >= frames[6:12, ~still] - 1e-6).all()
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.floats(0, 0.05))
 def test_blendshapes_stay_between_the_frames_around_them(seed, hop, lead_s):
     frames = np.random.default_rng(seed).uniform(0, 1, (40, MOTION_DIM)).astype(np.float32)
@@ -231,7 +230,6 @@ def led(horizon: int, hop: int, latency_s: float, lead_s: float, seconds: float 
     return np.array(asked), state
 
 
-@settings(max_examples=20, deadline=None)
 @given(
     st.sampled_from([(8, 4), (8, 1), (8, 6), (1, 1)]),
     st.sampled_from([0.002, 0.007, 0.013, 0.029]),

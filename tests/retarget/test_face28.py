@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from motion_rows import motion
 
@@ -37,7 +37,6 @@ def test_twenty_five_face_joints_and_three_of_the_neck_with_ids_from_1():
     assert [joint.id for joint in HEAD.joints.values()] == list(range(1, 29))
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_a_mirrored_face_gives_mirrored_joints(seed):
     rng = np.random.default_rng(seed)

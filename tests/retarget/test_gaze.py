@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Gaze, Life, load_head
@@ -42,7 +42,6 @@ def eyes_deg(motion) -> np.ndarray:
     return np.degrees(directions(motion, FULL_RAD).mean(axis=-2))
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(-29, 29), st.floats(-19, 19), st.floats(-29, 29), st.floats(-19, 19))
 def test_channels_and_directions_are_inverse(yaw_left, pitch_left, yaw_right, pitch_right):
     wanted = np.radians([[yaw_left, pitch_left], [yaw_right, pitch_right]])

@@ -36,7 +36,6 @@ def smooth_path(seed: int, count: int = 2000) -> np.ndarray:
     return FAR * (np.sin(phase) * rng.uniform(0, 0.6, (6, 1, 3))).sum(-1).T
 
 
-@settings(max_examples=25, deadline=None)
 @given(seeds)
 def test_joints_stay_in_range_whatever_pose_is_asked(seed):
     rng = np.random.default_rng(seed)
@@ -45,7 +44,6 @@ def test_joints_stay_in_range_whatever_pose_is_asked(seed):
     assert (angles >= LOW).all() and (angles <= HIGH).all()
 
 
-@settings(max_examples=25, deadline=None)
 @given(seeds)
 def test_a_reachable_pose_passes_unchanged_and_another_ends_on_the_border_of_the_way_home(seed):
     wanted = np.random.default_rng(seed).normal(size=(100, 6)) * FAR * 0.6
@@ -66,7 +64,7 @@ def test_the_reach_has_no_second_part_behind_its_border():
     assert (inside.sum(axis=1) == first_out).all()
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seeds)
 def test_on_a_smooth_path_in_and_out_of_reach_no_step_is_longer_than_the_asked_one_allows(seed):
     path = smooth_path(seed)
@@ -75,7 +73,7 @@ def test_on_a_smooth_path_in_and_out_of_reach_no_step_is_longer_than_the_asked_o
     assert (made <= LONGEST_STEP * asked).all()
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seeds)
 def test_nor_do_the_joints_jump(seed):
     """A crank tip moves as far as the head, or some times as far where crank and rod are nearly in line."""

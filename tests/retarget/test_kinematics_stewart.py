@@ -39,14 +39,13 @@ def test_the_inverse_is_that_of_the_published_geometry(row):
     assert solved.angles_rad == pytest.approx([body, *angles], abs=1e-9) and solved.reached
 
 
-@settings(max_examples=30, deadline=None)
 @given(seeds)
 def test_forward_of_inverse_is_the_pose_all_over_the_reach_starting_at_home(seed):
     wanted = in_reach(seed)  # about 100 poses an example
     assert np.abs(PLATFORM.forward(PLATFORM.inverse(wanted), HOME) - wanted).max() < 1e-9
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seeds)
 def test_inverse_of_forward_is_the_cranks_starting_at_the_last_pose(seed):
     wanted = in_reach(seed)
@@ -55,7 +54,6 @@ def test_inverse_of_forward_is_the_cranks_starting_at_the_last_pose(seed):
     assert PLATFORM.inverse(found) == pytest.approx(cranks, abs=1e-9)
 
 
-@settings(max_examples=20, deadline=None)
 @given(seeds)
 def test_every_rod_keeps_its_length(seed):
     wanted = in_reach(seed)
@@ -69,7 +67,6 @@ def test_every_rod_keeps_its_length(seed):
         assert np.linalg.norm(ends - tips, axis=1) == pytest.approx(np.full(len(wanted), CONFIG.rod_m), abs=1e-12)
 
 
-@settings(max_examples=20, deadline=None)
 @given(seeds)
 def test_a_mirrored_pose_gives_the_cranks_of_the_other_side_turned_the_other_way(seed):
     wanted = 0.9 * in_reach(seed)
@@ -77,7 +74,6 @@ def test_a_mirrored_pose_gives_the_cranks_of_the_other_side_turned_the_other_way
     assert PLATFORM.inverse(mirrored) == pytest.approx(-PLATFORM.inverse(wanted)[:, ::-1], abs=5e-4)  # as it was drawn
 
 
-@settings(max_examples=20, deadline=None)
 @given(seeds)
 def test_a_small_move_of_the_head_is_a_small_move_of_the_cranks(seed):
     wanted = in_reach(seed)

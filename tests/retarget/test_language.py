@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from motion_rows import motion
 
@@ -112,7 +112,6 @@ def test_who_gives_way_next_does_where_the_first_has_no_range_left():
     assert shown(head_of(LIPS, couplings=[first]), mouthRollUpper=1.0) == pytest.approx([-0.5, 1, 0])
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["range", "rad"]))
 def test_couplings_hold_for_any_motion(seed, unit):
     rng = np.random.default_rng(seed)
@@ -161,7 +160,6 @@ def test_channels_and_joints_that_are_left_out_are_listed():
     assert mapping.dead_joints == ("ear",)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_products_of_absurd_channels_stay_finite(seed):
     rng = np.random.default_rng(seed)

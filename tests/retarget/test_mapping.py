@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
@@ -67,7 +67,6 @@ def grown(children):
     )
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     st.lists(st.none() | st.recursive(leaves, grown, max_leaves=10), min_size=1, max_size=6),
     st.sampled_from(["range", "rad"]),

@@ -81,7 +81,7 @@ asked_at = st.lists(
 )
 
 
-@settings(max_examples=40, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+@settings(phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(asked_at, st.integers(0, 5))
 def test_whatever_is_asked_the_face_moves_without_a_jump_and_ends_as_the_listeners(asked, seed):
     """No joint, whatever its lead, jumps; no channel leaves what listener and puppeteer asked for."""

@@ -34,7 +34,7 @@ def turned(name, intensity, style):
 
 
 @pytest.mark.parametrize("name", RETARGETERS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(**knobs, turn=turns, shift=shifts)
 @example(intensity=2.0, style=1.0, turn=(0.0, 0.5, 1.0), shift=(0.0, 0.0, 0.0))
 @example(intensity=2.0, style=0.0, turn=(0.0, 0.875, 0.0), shift=(0.0, 0.0, 0.0))
@@ -50,7 +50,7 @@ def test_the_pose_that_is_said_to_be_shown_is_the_one_that_the_joints_give(name,
 
 
 @pytest.mark.parametrize("name", RETARGETERS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(**knobs, turn=turns, shift=shifts, hz=st.floats(0.2, 2.0))
 def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style, turn, shift, hz):
     retargeter, knobs = turned(name, intensity, style)

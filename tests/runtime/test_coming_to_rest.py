@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.app.open_head import build_bus, build_motion
@@ -138,7 +138,6 @@ def assert_at_rest(chain: Chain) -> None:
         assert abs(chain.state(joint.id)["position"] - joint.zero_ticks) <= 4, f"{name} is not at rest"
 
 
-@settings(max_examples=60, deadline=None)
 @given(place=st.sampled_from(PLACES[:-1]), error=st.sampled_from(ERRORS), at=st.integers(1, 70))
 def test_an_exception_at_any_place_of_any_tick_ends_at_rest_without_torque(chain, place, error, at):
     first = {"source.read": at, "feed.push": 1 + at % 20, "feed.poll": at, "timeline.accept": 1 + at % 5}.get(place, at)

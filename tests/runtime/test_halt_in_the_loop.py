@@ -143,7 +143,7 @@ def torque(chain: Chain, joint: str) -> bool:
     return bool(chain.state(HEAD.joints[joint].id)["torque"])
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(halted=st.integers(60, 250), resumed=st.integers(0, 120))
 @example(halted=100, resumed=0)  # the very tick in which all have eased in
 def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_is_released(chain, halted, resumed):

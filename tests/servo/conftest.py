@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from chain_rig import bus_of
 from emulated_port import BAUD
-from hypothesis import settings
 from virtual_time import Time
 
 from sfms_robot.config import load_firmware_map
@@ -16,9 +15,6 @@ from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
-
-settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure
-settings.load_profile("no_stopwatch")
 
 
 @dataclass

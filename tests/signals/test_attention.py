@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.data import data_dir
@@ -52,7 +52,6 @@ def test_a_blink_changes_nothing_and_eyes_kept_shut_look_at_nothing():
     assert asleep[-1] < 0.01
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.floats(-math.pi, math.pi), st.floats(0, 1))
 def test_a_look_aside_is_told_within_three_tenths_of_a_second_and_so_is_its_end(way, share):
     """However it is shared between head and eyes."""
@@ -65,7 +64,6 @@ def test_a_look_aside_is_told_within_three_tenths_of_a_second_and_so_is_its_end(
     assert back[round(0.3 / FRAME_S) - 1] > 0.8
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.floats(0, 80), st.floats(0, 80), st.floats(-math.pi, math.pi))
 def test_never_more_attention_for_a_larger_angle(one_deg, other_deg, way):
     small, large = sorted((one_deg, other_deg))
@@ -77,7 +75,6 @@ def test_never_more_attention_for_a_larger_angle(one_deg, other_deg, way):
     assert (shown[0] >= shown[1] - 1e-9).all()
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.floats(-14, 14), st.floats(-14, 14))
 def test_a_neutral_of_its_own_is_learnt(yaw_deg, pitch_deg):
     """A phone that stands aside: after a quarter of a minute the same looks give the same attention."""
@@ -94,7 +91,6 @@ def test_a_neutral_of_its_own_is_learnt(yaw_deg, pitch_deg):
     assert aside[late] == pytest.approx(straight[late], abs=0.1)
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.floats(-0.8, 0.8), st.floats(-0.4, 0.4), st.floats(0.5, 2.0))
 def test_where_the_place_is_known_looking_at_the_camera_is_attention_at_once(y_m, z_m, x_m):
     place_m = np.array([x_m, y_m, z_m], np.float32)

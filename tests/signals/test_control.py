@@ -1,7 +1,7 @@
 """Laws of the rows that a model of motion is told of events."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, ListenerEvent
@@ -22,14 +22,12 @@ def column(name: str) -> int:
     return COLUMNS.index(name)
 
 
-@settings(max_examples=60, deadline=None)
 @given(EVENTS, st.integers(-60, 60), st.integers(0, 50), st.integers(0, 50))
 def test_rows_of_two_halves_are_the_rows_of_the_whole(events, first: int, one: int, other: int):
     halves = [control_track(events, first, one), control_track(events, first + one, other)]
     np.testing.assert_array_equal(np.concatenate(halves), control_track(events, first, one + other))
 
 
-@settings(max_examples=60, deadline=None)
 @given(EVENTS, EVENT)
 def test_an_event_outside_its_time_changes_nothing(events, extra: ListenerEvent):
     frames = 150
@@ -39,7 +37,6 @@ def test_an_event_outside_its_time_changes_nothing(events, extra: ListenerEvent)
     np.testing.assert_array_equal(before[outside], after[outside])
 
 
-@settings(max_examples=60, deadline=None)
 @given(EVENTS)
 def test_rows_are_finite_and_bounded_whatever_the_events(events):
     rows = control_track(events, -50, 200)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE
@@ -43,7 +43,6 @@ def nod(frames, size_rad, length_s=0.5, at=30):
 
 
 @given(st.lists(TARGETS, min_size=1, max_size=6), SEEDS)
-@settings(max_examples=30, deadline=None)
 def test_a_whole_is_its_frames_one_by_one(places, seed):
     targets = np.repeat(places, 9, axis=0)
     poses = np.random.default_rng(seed).normal(0, 0.02, (len(targets), 6))
@@ -57,7 +56,6 @@ def test_a_whole_is_its_frames_one_by_one(places, seed):
 
 
 @given(TARGETS, TARGETS, SEEDS)
-@settings(max_examples=60, deadline=None)
 def test_gaze_is_there_after_a_fifth_of_a_second(first, second, seed):
     if math.dist(first, second) > math.radians(30):
         second = first + (second - first) * math.radians(30) / math.dist(first, second)
@@ -70,7 +68,6 @@ def test_gaze_is_there_after_a_fifth_of_a_second(first, second, seed):
 
 @given(SEEDS, TARGETS.map(lambda target: 0.4 * target))
 @example(212, np.zeros(2))  # a long fixation that drifts outwards
-@settings(max_examples=30, deadline=None)
 def test_eyes_hold_their_target_while_the_head_nods(seed, target):
     targets = np.tile(target, (80, 1))
     motion, _ = played(targets, nod(80, math.radians(8)), gaze.start(seed))
@@ -78,7 +75,6 @@ def test_eyes_hold_their_target_while_the_head_nods(seed, target):
 
 
 @given(SEEDS)
-@settings(max_examples=20, deadline=None)
 def test_the_eyes_leave_first_and_the_head_arrives_after_them(seed):
     targets = shift(np.zeros(2), np.radians([24.0, 0.0]))
     motion, head = played(targets, np.zeros((75, 6)), gaze.start(seed, wanders=False))
@@ -94,7 +90,6 @@ def test_the_eyes_leave_first_and_the_head_arrives_after_them(seed):
 
 
 @given(SEEDS)
-@settings(max_examples=20, deadline=None)
 def test_the_head_hardly_moves_for_a_small_shift_and_has_a_larger_share_of_a_larger_one(seed):
     state = gaze.start(seed)
     shares = [
@@ -105,7 +100,6 @@ def test_the_head_hardly_moves_for_a_small_shift_and_has_a_larger_share_of_a_lar
 
 
 @given(st.lists(TARGETS, min_size=2, max_size=8), SEEDS, st.integers(2, 20))
-@settings(max_examples=60, deadline=None)
 def test_the_head_never_jumps_and_neither_does_its_speed(places, seed, held):
     targets = np.concatenate([np.repeat(places, held, axis=0), np.tile(places[-1], (30, 1))])
     head, _, _ = gaze.follow(targets, np.zeros((len(targets), 6)), gaze.start(seed))
@@ -122,7 +116,6 @@ def test_a_still_target_keeps_the_head_where_it_is():
 
 
 @given(st.lists(TARGETS, min_size=1, max_size=6), SEEDS)
-@settings(max_examples=30, deadline=None)
 def test_mirrored_targets_give_mirrored_motion(places, seed):
     targets = np.repeat(places, 12, axis=0)
     poses = np.zeros((len(targets), 6))

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.signals import mel
@@ -8,7 +8,6 @@ from sfms_robot.signals import mel
 NOISE = np.random.default_rng(0).normal(0, 0.1, 16_000).astype(np.float32)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(0, 2000), max_size=12))
 def test_stream_equals_offline_for_any_chunking(cuts: list[int]):
     whole, _ = mel.log_mel(NOISE, mel.start())

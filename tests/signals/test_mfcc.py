@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.signals import learning2listen, mfcc
@@ -31,7 +31,6 @@ def test_delta_of_two_windows_is_three_tenths_of_their_difference():
     np.testing.assert_allclose(row[2], 0, atol=1e-4)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 9), st.integers(1, 5))
 def test_frames_share_nothing(first: int, count: int):
     part = mfcc.mfcc78(NOISE[640 * first : 640 * (first + count)])

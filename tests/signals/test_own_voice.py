@@ -60,7 +60,7 @@ SAID = own_speech(2.0)
 HEARD = echo_of(SAID) + talk("caller", 10.0, 2.0) + noise(len(SAID), -70)
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(st.lists(st.integers(1, 3000), min_size=5, max_size=30))
 def test_frames_do_not_depend_on_how_the_stream_was_cut(sizes):
     whole = OwnVoiceGate().push(HEARD, SAID)
@@ -145,7 +145,6 @@ def test_echo_that_is_expected_is_taken_away():
     assert energy_db(MotorNoise().suppress(hum, 0.0, power)) < energy_db(MotorNoise().suppress(hum, 0.0)) - 6
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.lists(st.floats(-90, 0), min_size=2, max_size=20), st.floats(0, 30))
 def test_what_is_left_of_a_frame_is_never_more_than_it_was_nor_less_than_the_least_gain(levels_db, speed_rad_s):
     motors = MotorNoise()
@@ -155,7 +154,7 @@ def test_what_is_left_of_a_frame_is_never_more_than_it_was_nor_less_than_the_lea
         assert -20.0 - 1e-6 <= motors.left_db <= 1e-6
 
 
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 @given(st.floats(0, STILL_RAD_S))
 def test_with_joints_still_the_microphone_passes_as_it_is(speed_rad_s):
     mic = talk("caller", 10.0, 2.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES
@@ -93,7 +93,6 @@ def test_hum_that_begins_is_forgotten_as_speech_within_a_minute():
 
 
 @given(st.lists(st.booleans(), max_size=120))
-@settings(deadline=None)
 def test_times_are_those_of_the_pattern(active):
     """Against the plain definition, counted from scratch at the last frame."""
     if not active:

@@ -1,5 +1,5 @@
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
@@ -38,7 +38,6 @@ def test_place_and_flips(argument, place, flip):
     assert parse_face_argument("webcam", argument) == FaceArgument(place, flip)
 
 
-@settings(deadline=None)
 @given(st.sets(st.sampled_from(POSE_CHANNELS), min_size=1))
 def test_signs_are_those_of_the_flipped_channels(names):
     signs = parse_face_argument("vmc", ",flip=" + "+".join(names)).signs

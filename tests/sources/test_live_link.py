@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
@@ -114,7 +114,6 @@ def test_what_is_no_packet_is_refused_in_one_line(data, reason):
     assert "\n" not in str(told.value)
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_packet_or_refused(data):
     try:
@@ -123,7 +122,6 @@ def test_any_bytes_are_a_packet_or_refused(data):
         pass
 
 
-@settings(deadline=None)
 @given(st.integers(0, 179), st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20))
 def test_a_damaged_packet_is_refused_or_finite(which, damage):
     data = bytearray(PACKETS[which])
@@ -172,7 +170,6 @@ def test_after_a_silence_any_number_will_do():
     assert decode([95, 96], decoder, start_s=1.0) == ([95, 96], {"recounted": 1})
 
 
-@settings(deadline=None)
 @given(st.permutations(range(12)))
 def test_faces_are_always_in_order_whatever_the_network_does(numbers):
     seen, _ = decode(numbers)

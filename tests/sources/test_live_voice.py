@@ -65,7 +65,7 @@ def offsets_s(frames, first):
     return np.array(found)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     st.sampled_from([8000, 16000, 44100, 48000]), st.floats(-200, 200), st.sampled_from([0.003, 0.01, 0.0213, 0.06]),
     st.floats(0, 0.03), st.integers(0, 99),
@@ -90,7 +90,7 @@ def test_an_hour_of_drift_costs_no_frame_and_no_time(ppm):
     assert voice.statistics()["drift_ppm"] == pytest.approx(ppm, abs=20)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.lists(st.integers(50, 1600), min_size=5, max_size=50), st.integers(0, 99))
 def test_pieces_may_have_any_length(sizes, seed):
     rng = np.random.default_rng(seed)
@@ -231,7 +231,6 @@ def test_a_voice_that_nobody_takes_fills_no_memory():
     tracemalloc.stop()
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.floats(-1000, 1000), st.floats(0, 0.05), st.integers(0, 10**6), st.integers(0, 99))
 def test_the_clock_is_the_line_under_all_callbacks(ppm, jitter_s, before, seed):
     clock, true_hz = SampleClock(16000), 16000 * (1 + ppm * 1e-6)

@@ -20,7 +20,7 @@ from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
 from sfms_robot.sources.sound_devices import SoundDevice, why_not_opened
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 PATIENCE_S = 60.0  # on a computer with nothing to spare
 CALLED_S = 4.0  # before it speaks

@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE, SHAPES
@@ -36,14 +36,12 @@ def follow(faces, start_s=0.0, state=None):
 angles = st.floats(-0.8, 0.8)
 
 
-@settings(deadline=None, max_examples=30)
 @given(st.tuples(angles, angles, angles), st.floats(0, 0.5))
 def test_a_face_that_never_moves_is_at_rest_from_the_first_frame_on(pose, smile):
     out, _ = follow([motion(pose, mouthSmileLeft=smile)] * 20)
     assert np.abs(out).max() < 1e-5
 
 
-@settings(deadline=None, max_examples=20)
 @given(st.tuples(angles, angles, angles), st.integers(0, 2**32 - 1))
 def test_whatever_the_first_face_did_the_offset_is_gone_after_3_s(pose, seed):
     """A person around some pose, caught in mid-turn, with a smile, at the start."""
@@ -117,7 +115,6 @@ def test_memory_is_bounded_and_state_is_a_value():
     assert pickle.dumps(state) == kept
 
 
-@settings(deadline=None, max_examples=30)
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0, 1), st.floats(0, 30)), min_size=1, max_size=40))
 def test_what_comes_out_is_a_face(faces):
     state, time_s = None, 0.0

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
@@ -78,7 +78,6 @@ def test_a_device_that_drifts_is_followed(rate_hz, ppm):
     assert [silence.first for silence in device.playout.silences] == []
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 1000), latency_s=st.floats(0.01, 0.3))
 def test_stamps_that_come_late_change_little(seed, latency_s):
     rng = np.random.default_rng(seed)
@@ -99,7 +98,6 @@ def test_what_was_due_before_a_late_start_is_silence():
     assert device.off_s(after_s=0.0) < 0.001
 
 
-@settings(max_examples=25, deadline=None)
 @given(for_s=st.floats(0.005, 2.0))
 def test_a_device_that_ran_dry_was_silent_and_is_on_time_again(for_s):
     device = VirtualDevice(16_000)

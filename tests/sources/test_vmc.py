@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
@@ -127,7 +127,6 @@ def test_a_turn_about_each_of_unitys_axes(axis, pose):
     assert shown(bone("Head", quaternion))[:3] == pytest.approx(np.array(pose) * 0.3, abs=1e-6)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_any_rotation_turns_our_axes_as_it_turns_unitys(seed):
     """R_ours = A R A^T, A a reflection: it takes left-handed axes to right-handed ones."""
@@ -229,7 +228,6 @@ def test_bundles_in_bundles_end_somewhere():
         list(elements(data))
 
 
-@settings(deadline=None)
 @given(
     st.binary(max_size=300),
     st.sampled_from([b"", b"/VMC/Ext/Blend/Val\0\0", b"/VMC/Ext/Bone/Pos\0\0\0,sfffffff\0\0\0"]),
@@ -244,7 +242,6 @@ def test_any_bytes_are_taken_or_refused(data, head):
         assert motion is None or np.isfinite(motion).all()
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=100))
 def test_any_message_is_read_or_refused(data):
     try:
@@ -253,7 +250,6 @@ def test_any_message_is_read_or_refused(data):
         pass
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=20))
 def test_a_damaged_frame_is_refused_or_finite(damage):
     data = bytearray(bundle(*(blend(name, 0.5) for name in BLENDSHAPES), bone("Head", IDENTITY), APPLY))

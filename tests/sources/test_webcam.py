@@ -16,7 +16,7 @@ from sfms_robot.sources.webcam import Webcam, open_webcam
 from sfms_robot.sources.webcam_worker import Landmarker, Opened, Seen, SeenFace, live, open_video, played, watch
 from sfms_robot.sources.worker import SourceWorker
 
-pytestmark = pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+pytestmark = pytest.mark.realtime
 
 ORIGIN_S = 1000.0
 PLACE_M = np.array([0.6, 0.0, 0.0], np.float32)

@@ -17,7 +17,7 @@ pytest.importorskip("zenoh", reason="needs the extra [remote]")
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}"),
-    pytest.mark.flaky(reruns=2),  # against clocks that all programs of this machine share
+    pytest.mark.realtime,
 ]
 
 TILES = "[...document.querySelectorAll('#heads li')]"

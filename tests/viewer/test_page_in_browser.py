@@ -13,7 +13,7 @@ from sfms_robot.face.human import load_human
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}"),
-    pytest.mark.flaky(reruns=2),  # against clocks that all programs of this machine share
+    pytest.mark.realtime,
 ]
 
 HUMAN = "human-cell"
@@ -252,7 +252,7 @@ def own_address():
 def test_beyond_loopback_a_wrong_token_is_refused_in_words_and_the_right_one_does(tmp_path):
     address = own_address()
     if address is None:
-        pytest.skip("needs an address beyond loopback")
+        pytest.skip("this machine has no address beyond loopback")
     flag = f"--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE {address}"
     head = ("--port", "sim", "--head", "op3_head", "--duration", "3000")
     notice, form = "document.getElementById('notice').textContent", "document.querySelector('#controls form')"

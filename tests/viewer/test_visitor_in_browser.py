@@ -12,7 +12,7 @@ from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}"),
-    pytest.mark.flaky(reruns=2),  # against clocks that all programs of this machine share
+    pytest.mark.realtime,
 ]
 
 VOICE = data_dir("sim") / "speakers" / "katie" / "speech.flac"

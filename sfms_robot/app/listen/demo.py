@@ -48,8 +48,8 @@ def demo(options: DemoOptions, panel: session.Panel | None = None, page: PagePro
     """Run once, record it, show it on a page or draw it. Raises RobotError.
 
     Blocks for the length of the run and some seconds; with a page for as long as somebody looks at it. What visitors
-    choose there is run behind it, unrecorded. Where the pictures' packages are not installed the run is as good as any;
-    `"missing"` names the pip install.
+    choose there is run behind it, unrecorded. Without the packages that a picture needs, it is left out and `"missing"`
+    names the pip install.
     """
     folder = options.folder if options.folder is not None else free_folder(Path(FOLDER))
     seen = False
@@ -63,8 +63,9 @@ def demo(options: DemoOptions, panel: session.Panel | None = None, page: PagePro
     from sfms_robot.app.replay import replay_run  # scipy: not while servos move
 
     try:
-        replay_run(folder, folder / PLOT, folder / SHEET)
-        told["pictures"] = [str(folder / name) for name in (PLOT, SHEET)]
+        for plot, sheet in ((folder / PLOT, None), (None, folder / SHEET)):
+            replay_run(folder, plot, sheet)
+            told["pictures"].append(str(plot or sheet))
     except MissingExtra as error:
         told["missing"] = str(error)
     return told

@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import find_peaks
 
 from sfms_robot.app.replay.run_file import RunRecording
-from sfms_robot.errors import ConfigError, MissingExtra
+from sfms_robot.errors import ConfigError, optional
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_S, Doubles, Floats
 
 if TYPE_CHECKING:
@@ -47,12 +47,10 @@ _LANES: Final = (
 
 def plot(recording: RunRecording, png: Path | str) -> None:
     """Draw the run as a PNG of 1600 x 1200. Raises MissingExtra without matplotlib."""
-    try:
+    with optional("a plot"):
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra.of("a plot", "pictures") from error
     if not Path(png).parent.is_dir():
         raise ConfigError(f"{png}: cannot be written: no folder {Path(png).parent}")
     style: dict[Any, Any] = {

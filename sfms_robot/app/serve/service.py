@@ -17,7 +17,7 @@ from sfms_robot.app.loopback_server import Answer, Document, LoopbackServer
 from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.app.serve.worker_pool import WorkerPool
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
-from sfms_robot.errors import ConfigError, MissingExtra, PortError
+from sfms_robot.errors import ConfigError, PortError, optional
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.serving.stream_server import DEADLINE_S
 from sfms_robot.listeners.zenoh_link import ROOT, down_key, join_key
@@ -161,10 +161,8 @@ def metrics_server(wanted: str) -> LoopbackServer:
 
     `wanted`: a port, "0" for any that is free; HOST:PORT beyond loopback. Raises ConfigError, MissingExtra, PortError.
     """
-    try:
+    with optional("--metrics"):
         import prometheus_client  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra.of("--metrics", "remote") from error
     host, _, number = wanted.rpartition(":")
     port = port_number(number)
     if port is None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
-from sfms_robot.errors import ConfigError, MissingExtra
+from sfms_robot.errors import ConfigError, optional
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.speech_probability import WINDOW, SpeechProbability
@@ -164,10 +164,8 @@ def _in_room(sound: Doubles, response: Doubles) -> Doubles:
 @cache
 def _responses(room: str) -> tuple[Doubles, Doubles, Doubles]:
     """From the person, the loudspeaker and the motors to the microphone. Image sources, so always the same."""
-    try:
+    with optional("bench own-voice"):
         import pyroomacoustics
-    except ImportError as error:
-        raise MissingExtra.of("bench own-voice", "bench") from error
     size, decay_s = ROOMS[room]
     absorption, order = pyroomacoustics.inverse_sabine(decay_s, size)
     material = pyroomacoustics.Material(absorption)

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from sfms_robot.errors import MissingExtra
+from sfms_robot.errors import optional
 from sfms_robot.lab.learning.job import Report
 
 Watch = Callable[[Report], None]
@@ -50,10 +50,8 @@ def figures(report: Report) -> str:
 @contextmanager
 def tensorboard(folder: Path) -> Iterator[Watch]:
     """Curves of loss, held-out loss, gradient norm, learning rate and speed in `folder`/NAME. Raises MissingExtra."""
-    try:
+    with optional("--tensorboard"):
         from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise MissingExtra.of("--tensorboard", "train") from error
     writers: dict[str, SummaryWriter] = {}
 
     def watch(report: Report) -> None:

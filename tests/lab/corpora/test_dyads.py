@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
@@ -50,7 +50,6 @@ def test_a_dyad_without_sound_survives_the_disk(tmp_path):
     assert read.audio is None and read.mel_rows() is None
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 40), st.sampled_from([24.0, 25.0, 29.97, 30.0, 50.0, 60.0]))
 def test_mel_rows_are_four_a_frame_at_any_rate(frames: int, fps: float):
     one = dyad(frames, fps=fps)

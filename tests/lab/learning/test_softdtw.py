@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.lab.evaluation.metrics import dtw
@@ -18,7 +18,6 @@ def test_the_gradient_is_that_of_finite_differences(frames: tuple[int, int]):
     assert torch.autograd.gradcheck(lambda c: soft_dtw(c, 0.3), (cost,))
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31))
 def test_with_hard_minima_it_is_the_squared_dtw(rows: int, columns: int, seed: int):
     rng = np.random.default_rng(seed)

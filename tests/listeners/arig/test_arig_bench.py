@@ -41,7 +41,7 @@ def test_a_memory_minutes_old_goes_on(minutes: int):
 
 
 @pytest.mark.slow
-@pytest.mark.flaky(reruns=2)  # against clocks that all programs of this machine share
+@pytest.mark.realtime
 def test_a_listener_is_measured_beside_the_servo_loop(tmp_path):
     listener = arig_listener()
     checkpoint.save_config(tmp_path, listener.settings)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
 
@@ -162,7 +162,6 @@ def test_several_streams_of_one_speaker_are_what_each_is_alone(told):
     left=st.integers(0, 5),
     uniforms=st.tuples(st.floats(0, 1, exclude_max=True, width=32), st.floats(0, 1, exclude_max=True, width=32)),
 )
-@settings(max_examples=200, deadline=None)
 def test_a_state_is_one_that_the_voices_leave_and_lasts_as_long_as_was_drawn(scores, possible, state, left, uniforms):
     voices, durations = np.ones((2, 2, 7), np.float32), np.tile(np.linspace(2, 9, 33, dtype=np.float32), (7, 1))
     voices[0, 1] = possible
@@ -217,7 +216,6 @@ def test_a_stream_nods_its_feedback(told):
 
 
 @given(rho=st.floats(0.0, 0.999), place=st.floats(-5, 5), other=st.floats(-5, 5), drawn=st.floats(-3, 3))
-@settings(max_examples=50, deadline=None)
 def test_what_was_drawn_wrongly_is_forgotten_at_the_rate_of_the_data(rho, place, other, drawn):
     model = arig_model(draws="innovation")
     model.rho.fill_(rho)

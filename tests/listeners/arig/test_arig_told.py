@@ -25,7 +25,7 @@ def test_nothing_told_is_the_one_of_rest():
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(start_s=st.floats(0, 1), duration_s=st.floats(0.1, 8), size=st.floats(0.01, 0.15))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_twice_the_size_is_twice_as_far_from_rest(kind: str, start_s: float, duration_s: float, size: float):
     one, two = (
         told.features(rows_of(ListenerEvent(kind, start_s, duration_s, scale * size, 2)))[:, 1:] for scale in (1, 2)
@@ -59,7 +59,6 @@ def test_curves_of_the_data_are_found_again():
 
 
 @given(rho=st.floats(0.0, 0.99), off=st.floats(-2, 2))
-@settings(max_examples=30, deadline=None)
 def test_what_leaves_the_told_course_comes_back_to_it(rho: float, off: float):
     """Where nothing is drawn: a face that no event moves at the rate of the data, a head by the end of its nod."""
     model = arig_model(events=True, draws="innovation")
@@ -83,7 +82,7 @@ def test_what_leaves_the_told_course_comes_back_to_it(rho: float, off: float):
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(start_s=st.floats(0, 1), duration_s=st.floats(0.1, 6))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_nothing_is_left_of_what_was_drawn_beside_an_event_once_it_is_over(
     kind: str, start_s: float, duration_s: float
 ):
@@ -118,7 +117,6 @@ def test_a_jaw_may_speak_while_its_mouth_smiles():
 
 
 @given(rho=st.floats(0.0, 0.98), off=st.floats(-9, 9), drawn=st.floats(-5, 5))
-@settings(max_examples=50, deadline=None)
 def test_a_face_that_nothing_moves_comes_to_rest_whatever_is_drawn(rho: float, off: float, drawn: float):
     """It is held to where faces rest, and comes back to there at the rate of the data; while it speaks it is free."""
     model = arig_model(events=True, draws="innovation")

@@ -155,7 +155,7 @@ def test_without_a_microphone_a_moving_mouth_is_a_voice():
 # --- knobs ------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.floats(0.1, 30), st.floats(1.01, 4))
 def test_more_of_a_knob_is_never_less_of_its_hazard(rate, times):
     frames = list(conversation())[:750]
@@ -256,7 +256,6 @@ def test_a_face_that_lies_never_makes_it_nod_without_end(name, face):
     assert np.isfinite(hazards).all()
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     st.lists(
         st.tuples(

@@ -58,14 +58,12 @@ def streamed(one):
     return np.array(rows)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 4))
 def test_stream_equals_offline(seed, people):
     one = scene(seed, people)
     np.testing.assert_array_equal(streamed(one), heard_in(one))
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, FRAMES - 1))
 def test_what_comes_later_changes_nothing_before(seed, at):
     one, other = scene(seed), scene(seed + 1)
@@ -151,7 +149,7 @@ def as_events(spans, aside):
     return sorted(events, key=lambda event: event.start_s)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10**6))
 def test_done_one_by_one_equals_done_in_whole(seed):
     spans, aside = deeds(seed)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.data import data_dir
@@ -65,7 +65,6 @@ def test_what_does_not_apply_says_nothing(tables):
     )
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=len(EVIDENCE), max_size=len(EVIDENCE)))
 def test_log_odds_are_finite_whatever_comes(values):
     bank = HazardBank(load_tables(SHIPPED).hazards)

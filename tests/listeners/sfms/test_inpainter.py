@@ -1,6 +1,6 @@
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.listeners.sfms.keyframes import KEYS_STEP, around
@@ -96,7 +96,6 @@ def test_every_keyframe_and_every_mask_entry_gets_a_gradient():
     assert (mask.grad != 0).all()
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.sets(st.integers(0, 39), min_size=1))
 def test_positions_are_the_distances_to_the_neighbours_in_binary(frames):
     mask = torch.zeros(1, 40, 1)

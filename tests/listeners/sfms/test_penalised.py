@@ -24,7 +24,6 @@ def errors(motion: torch.Tensor, mask: torch.Tensor, ramp: int | None) -> torch.
     return ((Neighbours.in_mask(mask, ramp).interpolate(values * mask[..., None]) - values) ** 2).sum((1, 3))
 
 
-@settings(max_examples=20, deadline=None)
 @given(COST, COST, st.sampled_from([None, 1, 2, 4]), st.integers(0, 10_000))
 def test_no_other_mask_costs_less(one: float, other: float, ramp, seed: int):
     motion, cost = walk(seed, 8), torch.tensor([one, other])
@@ -36,7 +35,6 @@ def test_no_other_mask_costs_less(one: float, other: float, ramp, seed: int):
     torch.testing.assert_close(found, totals.min(0).values, rtol=1e-4, atol=1e-4)
 
 
-@settings(max_examples=20, deadline=None)
 @given(COST, st.integers(0, 10_000))
 def test_with_straight_lines_it_is_the_exact_mask_of_as_many_keyframes(cost: float, seed: int):
     motion = walk(seed, 40)
@@ -45,7 +43,6 @@ def test_with_straight_lines_it_is_the_exact_mask_of_as_many_keyframes(cost: flo
     torch.testing.assert_close(errors(motion, mask, None), errors(motion, exact, None), rtol=1e-4, atol=1e-4)
 
 
-@settings(max_examples=20, deadline=None)
 @given(COST, st.floats(1.0, 10), st.sampled_from([None, 5]), st.integers(0, 10_000))
 def test_dearer_keyframes_are_never_more(cost: float, times: float, ramp, seed: int):
     motion = walk(seed, 60)
@@ -68,7 +65,7 @@ def test_a_movement_takes_no_keyframe_out_of_the_stillness_around_it(ramp):
     assert len(at) >= 6 and at.min() >= 90 and at.max() <= 130
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10_000), st.integers(0, 10_000))
 def test_before_a_keyframe_that_two_motions_share_only_what_is_there_decides(seed: int, other_seed: int):
     """So what is far ahead reaches no further back than to the first keyframe that stands either way."""

@@ -29,7 +29,6 @@ def interpolation_error(motion: torch.Tensor, mask: torch.Tensor) -> torch.Tenso
     return ((Neighbours.in_mask(mask).interpolate(values) - values) ** 2).sum((1, 3))
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 10_000))
 def test_exact_placement_beats_every_other_mask(first: int, second: int, seed: int):
     motion = torch.randn(2, 9, 3, generator=torch.Generator().manual_seed(seed)).cumsum(1)
@@ -58,7 +57,6 @@ def test_every_strategy_places_exactly_k(strategy, k):
     assert set(mask.unique().tolist()) <= {0.0, 1.0}
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 12), st.floats(0.05, 5.0))
 def test_sampled_placement_has_exactly_k_and_reaches_every_score(count: int, temperature: float):
     scores = torch.randn(2, 12, 1, requires_grad=True)
@@ -130,7 +128,6 @@ def every_mask(frames: int, count: int) -> torch.Tensor:
     return torch.zeros(len(rows), frames, dtype=torch.float64).scatter(1, rows, 1.0)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 9), st.integers(0, 10_000))
 def test_the_cost_of_a_mask_is_its_interpolation_error(count: int, seed: int):
     motion = walk(seed, 1)
@@ -140,7 +137,6 @@ def test_the_cost_of_a_mask_is_its_interpolation_error(count: int, seed: int):
     torch.testing.assert_close(mask_cost(cost_of(same), masks), ((drawn - same) ** 2).sum((1, 2)), rtol=1e-6, atol=1e-8)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.sets(st.integers(0, 7), max_size=3), st.integers(1, 5), st.integers(0, 10_000))
 def test_completion_errors_are_those_of_the_best_mask_through_the_chosen_frames(chosen, most: int, seed: int):
     frames, motion = 8, walk(seed, 1, 8)
@@ -156,7 +152,6 @@ def test_completion_errors_are_those_of_the_best_mask_through_the_chosen_frames(
             torch.testing.assert_close(found[k - 1, frame], best, rtol=1e-6, atol=1e-8)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.sets(st.integers(0, 8), min_size=1, max_size=6), st.integers(0, 10_000))
 def test_stretch_errors_tell_what_one_more_keyframe_changes(chosen, seed: int):
     motion = walk(seed, 1)
@@ -192,7 +187,7 @@ def test_conditional_scores_never_choose_a_frame_twice_and_see_no_other_track():
     assert torch.equal(alone[0], mask[2])
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.floats(0.1, 10), st.integers(0, 1000))
 def test_scores_do_not_depend_on_size_or_offset_of_the_motion(scale: float, seed: int):
     score = scores("learned")

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.listeners.sfms.quantizer import (
@@ -17,7 +17,6 @@ grids = st.integers(1, 4).flatmap(
 )
 
 
-@settings(max_examples=30, deadline=None)
 @given(grids)
 def test_every_index_is_the_index_of_its_code(grid: list[list[int]]):
     levels = as_levels(grid)
@@ -29,7 +28,6 @@ def test_every_index_is_the_index_of_its_code(grid: list[list[int]]):
         assert len(codes[: int(size), group].unique(dim=0)) == size
 
 
-@settings(max_examples=30, deadline=None)
 @given(grids, st.integers(0, 1000))
 def test_a_quantized_value_is_on_the_grid_and_the_nearest_there(grid: list[list[int]], seed: int):
     levels = as_levels(grid)

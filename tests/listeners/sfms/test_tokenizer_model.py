@@ -2,7 +2,7 @@ from typing import get_args
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_sfms import tiny_settings
 
@@ -36,7 +36,6 @@ def test_what_is_not_a_keyframe_does_not_reach_the_inpainter(tiny):
     assert torch.equal(tokenizer.inpaint(codes, mask), tokenizer.inpaint(noise, mask))
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.sets(st.integers(0, 19), min_size=1), st.floats(-3, 3), st.floats(-3, 3))
 def test_a_straight_line_between_keyframes_is_restored(frames, slope, start):
     frames = {0, 19, *frames}

@@ -2,13 +2,9 @@
 
 import pytest
 from families import FAMILIES
-from hypothesis import settings
 from rig import emulated, real
 
 from sfms_robot.emulator.launch import launch
-
-settings.register_profile("no_stopwatch", deadline=None)  # a busy computer is not a failure
-settings.load_profile("no_stopwatch")
 
 
 def pytest_generate_tests(metafunc):

@@ -158,7 +158,7 @@ def test_torque_off_is_on_the_wire_before_anybody_is_asked(family):
 
 
 @pytest.mark.parametrize("family", CHAINS)
-@settings(max_examples=4, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@settings(max_examples=4, suppress_health_check=[HealthCheck.too_slow])
 @given(count=st.integers(2, 6), armed=st.booleans())
 def test_any_number_of_mute_buses_have_torque_off_within_20_ms_and_stop_within_half_a_second(family, count, armed):
     clock = Time()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.signals.events import (
@@ -34,7 +34,6 @@ def nod(pitch, start_s, cycles, hz, peak_to_peak_deg):
     return pitch + np.deg2rad(peak_to_peak_deg) * inside * (0.5 - 0.5 * np.cos(2 * np.pi * hz * times))
 
 
-@settings(deadline=None, max_examples=60)
 @given(
     start=st.floats(2, 7),
     cycles=st.integers(1, 4),
@@ -150,7 +149,6 @@ def test_ratio_of_onsets_everywhere_is_one():
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=20)
 def test_ratio_of_random_onsets_is_near_one(seed):
     rng = np.random.default_rng(seed)
     length_s = 20_000

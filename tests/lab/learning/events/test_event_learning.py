@@ -217,7 +217,7 @@ STUDY = {
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("SFMS_ROBOT_AMI" not in os.environ, reason="needs the AMI tables: SFMS_ROBOT_AMI=DIR")
+@pytest.mark.skipif("SFMS_ROBOT_AMI" not in os.environ, reason="AMI tables: SFMS_ROBOT_AMI=DIR")
 def test_all_meetings_teach_what_a_study_found_in_them():
     """To what another sixth of the steps leaves, but for instants at which a step begins (docs/listening.md).
 

@@ -1,4 +1,4 @@
-"""robot.txt is what a run needs: a bare environment of it, without torch, drives an emulated head."""
+"""The base installation, without torch, drives an emulated head; each command starts in it or names its extra."""
 
 import json
 import os
@@ -12,24 +12,15 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
+from pins import COMMANDS, write_inputs
 
-ROOT = Path(__file__).parents[1]
-LEFT_OUT = {"torch", "scipy"}
+ROOT = Path(__file__).parents[2]
 MAIN = "from sfms_robot.cli.main import main; main()"
-
-
-def requirements() -> list[Requirement]:
-    lines = (ROOT / "robot.txt").read_text(encoding="utf-8").splitlines()
-    return [Requirement(line) for line in lines if line and not line.startswith("#")]
 
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 WANTED = [Requirement(each) for each in PROJECT["dependencies"]]
 EXTRAS = [Requirement(each) for extra in PROJECT["optional-dependencies"].values() for each in extra]
-
-
-def test_it_is_what_the_package_depends_on_without_torch():
-    assert sorted(map(str, requirements())) == sorted(str(each) for each in WANTED if each.name not in LEFT_OUT)
 
 
 @pytest.mark.parametrize("one", [each for each in WANTED + EXTRAS if each.name != "sfms-robot"], ids=str)
@@ -70,12 +61,12 @@ def installed(wanted: list[Requirement]) -> set[str]:
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory):
-    """A new environment with robot.txt alone, its packages linked from here: nothing is downloaded."""
+    """A new environment with the base dependencies, linked from here: nothing is downloaded."""
     folder = tmp_path_factory.mktemp("robot")
     venv.create(folder / "venv", symlinks=True)
     site = folder / "site"
     site.mkdir()
-    for name in installed(requirements()):
+    for name in installed(WANTED):
         dist = distribution(name)
         for entry in {file.parts[0] for file in dist.files or () if file.parts[0] not in ("..", "__pycache__")}:
             if not (site / entry).exists():
@@ -87,7 +78,7 @@ def bare(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="links and the emulator's terminal")
 @pytest.mark.parametrize("how", [["--fast", "--listener", "arig-small"], []], ids=["fast", "real time"])
-def test_an_environment_of_it_alone_drives_a_head(bare, how):
+def test_base_installation_drives_a_head(bare, how):
     python, environment = bare
     done = subprocess.run(
         [python, "-c", MAIN, "run", "--duration", "2", "--json", *how],
@@ -98,12 +89,53 @@ def test_an_environment_of_it_alone_drives_a_head(bare, how):
     assert report["exit"] == "done" and report["listener_state"]["engine"].startswith("onnx")
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="links")
-def test_what_wants_torch_says_so_in_one_line(bare):
+# Commands up to the first use of an optional package, with the package that each names where it is missing.
+NEEDS = {
+    "run --engine torch --fast --duration 1": "torch",
+    "export sfms-small": "torch",
+    "train tokenizer --data {tmp} --out {tmp}/out": "torch",
+    "train listener --data {tmp} --out {tmp}/out": "torch",
+    "train arig --data {tmp} --out {tmp}/out": "torch",
+    "bench train": "torch",
+    "bench listener": "torch",
+    "replay {tmp}/run --plot {tmp}/run.png": "matplotlib",
+    "replay {tmp}/run --sheet {tmp}/head.png": "vtkmodules",
+    "head show face28 --urdf {tmp}/head.png": "vtkmodules",
+    "run --listener zenoh/arig-small --fast --duration 1": "zenoh",
+    "run --face webcam --fast --duration 1": "mediapipe",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(bare, tmp_path_factory):
+    """A folder with what the commands read, and the recording of a run."""
+    path = tmp_path_factory.mktemp("base")
+    write_inputs(path)
+    start(bare, f"run --fast --duration 1 --record {path}/run")
+    return path
+
+
+def start(bare, words: str) -> subprocess.CompletedProcess[str]:
     python, environment = bare
-    done = subprocess.run(
-        [python, "-c", MAIN, "run", "--engine", "torch", "--fast", "--duration", "1"],
+    return subprocess.run(
+        [python, "-c", MAIN, *words.split()],
         env=environment, capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
-    assert done.returncode == 2 and "pip install torch" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="links")
+@pytest.mark.parametrize(("words", "package"), NEEDS.items())
+def test_what_needs_an_extra_names_it_in_one_line(bare, folder, words, package):
+    done = start(bare, words.format(tmp=folder))
+    (line,) = done.stderr.splitlines()[-1:]
+    assert done.returncode == 2 and f"needs {package}, which is not installed: pip install" in line
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="links")
+@pytest.mark.parametrize("words", COMMANDS)
+def test_every_other_command_starts(bare, folder, words):
+    done = start(bare, words.format(tmp=folder))
+    assert "Traceback" not in done.stderr and "not installed" not in done.stderr
