@@ -19,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
 from sfms_robot.ports import (
     Bus,
@@ -187,6 +188,9 @@ def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> Stat
         if interrupted():
             return None
         held_rad[index] = parts.bus.enable([joint])[0]
+        if parts.halt.causes:
+            parts.bus.torque_off("release")  # again: what the watcher sent may have come between two joints
+            raise BusError(f"halted by {', '.join(parts.halt.causes)} while joints were switched on")
     log.start(held_rad)
     return State(
         parts.timeline.start(), parts.limiter.start(held_rad), held_rad, 0 * held_rad, held_rad, held_rad, held_rad,

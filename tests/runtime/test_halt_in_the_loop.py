@@ -12,6 +12,7 @@ from sfms_robot.app.open_head import build_bus, build_motion
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
+from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, FaceFrame, Plan, SpeakerFrame
 from sfms_robot.ports import Bus, Source, Tick
 from sfms_robot.runtime.clock import VirtualClock
@@ -111,6 +112,7 @@ def run(
     without: tuple[str, ...] = (),
     latch: HaltLatch | None = None,
     opened: Callable[[Bus], object] = lambda bus: None,
+    interrupted: Callable[[], bool] = lambda: False,
 ) -> Ran:
     clock, latch, motion = VirtualClock(), latch or HaltLatch(), build_motion(HEAD, RATE_HZ)
     clock.wait_until(chain_time(chain))
@@ -125,7 +127,7 @@ def run(
     )  # fmt: skip
     bus.connect()
     try:
-        outcome = drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=lambda: False)
+        outcome = drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=interrupted)
         TIMES[id(chain)] = clock.now_s()
     finally:
         bus.close()
@@ -187,6 +189,19 @@ def test_a_halt_while_joints_ease_in_and_one_before_the_first_tick(chain):
     ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: lambda: latch.resume("device")}, seconds=4.0)
     assert ran.states == ["starting", "halted", "starting", "listening", "stopping"]
     assert ran.log.audited.violations == 0
+
+
+def test_a_halt_while_joints_are_switched_on_takes_torque_off_and_ends_the_run(chain):
+    latch, looks = HaltLatch(), iter(range(99))
+
+    def halted_at_the_fifth_joint() -> bool:
+        if next(looks) == 4:
+            latch.close("key")
+        return False
+
+    with pytest.raises(BusError, match="halted by key while joints were switched on"):
+        run(chain, latch=latch, interrupted=halted_at_the_fifth_joint)
+    assert not any(torque(chain, joint) for joint in JOINTS)
 
 
 def came_back(ran: Ran) -> dict[str, int]:

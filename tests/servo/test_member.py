@@ -238,6 +238,14 @@ def test_online_by_a_load_rule(way, then, state):
     assert member.state is state and member.fault == "pinched"
 
 
+def test_a_joint_that_holds_does_not_get_goals_by_a_fault_that_reduces_others(way):
+    member = made(way, on_fault="reduce", pinch=LoadRule(current_mA=100, for_s=0.1, then="hold"))
+    member.take_current(150, 0.0)
+    member.take_current(150, 0.1)
+    fails(member)
+    assert member.state is State.FAULTY and not member.gets_goals and member.fault == "overload"
+
+
 def test_limp_stays_to_be_released_until_the_servo_says_so(way):
     member = made(way, on_fault="limp")
     fails(member)

@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.codecs.maestro import set_target
+from sfms_robot.servo.codecs.maestro import get_position, set_target
 
 KINDS = ("maestro-24", "ssc-32")
 FIVE = (0, 1, 2, 5, 7)
@@ -211,6 +211,20 @@ def test_only_channels_whose_pulses_go_on_are_listed_where_the_board_reports_pul
     bench.board.receive = lambda data, baud, now_s: receive(data.replace(last, b""), baud, now_s)
     bench.bus.stop("release")
     assert bench.on() == [7] and bench.bus.statistics()["torque_unconfirmed"] == ["joint7"]
+
+
+def test_a_lost_answer_of_a_board_that_reports_pulses_confirms_nothing():
+    bench = ConnectedBench("maestro-24")
+    bench.enable()
+    receive, last = bench.board.receive, set_target(7, 0)
+
+    def mute_of_one_channel(data, baud, now_s):
+        answer = receive(data.replace(last, b""), baud, now_s)
+        return b"" if data == get_position(5) else answer
+
+    bench.board.receive = mute_of_one_channel
+    bench.bus.stop("release")
+    assert bench.on() == [7] and "joint7" in bench.bus.statistics()["torque_unconfirmed"]
 
 
 def test_one_joint_comes_on_within_a_second(model):

@@ -31,6 +31,10 @@ class BoardProtocol(Protocol):
     def status_length(self) -> int:
         """Bytes of the answer to `status_request`."""
 
+    @property
+    def reports_pulses(self) -> bool:
+        """Whether the board can report the pulses that it sends."""
+
     def status_request(self, restarted: bool) -> bytes:
         """Asks the board for its status; `restarted`: it may have been switched off since it last answered."""
 
@@ -44,7 +48,7 @@ class BoardProtocol(Protocol):
         """None for what is no answer."""
 
     def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
-        """Ticks of the pulses it sends now, 0 for none; None when it does not say."""
+        """Return ticks of the pulses that it sends now, 0 for none; None where a channel is not answered."""
 
     def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
         """Moves channels to `ticks`; the goals before went out `interval_s` ago, 0 for the first."""

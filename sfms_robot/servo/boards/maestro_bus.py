@@ -41,6 +41,7 @@ class _Maestro:
         self._groups = (table.channels or 0) > _MICRO
 
     status_length = 2
+    reports_pulses = True
 
     def status_request(self, restarted: bool) -> bytes:
         return bytes([maestro.BAUD_INDICATION] * restarted) + self._sealed(maestro.get_errors())

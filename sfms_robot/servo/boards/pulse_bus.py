@@ -327,7 +327,8 @@ class PulseBus(WireBus[RateLimitedPort]):
         channels = self._off or ()
         pulses = self._protocol.read_pulses(wire.exchange, channels)
         if pulses is None:
-            return set() if self._answers(wire, restarted=True) else set(channels)
+            off = not self._protocol.reports_pulses and self._answers(wire, restarted=True)
+            return set() if off else set(channels)
         return {channel for channel, ticks in pulses.items() if ticks}
 
     def end_pulses(self, channels: Sequence[int]) -> bool:

@@ -22,6 +22,7 @@ class _Ssc32:
     """`board_protocol.BoardProtocol` of an SSC-32, which has no error word: it answers, or it does not."""
 
     status_length = 1
+    reports_pulses = False
 
     def status_request(self, restarted: bool) -> bytes:
         """After a restart, a carriage return in front ends whatever line noise had begun."""

@@ -404,7 +404,8 @@ class Member:
         elif policy == "hold":
             self.state = State.FAULTY
         elif policy == "reduce":
-            self.state = State.REDUCED
+            if self.state is not State.FAULTY:  # one that holds got no goals: the next may be far from where it stands
+                self.state = State.REDUCED
         elif self._restart is not None and self._restart.can_reboot:
             self._try_again(now_s, now_s, reboot=True)
         else:
