@@ -7,6 +7,7 @@ Radians, metres and seconds throughout. A *motion* array is (..., 58): pose 6, t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
@@ -58,6 +59,7 @@ SPACE_CHANNELS: Final[Mapping[str, tuple[str, ...]]] = {
     "deca56": (*(f"expression_{i}" for i in range(50)), *(f"head_{a}" for a in _AXES), *(f"jaw_{a}" for a in _AXES)),
 }
 
+JAW_FULL_OPEN_RAD: Final = math.radians(25.0)  # jaw pitch that stands for jawOpen = 1
 PITCH_CHANNEL: Final[Mapping[str, str]] = {"arkit58": "pitch", "faceverse58": "rotation_x", "deca56": "head_x"}
 
 # The order of Apple's ARKit header (eyes, jaw, mouth, brows, cheeks, nose, tongue).

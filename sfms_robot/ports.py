@@ -270,9 +270,10 @@ class Bus(Protocol):
 
 
 class Observer(Protocol):
-    """Sees every tick, may drop, never blocks. A class that derives from it needs only what it looks at."""
+    """An observer of the loop, which may drop but never blocks. A subclass overrides the methods that it needs."""
 
-    def tick(self, seen: Tick) -> None: ...
+    def tick(self, seen: Tick) -> None:
+        return
 
     def heard(self, frame: SpeakerFrame) -> None:
         return

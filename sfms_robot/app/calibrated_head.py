@@ -14,7 +14,7 @@ from sfms_robot.app.servo.serial_line import FoundServo, Wire
 from sfms_robot.app.servo.single_servo import read
 from sfms_robot.app.wiring import SIM, devices, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
-from sfms_robot.config.calibrate_first import held_back
+from sfms_robot.config.head import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ServoError

@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import Any
 
 from sfms_robot.config import load_head
-from sfms_robot.config.listener_kinds import load_listener
+from sfms_robot.config.listener import load_listener
 from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.sound_devices import SoundDevice

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import cast, get_args
 
 from sfms_robot.app.out_files import made_folder
-from sfms_robot.config.listener_kinds import LISTENER_KINDS
+from sfms_robot.config.listener import LISTENER_KINDS
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, load_config, read_weights, write_tensors

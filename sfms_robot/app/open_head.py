@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sfms_robot.app.calibrated_head import calibrated_head
 from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
 from sfms_robot.config import FirmwareMap, Head, Joint, load_head
-from sfms_robot.config.safety_rules import check_registers
+from sfms_robot.config.check import check_registers
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import Doubles
@@ -34,7 +34,7 @@ from sfms_robot.motion.timeline import PlanTimeline
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.runtime.heat import HeatGuard
+from sfms_robot.runtime.safety import HeatGuard
 from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem

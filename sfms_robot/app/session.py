@@ -36,15 +36,13 @@ from sfms_robot.plugins import REMOTE, listener_folder
 from sfms_robot.ports import Observer, PlanFeed, Retargeter, Source, Timeline
 from sfms_robot.realtime import realtime_priority
 from sfms_robot.retarget.spontaneous import HeadLife
-from sfms_robot.runtime.feed import InlineFeed
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.halt_switches import halt_signals, halt_switch
+from sfms_robot.runtime.clock import InlineFeed
+from sfms_robot.runtime.halt import HaltLatch, halt_signals, halt_switch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
-from sfms_robot.runtime.observers import RunStatus
+from sfms_robot.runtime.observers import NotifyingObserver, RunStatus, ServiceManager
 from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
-from sfms_robot.runtime.service_notify import NotifyingObserver, ServiceManager
 from sfms_robot.sources.registry import open_source, split_kind
 
 logger = logging.getLogger(__name__)

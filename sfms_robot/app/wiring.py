@@ -10,9 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.config import Bus as BusConfig
-from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map
-from sfms_robot.config.emulate import load_stored
+from sfms_robot.config import BusConfig, FirmwareMap, Head, Joint, load_firmware_map
+from sfms_robot.config.head import load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration

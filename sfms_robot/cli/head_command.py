@@ -146,7 +146,7 @@ def show(
         else:
             print_scene(told)
         return
-    from sfms_robot.config.provenance import provenance, refusals
+    from sfms_robot.config.overlay import provenance, refusals
 
     joints, refused = provenance(name), refusals(name)
     if joint is not None:

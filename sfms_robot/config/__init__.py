@@ -1,15 +1,13 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices.
 
-Every name is loaded when it is first used, so that a program that reads a listener's file builds no models of a head.
+Every name is loaded at its first use, so that a program that reads a listener's file builds no models of a head.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from sfms_robot.config.arig import Arig, Diffusion
     from sfms_robot.config.base import Model, load, parse
-    from sfms_robot.config.calmness import Calmness
     from sfms_robot.config.firmware import FirmwareMap, load_firmware_map, map_files, variant
     from sfms_robot.config.head import (
         CameraMount,
@@ -22,18 +20,30 @@ if TYPE_CHECKING:
         RobotDescription,
         load_head,
     )
-    from sfms_robot.config.joint import Joint, LimitClass
+    from sfms_robot.config.joint import (
+        BusConfig,
+        Coupling,
+        Expression,
+        Faults,
+        Joint,
+        LimitClass,
+        LoadRule,
+        Region,
+        Safety,
+        Threshold,
+    )
     from sfms_robot.config.listener import (
+        Arig,
+        Calmness,
         ChannelGroup,
+        Diffusion,
         Listener,
         NodCourse,
         Sfms,
         SmileCourse,
+        load_listener,
+        parse_listener,
     )
-    from sfms_robot.config.listener_kinds import load_listener, parse_listener
-    from sfms_robot.config.mapping import Coupling, Expression, Region
-    from sfms_robot.config.named_bus import Bus
-    from sfms_robot.config.safety_rules import Faults, LoadRule, Safety, Threshold
     from sfms_robot.config.training import (
         ArigPhase,
         ArigTraining,
@@ -57,7 +67,7 @@ __all__ = [
     "ArigPhase",
     "ArigTraining",
     "Baseline",
-    "Bus",
+    "BusConfig",
     "Calmness",
     "CameraMount",
     "ChannelGroup",
@@ -79,6 +89,7 @@ __all__ = [
     "Listener",
     "LoadRule",
     "Model",
+    "NodCourse",
     "Person",
     "Phase",
     "PredictorTraining",
@@ -87,7 +98,6 @@ __all__ = [
     "RobotDescription",
     "Safety",
     "Sfms",
-    "NodCourse",
     "SmileCourse",
     "Stage",
     "Threshold",
@@ -106,11 +116,9 @@ __all__ = [
     "variant",
 ]
 
-# Module -> what comes from there.
-_NAMES: Final = {
-    "config.arig": ("Arig", "Diffusion"),
+# Modules and the names they hold; every other name is of config.training.
+_HOMES: Final = {
     "config.base": ("Model", "load", "parse"),
-    "config.calmness": ("Calmness",),
     "config.firmware": ("FirmwareMap", "load_firmware_map", "map_files", "variant"),
     "config.head": (
         "CameraMount",
@@ -123,41 +131,39 @@ _NAMES: Final = {
         "RobotDescription",
         "load_head",
     ),
-    "config.joint": ("Joint", "LimitClass"),
-    "config.listener": ("ChannelGroup", "Listener", "NodCourse", "Sfms", "SmileCourse"),
-    "config.listener_kinds": ("load_listener", "parse_listener"),
-    "config.mapping": ("Coupling", "Expression", "Region"),
-    "config.named_bus": ("Bus",),
-    "config.safety_rules": ("Faults", "LoadRule", "Safety", "Threshold"),
-    "config.training": (
-        "ArigPhase",
-        "ArigTraining",
-        "Baseline",
-        "Dense",
-        "Grouped",
-        "GroupWeights",
-        "Phase",
-        "PredictorTraining",
-        "Recipe",
-        "Stage",
-        "TokenizerTraining",
-        "Training",
-        "load_training",
-        "parse_training",
+    "config.joint": (
+        "BusConfig",
+        "Coupling",
+        "Expression",
+        "Faults",
+        "Joint",
+        "LimitClass",
+        "LoadRule",
+        "Region",
+        "Safety",
+        "Threshold",
+    ),
+    "config.listener": (
+        "Arig",
+        "Calmness",
+        "ChannelGroup",
+        "Diffusion",
+        "Listener",
+        "NodCourse",
+        "Sfms",
+        "SmileCourse",
+        "load_listener",
+        "parse_listener",
     ),
     "data": ("find",),
 }
-_MODULE_OF: Final = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     """Load a name from its module (PEP 562)."""
-    if name not in _MODULE_OF:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"sfms_robot.{_MODULE_OF[name]}"), name)
+    home = next((module for module, names in _HOMES.items() if name in names), "config.training")
+    value = getattr(import_module(f"sfms_robot.{home}"), name)
     globals()[name] = value
     return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

@@ -1,30 +1,40 @@
-"""What every configuration file shares: strict frozen models, and errors of one line.
+"""YAML files as frozen, strict models, with errors of one line that name file, key, value and valid choices.
 
-Files speak the units people use (degrees, milliseconds where the key says so); properties give radians and
-seconds. Nothing past `load` handles a plain dict.
+Files use the units that people use (degrees, milliseconds where the key says so); properties give radians and seconds.
+Code past `load` handles no plain dict.
+
+Scalars are those of YAML 1.2's core schema. YAML 1.1, the default of pyyaml, reads `yes`, `on` and `no` as booleans,
+`023` as 19 and `1:30` as 90. Here only `true` and `false` are booleans, and a number with a leading zero is refused,
+because readers do not agree on it.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Final, TypeVar, get_args
 
+import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from sfms_robot.config.yaml_file import read
-from sfms_robot.errors import ConfigError
+from sfms_robot.endpoint import whole_number
+from sfms_robot.errors import ConfigError, InputError
 
+DEEPEST: Final = 100  # levels; libyaml's composer recurses, and ends the process at some 10,000
 UNKNOWN_KEY: Final = "unknown_key"  # type of that problem, its key in the context
+_LEADING_ZERO: Final = "!leading-zero"
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
 
 class Model(BaseModel):
-    """Base: immutable, and an unknown key is an error rather than a shrug."""
+    """An immutable section of a file; an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -33,12 +43,12 @@ class Model(BaseModel):
     def _known_keys(cls, value: Any) -> Any:
         for key, given in value.items() if isinstance(value, dict) else ():
             if key not in cls.model_fields:
-                told = {"key": key, "choices": ", ".join(cls.model_fields), "shown": repr(key)}
-                raise PydanticCustomError(UNKNOWN_KEY, "{shown} is not a known key ({choices})", told)
-            # To Python true is 1: `id: true` would be servo 1.
+                context = {"key": key, "choices": ", ".join(cls.model_fields), "shown": repr(key)}
+                raise PydanticCustomError(UNKNOWN_KEY, "{shown} is not a known key ({choices})", context)
+            # Python takes true for 1: `id: true` would be servo 1.
             if isinstance(given, bool) and not _takes_bool(cls.model_fields[key].annotation):
-                told = {"key": key, "shown": str(given).lower()}
-                raise PydanticCustomError("bool", "{key} = {shown} is neither a number nor a name", told)
+                context = {"key": key, "shown": str(given).lower()}
+                raise PydanticCustomError("bool", "{key} = {shown} is neither a number nor a name", context)
         return value
 
 
@@ -50,26 +60,22 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def load(model: type[M], file: Path) -> M:
-    """Read one YAML file into `model`, or raise a ConfigError of one line."""
+    """Read one YAML file as `model`. Raises a ConfigError of one line."""
     return parse(model, read(file), file)
 
 
 def parse(model: type[M], raw: object, file: Path | str) -> M:
-    """Validate plain data; `file` is only for the message."""
+    """Validate plain data as `model`; `file` is the name that the ConfigError begins with."""
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        raise ConfigError(_first(error, file)) from error
-
-
-def _first(error: ValidationError, file: Path | str) -> str:
-    problems = error.errors()
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{file}: {one_line(problems[0])}{more}"
+        problems = error.errors()
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise ConfigError(f"{file}: {one_line(problems[0])}{more}") from error
 
 
 def one_line(problem: ErrorDetails, where: str = "") -> str:
-    """Key, value and what is wrong with it; `where` stands before the key."""
+    """Return key, value and problem in one line; `where` is put before the key."""
     key = ".".join(filter(None, (where, *(str(part) for part in problem["loc"]))))
     text = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "model_type":  # pydantic names the class
@@ -77,3 +83,91 @@ def one_line(problem: ErrorDetails, where: str = "") -> str:
     value = problem["input"]
     shown = f" = {value!r}" if isinstance(value, (str, int, float, bool)) or value is None else ""
     return f"{key}{shown}: {text}" if key else text
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # libyaml's is ten times faster
+    """Safe loader that refuses a key given twice instead of keeping the last value."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # none of YAML 1.1
+
+
+# YAML 1.2.2, section 10.3.2; a scalar is looked up by its first character
+for _tag, _pattern, _first in (
+    ("tag:yaml.org,2002:null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("tag:yaml.org,2002:bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    (_LEADING_ZERO, r"[-+]?0[0-9]+", list("-+0")),
+    ("tag:yaml.org,2002:int", r"[-+]?[0-9]+", list("-+0123456789")),
+    ("tag:yaml.org,2002:float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", list("-+.0123456789")),
+    ("tag:yaml.org,2002:float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", list("-+.")),
+    ("tag:yaml.org,2002:merge", r"<<", ["<"]),
+):
+    _Loader.add_implicit_resolver(_tag, re.compile(f"^(?:{_pattern})$"), _first)
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: set[Any] = set()
+    for key_node, _ in node.value:
+        key = loader.construct_object(key_node)
+        if key in seen:
+            raise yaml.constructor.ConstructorError(None, None, f"{key!r} is given twice", key_node.start_mark)
+        seen.add(key)
+    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
+
+
+def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
+    try:
+        return whole_number(node.value)
+    except InputError as error:
+        raise yaml.constructor.ConstructorError(None, None, str(error), node.start_mark) from error
+
+
+def _leading_zero(loader: _Loader, node: yaml.ScalarNode) -> None:
+    problem = f"{node.value} has a leading zero: write {_whole(loader, node)}, or '{node.value}' for a text"
+    raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+
+
+_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
+_Loader.add_constructor(_LEADING_ZERO, _leading_zero)
+
+
+def read(file: Path) -> Any:
+    """Return the plain data of one YAML file. Raises a ConfigError of one line, with the line of the file."""
+    try:
+        text = file.read_text(encoding="utf-8")
+        depth = 0
+        events: Iterable[Any] = yaml.parse(text, Loader=_Loader)
+        for event in events:
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:
+                problem = f"nested more than {DEEPEST} levels deep"
+                raise yaml.MarkedYAMLError(None, None, problem, event.start_mark)
+        return yaml.load(text, Loader=_Loader)
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f":{mark.line + 1}" if mark else ""
+        problem = " ".join(str(getattr(error, "problem", None) or error).split())
+        raise ConfigError(f"{file}{where}: {problem}") from error
+
+
+def with_number(text: str, keys: Sequence[str], value: int) -> str:
+    """Return `text` with `value` under a path of mapping keys; comments, order and all other values stay.
+
+    Edits only the text: aliases and merge keys are not followed, so the caller checks the meaning of the result.
+    """
+    node: Any = yaml.compose(text, Loader=yaml.SafeLoader)
+    missing, new = list(keys), f"{value}"
+    while isinstance(node, yaml.MappingNode) and (found := [v for k, v in node.value if [k.value] == missing[:1]]):
+        node = found[0]
+        del missing[0]
+    for key in reversed(missing):
+        new = f"{{{key}: {new}}}"
+    start, end = node.start_mark.index, node.end_mark.index
+    if isinstance(node, yaml.MappingNode):  # as its first entry
+        start = end = start + node.flow_style
+        new = new[1:-1] + (", " if node.flow_style else f"\n{' ' * node.start_mark.column}")
+    return text[:start] + new + text[end:]

@@ -1,171 +1,198 @@
-"""Everything in which the parts of a head's file do not agree, one line each; a part that is wrong alone is None."""
+"""Contradictions between the parts of a head's file, one line each."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from sfms_robot.config.joint import Joint
-from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
-from sfms_robot.config.named_bus import Bus, highest_rate_hz, most_joints
+from sfms_robot.config.joint import Expression, Joint
+from sfms_robot.config.kinematics import SerialNeck
+from sfms_robot.config.wire_time import BITS, FRAMINGS
 from sfms_robot.frames import CHANNEL_INDEX
 
 MOST_NODES: Final = 2000
+HIGHEST_RATE_HZ: Final = 1000.0
 
 
-def wiring(joints: Mapping[str, Joint | None], buses: Collection[str], limits: Collection[str]) -> list[str]:
-    """Every joint that is on no bus, of no limit class, or on another's id, one line each."""
-    found: list[str] = []
+def problems(head: Any) -> list[str]:
+    """Return every contradiction between the parts of a head.
+
+    `head` has the attributes of `config.Head`; a part that is wrong in itself is None there, and is passed over.
+    """
+    return [*_wiring(head), *_rates(head), *_drives(head), *_parts(head), *_neck(head), *_description(head)]
+
+
+def _sound(parts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    return ((name, part) for name, part in parts.items() if part is not None)
+
+
+def _wiring(head: Any) -> Iterator[str]:
+    """Yield the joints that are on no bus, of no limit class, or on another's id."""
     seen: dict[tuple[str, int], str] = {}
-    for name, joint in joints.items():
-        if joint is None:
-            continue
-        if joint.bus not in buses:
-            found.append(f"joints.{name}.bus = {joint.bus!r} is not a bus of this head ({', '.join(buses)})")
-        if joint.limits not in limits:
-            found.append(f"joints.{name}.limits = {joint.limits!r} is not a limit class ({', '.join(limits)})")
+    for name, joint in _sound(head.joints):
+        if joint.bus not in head.buses:
+            yield f"joints.{name}.bus = {joint.bus!r} is not a bus of this head ({', '.join(head.buses)})"
+        if joint.limits not in head.limits:
+            yield f"joints.{name}.limits = {joint.limits!r} is not a limit class ({', '.join(head.limits)})"
         other = seen.setdefault((joint.bus, joint.id), name)
         if other != name:
-            found.append(f"joints.{name}.id = {joint.id} is used twice on bus {joint.bus!r} (also by {other})")
-    return found
+            yield f"joints.{name}.id = {joint.id} is used twice on bus {joint.bus!r} (also by {other})"
 
 
-def rates(joints: Mapping[str, Joint | None], buses: Mapping[str, Bus | None]) -> list[str]:
-    """Return a line for every bus whose packets, or whose wire at `rate_hz`, cannot carry the goals of its joints."""
-    found: list[str] = []
-    for name, bus in buses.items():
-        count = sum(joint is not None and joint.bus == name for joint in joints.values())
-        most = None if bus is None else most_joints(bus.family)
-        if bus is not None and most is not None and count > most:
-            found.append(
-                f"buses.{name}: expected at most {most} joints (one packet of goals, {bus.family}), got {count}"
-            )
-        elif bus is not None and bus.rate_hz > (highest := highest_rate_hz(bus.family, bus.baud, count)):
+def highest_rate_hz(family: str, baud: int, joints: int) -> float:
+    """Return how often a second goals for `joints` servos fit on a wire of `baud`, answers left out.
+
+    At most 1000, and whole. A board sends the changes when its wire is free, so its wire sets no limit.
+    """
+    framing = FRAMINGS.get(family)
+    if framing is None or not framing.answer:
+        return HIGHEST_RATE_HZ
+    return min(HIGHEST_RATE_HZ, max(1.0, float(baud // (BITS * framing.goals(joints)))))
+
+
+def _rates(head: Any) -> Iterator[str]:
+    """Yield the buses whose packets, or whose wire at `rate_hz`, cannot carry the goals of their joints."""
+    for name, bus in _sound(head.buses):
+        count = sum(joint.bus == name for _, joint in _sound(head.joints))
+        framing = FRAMINGS.get(bus.family)  # None for a family of another package
+        longest = framing.longest if framing else 0  # 0: a board, which has no packet of all goals
+        most = (longest - framing.write) // (framing.write_each + framing.goal) if framing and longest else count
+        if count > most:
+            yield f"buses.{name}: expected at most {most} joints (one packet of goals, {bus.family}), got {count}"
+        elif bus.rate_hz > (highest := highest_rate_hz(bus.family, bus.baud, count)):
             problem = f"is more than {bus.baud} baud carry for {count} joints (at most {highest:g})"
-            found.append(f"buses.{name}.rate_hz = {bus.rate_hz:g} {problem}")
-    return found
+            yield f"buses.{name}.rate_hz = {bus.rate_hz:g} {problem}"
 
 
-def problems(
-    joints: Mapping[str, Joint | None],
-    expressions: Mapping[str, Expression | None],
-    couplings: Sequence[Coupling | None],
-    folds: Sequence[Fold | None],
-    regions: Mapping[str, Region | None],
-) -> list[str]:
-    """Everything in which the parts of a mapping do not agree, one line each; parts that are wrong alone are None."""
-    found: list[str] = []
-    for name, expression in expressions.items():
+def _drives(head: Any) -> Iterator[str]:
+    """Yield unknown names, wrong mirrors, circles, and drives that are too large."""
+    for name, expression in head.expressions.items():
         if name in CHANNEL_INDEX:
-            found.append(f"expressions.{name} has the name of a channel")
-        found += _unknown(expression, f"expressions.{name}", expressions)
-    for name, joint in joints.items():
-        if joint is not None:
-            found += _unknown(joint.drive, f"joints.{name}.drive", expressions) + _mirror(name, joint, joints)
-    circles = _circles(expressions)
-    found += circles
-    if not circles:
-        found += _too_large(joints, expressions)
-    for index, fold in enumerate(folds):
-        if fold is not None and fold.into not in joints:
-            found.append(f"folds.{index}.into = {_not_a_joint(fold.into, joints)}")
-    return found + _couplings(couplings, joints) + _regions(regions, joints)
-
-
-def _not_a_joint(name: str, joints: Mapping[str, Any]) -> str:
-    return f"{name!r} is not a joint of this head ({', '.join(joints)})"
-
-
-def _unknown(node: Expression | None, where: str, expressions: Mapping[str, Any]) -> list[str]:
-    if node is None:
-        return []
-    if node.use is not None and node.use not in expressions:
-        choices = "; ".join(filter(None, (", ".join(expressions), ", ".join(CHANNEL_INDEX))))
-        return [f"{where}: {node.use!r} is not a channel, nor an expression of this head ({choices})"]
-    return [
-        line for i, part in enumerate(node.parts) for line in _unknown(part, f"{where}.{node.group}.{i}", expressions)
-    ]
-
-
-def _mirror(name: str, joint: Joint, joints: Mapping[str, Joint | None]) -> list[str]:
-    twin = joint.mirror_of
-    if twin is None:
-        return []
-    if twin not in joints:
-        return [f"joints.{name}.mirror_of = {_not_a_joint(twin, joints)}"]
-    other = joints[twin]
-    if twin == name or (other is not None and other.mirror_of is not None):
-        return [f"joints.{name}.mirror_of = {twin!r} is itself a mirror; name the joint that has the drive"]
-    if other is not None and other.unit != joint.unit:
-        return [f"joints.{name}.unit = {joint.unit!r} is not that of {twin} ({other.unit})"]
-    return []
-
-
-def _names(node: Expression | None) -> set[str]:
-    """Shared expressions named below this node."""
-    if node is None:
-        return set()
-    return ({node.use} if node.use else set[str]()).union(*(_names(part) for part in node.parts))
-
-
-def _circles(expressions: Mapping[str, Expression | None]) -> list[str]:
-    found: list[str] = []
-    done: set[str] = set()
-
-    def visit(name: str, path: tuple[str, ...]) -> None:
-        if name in path:
-            circle = (*path[path.index(name) :], name)
-            found.append(f"expressions.{name} uses itself: {' -> '.join(circle)}")
-        elif name not in done:
-            for used in sorted(_names(expressions.get(name))):
-                visit(used, (*path, name))
-            done.add(name)
-
-    for name in expressions:
-        visit(name, ())
-    return found
-
-
-def _too_large(joints: Mapping[str, Joint | None], expressions: Mapping[str, Expression | None]) -> list[str]:
+            yield f"expressions.{name} has the name of a channel"
+        yield from _unknown(expression, f"expressions.{name}", head.expressions)
+    for name, joint in _sound(head.joints):
+        yield from _unknown(joint.drive, f"joints.{name}.drive", head.expressions)
+        yield from _mirror(name, joint, head.joints)
+    circles = list(_circles(head.expressions))
+    yield from circles
+    if circles:
+        return
     sizes: dict[str, int] = {}
 
     def size(node: Expression | None) -> int:
         if node is None:
             return 0
         if node.use is not None and node.use not in sizes:
-            sizes[node.use] = size(expressions.get(node.use))
+            sizes[node.use] = size(head.expressions.get(node.use))
         return 1 + (sizes[node.use] if node.use is not None else sum(size(part) for part in node.parts))
 
-    counts = {name: size(joint.drive) for name, joint in joints.items() if joint is not None}
-    return [
-        f"joints.{name}.drive has {count} nodes, shared expressions counted where they are used; at most {MOST_NODES}"
-        for name, count in counts.items()
-        if count > MOST_NODES
-    ]
+    for name, joint in _sound(head.joints):
+        if (count := size(joint.drive)) > MOST_NODES:
+            counted = "shared expressions counted where they are used"
+            yield f"joints.{name}.drive has {count} nodes, {counted}; at most {MOST_NODES}"
 
 
-def _couplings(couplings: Sequence[Coupling | None], joints: Mapping[str, Any]) -> list[str]:
-    found: list[str] = []
-    for index, coupling in enumerate(couplings):
-        if coupling is None:
-            continue
-        found += [f"couplings.{index}.keep: {_not_a_joint(n, joints)}" for n in coupling.keep if n not in joints]
-        for other, rival in enumerate(couplings):
+def _unknown(node: Expression | None, where: str, expressions: Mapping[str, Any]) -> Iterator[str]:
+    if node is None:
+        return
+    if node.use is not None and node.use not in expressions:
+        choices = "; ".join(filter(None, (", ".join(expressions), ", ".join(CHANNEL_INDEX))))
+        yield f"{where}: {node.use!r} is not a channel, nor an expression of this head ({choices})"
+    for i, part in enumerate(node.parts):
+        yield from _unknown(part, f"{where}.{node.group}.{i}", expressions)
+
+
+def _mirror(name: str, joint: Joint, joints: Mapping[str, Joint | None]) -> Iterator[str]:
+    twin = joint.mirror_of
+    if twin is None:
+        return
+    if twin not in joints:
+        yield f"joints.{name}.mirror_of = {_not_a_joint(twin, joints)}"
+        return
+    other = joints[twin]
+    if twin == name or (other is not None and other.mirror_of is not None):
+        yield f"joints.{name}.mirror_of = {twin!r} is itself a mirror; name the joint that has the drive"
+    elif other is not None and other.unit != joint.unit:
+        yield f"joints.{name}.unit = {joint.unit!r} is not that of {twin} ({other.unit})"
+
+
+def _not_a_joint(name: str, joints: Mapping[str, Any]) -> str:
+    return f"{name!r} is not a joint of this head ({', '.join(joints)})"
+
+
+def _circles(expressions: Mapping[str, Expression | None]) -> Iterator[str]:
+    done: set[str] = set()
+
+    def names(node: Expression | None) -> set[str]:
+        """Return the shared expressions named below a node."""
+        if node is None:
+            return set()
+        return ({node.use} if node.use else set[str]()).union(*(names(part) for part in node.parts))
+
+    def visit(name: str, path: tuple[str, ...]) -> Iterator[str]:
+        if name in path:
+            circle = (*path[path.index(name) :], name)
+            yield f"expressions.{name} uses itself: {' -> '.join(circle)}"
+        elif name not in done:
+            for used in sorted(names(expressions.get(name))):
+                yield from visit(used, (*path, name))
+            done.add(name)
+
+    for name in expressions:
+        yield from visit(name, ())
+
+
+def _parts(head: Any) -> Iterator[str]:
+    """Yield the joints of folds, couplings and regions that are unknown or claimed twice."""
+    for index, fold in enumerate(head.folds):
+        if fold is not None and fold.into not in head.joints:
+            yield f"folds.{index}.into = {_not_a_joint(fold.into, head.joints)}"
+    couplings = [(index, coupling) for index, coupling in enumerate(head.couplings) if coupling is not None]
+    for index, coupling in couplings:
+        yield from (
+            f"couplings.{index}.keep: {_not_a_joint(n, head.joints)}" for n in coupling.keep if n not in head.joints
+        )
+        for other, rival in couplings:
             for name in coupling.moving:
-                if rival is not None and other != index and rival.keep.get(name):
-                    found.append(
-                        f"couplings.{index}.moving: {name!r} is also in couplings.{other}, one would undo the other"
-                    )
-    return found
-
-
-def _regions(regions: Mapping[str, Region | None], joints: Mapping[str, Any]) -> list[str]:
-    found: list[str] = []
+                if other != index and rival.keep.get(name):
+                    yield f"couplings.{index}.moving: {name!r} is also in couplings.{other}, one would undo the other"
     owner: dict[str, str] = {}
-    for name, region in regions.items():
-        for joint in region.joints if region else ():
-            if joint not in joints:
-                found.append(f"regions.{name}.joints: {_not_a_joint(joint, joints)}")
+    for name, region in _sound(head.regions):
+        for joint in region.joints:
+            if joint not in head.joints:
+                yield f"regions.{name}.joints: {_not_a_joint(joint, head.joints)}"
             elif owner.setdefault(joint, name) != name:
-                found.append(f"regions.{name}.joints: {joint!r} is already in region {owner[joint]}")
-    return found
+                yield f"regions.{name}.joints: {joint!r} is already in region {owner[joint]}"
+
+
+def _neck(head: Any) -> Iterator[str]:
+    """Yield the neck's joints that are unknown, have a drive or a fold, or do not rest where the neck is at home."""
+    if (neck := head.kinematics) is None:
+        return
+    for index, fold in enumerate(head.folds):
+        if fold is not None and fold.into in neck.joints():
+            yield f"folds.{index}.into = {fold.into!r}: the neck moves this joint (kinematics)"
+    for name in neck.joints():
+        joint = head.joints.get(name)
+        if name not in head.joints:
+            yield f"kinematics: {_not_a_joint(name, head.joints)}"
+        elif joint is not None and joint.drive is not None:
+            yield f"joints.{name}.drive: the neck moves this joint (kinematics), leave its drive out"
+        if joint is None or not isinstance(neck, SerialNeck):
+            continue
+        if not joint.min_rad <= 0.0 <= joint.max_rad:
+            yield f"joints.{name}: its range leaves out 0, where the neck stands at home"
+        elif joint.rest_deg != 0:
+            yield f"joints.{name}.rest_deg = {joint.rest_deg:g}: the neck rests at 0; shift zero_ticks instead"
+
+
+def _description(head: Any) -> Iterator[str]:
+    """Yield the joints of the URDF section that the head lacks, and joints of the URDF that two of ours would move."""
+    if head.urdf is None:
+        return
+    owner: dict[str, str] = {}
+    for name, follows in head.urdf.joints.items():
+        if name not in head.joints:
+            yield f"urdf.joints: {_not_a_joint(name, head.joints)}"
+        if owner.setdefault(follows.joint, name) != name:
+            yield f"urdf.joints.{name}.joint = {follows.joint!r} already follows {owner[follows.joint]}"

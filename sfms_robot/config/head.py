@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, load
-from sfms_robot.config.consistency import problems, rates, wiring
-from sfms_robot.config.joint import Joint, JointDefaults, LimitClass
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, load
+from sfms_robot.config.consistency import problems
+from sfms_robot.config.joint import (
+    BusConfig,
+    Coupling,
+    Expression,
+    Faults,
+    Fold,
+    Joint,
+    JointDefaults,
+    LimitClass,
+    Region,
+    Safety,
+)
 from sfms_robot.config.kinematics import Kinematics, Triple
-from sfms_robot.config.kinematics import problems as neck_problems
-from sfms_robot.config.mapping import Coupling, Expression, Fold, Region
-from sfms_robot.config.named_bus import Bus
-from sfms_robot.config.safety_rules import Faults, Safety
 from sfms_robot.data import find
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import LATERAL_POSE, Doubles
 
 VERSION: Final = 1  # of a head's file
-Share = Annotated[float, Field(ge=0, le=1)]
-NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # what a twin does not take over
+NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # keys that a twin does not take over
+TRAVEL: Final = 0.2  # of a joint that is to be calibrated first, around rest
+PACE: Final = 0.3
+_SUFFIX: Final = "_calibrate_first"
 
 
 class CameraMount(Model):
-    """A camera and where it looks; axes are the head's, x forward, y left, z up.
+    """A camera and its direction; axes are the head's, x forward, y left, z up.
 
     Attributes:
         on: `head` moves with the neck; `base` stays.
@@ -61,7 +70,7 @@ class Gaze(Model):
 
     @property
     def full_rad(self) -> Doubles:
-        """Return the eye's yaw and pitch (2,) for a channel of 1."""
+        """Yaw and pitch (2,) of the eye for a channel of 1."""
         return np.radians([self.full_yaw_deg, self.full_pitch_deg])
 
 
@@ -84,11 +93,11 @@ class Idle(Model):
 
 
 class Person(Model):
-    """Looking at whom the head listens to, and away as people do.
+    """Looking at the person that the head listens to, and away as people do.
 
     Attributes:
-        head_share: of the direction to a person, what the neck turns; the eyes keep the rest. A head that is given no
-            gaze turns its neck all the way.
+        head_share: of the direction to a person, the part that the neck turns; the eyes keep the rest. A head that is
+            given no gaze turns its neck all the way.
         look_away: how often the head looks away, people being 1; 0 is never.
     """
 
@@ -97,7 +106,7 @@ class Person(Model):
 
 
 class Life(Model):
-    """All are optional; a section that is left out does nothing."""
+    """Spontaneous motion. All sections are optional; one that is left out does nothing."""
 
     gaze: Gaze | None = None
     idle: Idle | None = None
@@ -130,7 +139,7 @@ class RobotDescription(Model):
     @model_validator(mode="before")
     @classmethod
     def _short(cls, value: Any) -> Any:
-        """`urdf: FILE`, and `jaw: JawJoint` under joints."""
+        """Accept `urdf: FILE`, and `jaw: JawJoint` under joints."""
         if isinstance(value, str):
             return {"file": value}
         if isinstance(value, dict) and isinstance(joints := value.get("joints"), dict):
@@ -143,14 +152,14 @@ class Head(Model):
     """A head: `configs/heads/NAME/head.yaml`.
 
     `calibrate_first`: zeros and ranges differ from build to build, so that on real servos the head moves little and
-    slowly until somebody has measured them.
+    slowly until they have been measured.
     """
 
     version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
     name: Name
     description: str
     calibrate_first: bool = False
-    buses: Annotated[dict[Name, Bus], Field(min_length=1)]
+    buses: Annotated[dict[Name, BusConfig], Field(min_length=1)]
     limits: dict[Name, LimitClass]
     safety: Safety = Safety()
     faults: Faults = Faults()
@@ -168,7 +177,7 @@ class Head(Model):
 
     @property
     def folder(self) -> Path | None:
-        """Where its file lies; None for a head that was made otherwise."""
+        """Folder of its file; None for a head that was made otherwise."""
         return self._folder
 
     @model_validator(mode="before")
@@ -178,12 +187,7 @@ class Head(Model):
 
     @model_validator(mode="after")
     def _consistent(self) -> Head:
-        found = wiring(self.joints, self.buses, self.limits) + rates(self.joints, self.buses)
-        found += problems(self.joints, self.expressions, self.couplings, self.folds, self.regions)
-        if self.kinematics is not None:
-            found += neck_problems(self.kinematics, self.joints, self.folds)
-        found += description_problems(self.urdf, self.joints)
-        if found:
+        if found := problems(self):
             more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
             raise ValueError(found[0] + more)
         return self
@@ -198,27 +202,9 @@ class Head(Model):
 def load_head(name: str) -> Head:
     """Return a head by shipped name or folder. Raises ConfigError."""
     folder = find("heads", name, "head.yaml")
-    file = folder / "head.yaml"
-    head = load(Head, file)
+    head = load(Head, folder / "head.yaml")
     head._folder = folder
     return head
-
-
-def description_problems(description: RobotDescription | None, joints: Collection[str]) -> list[str]:
-    """Return the joints of the description that the head has not, and those of the URDF that two of ours would move."""
-    if description is None:
-        return []
-    known = ", ".join(joints)
-    found = [
-        f"urdf.joints: {name!r} is not a joint of this head ({known})"
-        for name in description.joints
-        if name not in joints
-    ]
-    owner: dict[str, str] = {}
-    for name, follows in description.joints.items():
-        if owner.setdefault(follows.joint, name) != name:
-            found.append(f"urdf.joints.{name}.joint = {follows.joint!r} already follows {owner[follows.joint]}")
-    return found
 
 
 def expanded(raw: Any) -> Any:
@@ -228,7 +214,7 @@ def expanded(raw: Any) -> Any:
     roll, yaw and y, which have one channel for both sides, change sign. A joint whose plus points to the same side of
     the head as that of its twin (pan, say) is of the opposite sense: its drive, and its range, are negated as well.
 
-    A value of the wrong type stays as it is, for the models to refuse. Raises ValueError for a newer version.
+    A value of the wrong type stays unchanged, for the models to refuse. Raises ValueError for a newer version.
     """
     if not isinstance(raw, dict):
         return raw
@@ -256,3 +242,97 @@ def _seen_in_mirror(twin: dict[str, Any], sense: Any) -> dict[str, Any]:
         if isinstance(twin.get(other), (int, float)):
             out[key] = -twin[other]
     return out
+
+
+def held_back(head: Head, joints: Collection[str] | None = None) -> Head:
+    """Return the head with `joints` (all of them by default) at 20 % of their travel and 0.3 of their limits.
+
+    Servo horns sit differently on every build, so a face that moves as its file says may drive a lip into the teeth.
+    A joint whose zero and range have not been measured therefore keeps near its rest and moves slowly.
+    """
+    names = head.joints if joints is None else joints
+    limits, held = dict(head.limits), dict(head.joints)
+    for name in names:
+        joint, rest = head.joints[name], head.joints[name].rest_deg
+        slow = {key: PACE * value for key, value in head.limits[joint.limits]}
+        limits[joint.limits + _SUFFIX] = LimitClass(**slow)
+        ends = {"min_deg": rest + TRAVEL * (joint.min_deg - rest), "max_deg": rest + TRAVEL * (joint.max_deg - rest)}
+        held[name] = joint.model_copy(update={**ends, "limits": joint.limits + _SUFFIX})
+    return head.model_copy(update={"limits": limits, "joints": held})
+
+
+# --- Drives: every joint's own as one plain expression, with sharing, mirrors and folds worked out ------------------
+
+
+def drives(head: Head) -> dict[str, Expression | None]:
+    """Return the drive of every joint in terms of channels alone; None for a joint without one."""
+    # A mirror that has learnt a drive of its own does not look at its twin's.
+    mirrors = {name for name, joint in head.joints.items() if joint.mirror_of is not None and joint.drive is None}
+    found = {name: _own(name, joint.drive, head) for name, joint in head.joints.items() if name not in mirrors}
+    for name in mirrors:
+        joint = head.joints[name]
+        twin = found[joint.mirror_of or ""]
+        seen = mirrored(twin) if twin else None
+        if seen and joint.mirror_sense == "opposite":
+            seen = Expression(sum=(seen,), gain=-1)
+        found[name] = _own(name, seen, head)
+    return {name: found[name] for name in head.joints}
+
+
+def _own(name: str, drive: Expression | None, head: Head) -> Expression | None:
+    folds = tuple(Expression(channel=fold.channel, gain=fold.gain) for fold in head.folds if fold.into == name)
+    terms = ((_inlined(drive, head.expressions),) if drive else ()) + folds
+    return Expression(sum=terms) if folds else terms[0] if terms else None
+
+
+def _inlined(node: Expression, expressions: Mapping[str, Expression]) -> Expression:
+    """Return the expression with every shared one in the place of its name."""
+    if node.use is not None:
+        shared = _inlined(expressions[node.use], expressions)
+        plain = node.model_copy(update={"use": None})
+        return shared if node == Expression(use=node.use) else plain.model_copy(update={"sum": (shared,)})
+    if node.group is None:
+        return node
+    return node.model_copy(update={node.group: tuple(_inlined(part, expressions) for part in node.parts)})
+
+
+def mirrored(node: Expression) -> Expression:
+    """Return the expression of the other side of the face."""
+    if node.channel in LATERAL_POSE:
+        turned = Expression(channel=node.channel, gain=-1)
+        return node.model_copy(update={"channel": None, "sum": (turned,)})
+    if node.channel is not None:
+        return node.model_copy(update={"channel": other_side(node.channel)})
+    assert node.group is not None
+    return node.model_copy(update={node.group: tuple(mirrored(part) for part in node.parts)})
+
+
+def other_side(channel: str) -> str:
+    """Return the channel with left and right exchanged."""
+    for side, other in (("Left", "Right"), ("Right", "Left")):
+        if channel.endswith(side):
+            return channel.removesuffix(side) + other
+    return channel
+
+
+class StoredRegisters(Model):
+    """The registers and supply of an emulated head's servos: `configs/heads/NAME/emulate.yaml`.
+
+    In a real head homing offsets, limits and the like have been written into the servos before; emulated ones get them
+    from here. `registers` holds for every servo of the head, `joints` for one; raw values by register name.
+    """
+
+    source: str = ""
+    supply_v: Positive | None = None
+    registers: dict[Name, int] = Field(default_factory=dict)
+    joints: dict[Name, dict[Name, int]] = Field(default_factory=dict)
+
+    def of(self, joint: str) -> dict[str, int]:
+        """Return all registers stored in a joint's servo."""
+        return {**self.registers, **self.joints.get(joint, {})}
+
+
+def load_stored(head: str) -> StoredRegisters:
+    """Return the stored registers of a head, by shipped name or folder; without a file, those of a new servo."""
+    file = find("heads", head, "head.yaml") / "emulate.yaml"
+    return load(StoredRegisters, file) if file.is_file() else StoredRegisters()

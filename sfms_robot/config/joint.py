@@ -1,17 +1,229 @@
-"""One joint of a head: which servo moves it, how far and fast it may go, and what it follows."""
+"""Joints of a head: the servo and bus of each, its range and limits, its safety, and the drive that it follows.
+
+A drive is an `Expression`: one channel, one shared expression, or a sum, maximum, minimum, mean or product of
+expressions. The value of a node then passes, in this order, its dead band, curve, gain, offset and clamp. Couplings and
+regions apply to the results, in joint units: -1 = min, 0 = rest, +1 = max where the joint's `unit` is "range", radians
+from rest where it is "rad".
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, StrictInt, ValidationInfo, WithJsonSchema, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, Positive
-from sfms_robot.config.mapping import Expression
-from sfms_robot.config.safety_rules import Safety
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
+from sfms_robot.frames import CHANNEL_INDEX
+from sfms_robot.plugins import plugins
 
-Lag = Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)]  # ms; a plan's horizon is 320
+GROUPS: Final = ("sum", "max", "min", "mean", "product")
+KINDS: Final = ("channel", "use", *GROUPS)
+MOST_FACTORS: Final = 4
+SMALLEST_STEP: Final = 1e-6  # of a curve's x
+MEASURED_FAULTS: Final = ("input voltage", "overheating")  # a threshold may be given for these
+BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
+BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
+
+Gain = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]  # bounded: no drive can overflow
+Knob = Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)]
+Lag = Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)]  # ms; the horizon of a plan is 320
+
+
+class Expression(Model):
+    """A node of a drive. A bare name stands for `{channel: NAME}`, or `{use: NAME}` for a shared expression.
+
+    Attributes:
+        channel, use, sum, max, min, mean, product: exactly one of these; a product has at most four factors.
+        dead_band: values this near to 0 become 0, the others come nearer by as much.
+        curve: points (x, y), x rising; between them a monotone cubic (PCHIP), beyond them the last y.
+        gain: factor; `gain_up` and `gain_down` take its place above and below 0.
+        offset: added after the gain.
+        clamp: (low, high) of the result.
+    """
+
+    channel: str | None = None
+    use: str | None = None
+    sum: tuple[Expression, ...] | None = None
+    max: tuple[Expression, ...] | None = None
+    min: tuple[Expression, ...] | None = None
+    mean: tuple[Expression, ...] | None = None
+    product: tuple[Expression, ...] | None = None
+    dead_band: NonNegative = 0.0
+    curve: tuple[tuple[Gain, Gain], ...] | None = None
+    gain: Gain = 1.0
+    gain_up: Gain | None = None
+    gain_down: Gain | None = None
+    offset: Gain = 0.0
+    clamp: tuple[Finite, Finite] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bare_name(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"channel" if value in CHANNEL_INDEX else "use": value}
+        return value
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Expression:
+        kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(kinds) != 1:
+            raise ValueError(f"needs exactly one of {', '.join(KINDS)}; has {', '.join(kinds) or 'none'}")
+        if self.channel is not None:
+            _check_channel(self.channel)
+        if kinds[0] in GROUPS and not self.parts:
+            raise ValueError(f"{kinds[0]} is empty")
+        if self.product is not None and len(self.product) > MOST_FACTORS:
+            raise ValueError(f"product has {len(self.product)} factors, at most {MOST_FACTORS}")
+        if self.clamp is not None and self.clamp[0] >= self.clamp[1]:
+            raise ValueError(f"clamp {list(self.clamp)} is reversed or empty")
+        if self.curve is not None and len(self.curve) < 2:
+            raise ValueError(f"curve has {len(self.curve)} point, needs at least 2")
+        for (before, _), (after, _) in zip(self.curve or (), (self.curve or ())[1:], strict=False):
+            if after - before < SMALLEST_STEP:
+                raise ValueError(f"curve is not a function: x goes from {before:g} to {after:g}, it has to rise")
+        return self
+
+    @property
+    def parts(self) -> tuple[Expression, ...]:
+        """The nodes below; empty for a channel or a shared expression."""
+        return self.sum or self.max or self.min or self.mean or self.product or ()
+
+    @property
+    def group(self) -> str | None:
+        return next((kind for kind in GROUPS if getattr(self, kind) is not None), None)
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Factor below 0 and above 0."""
+        down = self.gain if self.gain_down is None else self.gain_down
+        return down, self.gain if self.gain_up is None else self.gain_up
+
+    def channels(self) -> set[str]:
+        """Return every channel below this node, without those of shared expressions."""
+        own = {self.channel} if self.channel else set[str]()
+        return own.union(*(part.channels() for part in self.parts))
+
+
+def _check_channel(name: str) -> None:
+    if name not in CHANNEL_INDEX:
+        raise ValueError(f"{name!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
+
+
+class Coupling(Model):
+    """A bound that joints keep together whatever their drives ask: sum of weight x joint >= at_least, in joint units.
+
+    Where the sum would be less, the joints under `moving` give way, the first as far as its range goes, then the next.
+    """
+
+    keep: Annotated[dict[Name, Gain], Field(min_length=2)]
+    at_least: Annotated[float, Field(le=0, ge=-1000)]  # at rest the sum is 0: rest has to be allowed
+    moving: Annotated[tuple[Name, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _can_move(self) -> Coupling:
+        for name in self.moving:
+            if not self.keep.get(name):
+                raise ValueError(f"moving: {name!r} has no weight under keep ({', '.join(self.keep)})")
+        if len(set(self.moving)) != len(self.moving):
+            raise ValueError(f"moving {list(self.moving)} has a joint twice")
+        return self
+
+
+class Fold(Model):
+    """A channel without a joint of its own, shown by another joint: `gain` x channel is added to that joint's drive."""
+
+    channel: str
+    into: Name
+    gain: Gain
+
+    @model_validator(mode="after")
+    def _known(self) -> Fold:
+        _check_channel(self.channel)
+        return self
+
+
+class Region(Model):
+    """Joints that are turned up and down together; both knobs run from 0 to 2 and start here.
+
+    Attributes:
+        joints: no joint is in two regions.
+        intensity: how far from rest everything goes; 0 is rest.
+        style: how much of the fine detail shows; 0 lets only large motions through, 2 doubles the small ones.
+    """
+
+    joints: Annotated[tuple[Name, ...], Field(min_length=1)]
+    intensity: Knob = 1.0
+    style: Knob = 1.0
+
+
+class LoadRule(Model):
+    """A present current above `current_mA` for `for_s` without a break, and the reaction of the joint."""
+
+    current_mA: Positive
+    for_s: Positive
+    then: Literal["hold", "limp", "reduce"] = "limp"
+
+
+class Safety(Model):
+    """Force limits of a joint, and its reaction when its servo reports a fault.
+
+    Attributes:
+        current_limit_mA: the servo never pushes harder; needs a servo with a current sensor.
+        torque_limit_percent: of the servo's full torque (its voltage, to be exact); for those without such a sensor.
+        on_fault: hold where it is, limp (torque off), reduce (half the force), or reboot and ease in again.
+        pinch: something is in the way. By default 60 % of the servo's own current limit for half a second: limp.
+        strain: a pose that takes force for long heats the servo and makes it sing. Off by default.
+        stop: at the end of a run, once at rest: torque off, or kept.
+        halt: in an emergency stop, once the joint stands: torque off, or kept. By default joints of the neck, which
+            bear its weight, keep it.
+        warm_C, hot_C: temperature from which the joint moves half as far, and from which it stays at rest.
+        registers: raw values written before torque comes on: gains, profiles and the like (`check.is_harmless`).
+        stored: raw values that have to be stored in the servo; compared before torque comes on, never written.
+    """
+
+    current_limit_mA: Positive | None = None
+    torque_limit_percent: Annotated[float, Field(gt=0, le=100)] | None = None
+    on_fault: Literal["hold", "limp", "reduce", "reboot_and_ease_in"] = "limp"
+    pinch: LoadRule | None = None
+    strain: LoadRule | None = None
+    stop: Literal["release", "hold"] = "release"
+    halt: Literal["release", "hold"] | None = None
+    warm_C: Positive = 60.0
+    hot_C: Positive = 67.0
+    registers: dict[Name, StrictInt] = Field(default_factory=dict)
+    stored: dict[Name, StrictInt] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _hot_is_warmer(self) -> Safety:
+        if self.hot_C <= self.warm_C:
+            raise ValueError(f"hot_C: {self.hot_C:g} is not above warm_C ({self.warm_C:g})")
+        return self
+
+    def merged(self, other: Safety | None) -> Safety:
+        """Return this, overridden by the keys that `other` gives explicitly."""
+        return self if other is None else self.model_copy(update={k: getattr(other, k) for k in other.model_fields_set})
+
+
+class Threshold(Model):
+    """A fault counts only when its measured value lies outside min..max (V for voltage, degC for heat)."""
+
+    min: Finite | None = None
+    max: Finite | None = None
+
+
+class Faults(Model):
+    """The servo faults that cause a reaction, by the names in the firmware map."""
+
+    mask: tuple[str, ...] = ()
+    thresholds: dict[str, Threshold] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _measurable(self) -> Faults:
+        for name in self.thresholds:
+            if name not in MEASURED_FAULTS:
+                raise ValueError(f"thresholds.{name} is about nothing that is measured ({', '.join(MEASURED_FAULTS)})")
+        return self
 
 
 class LimitClass(Model):
@@ -23,12 +235,12 @@ class LimitClass(Model):
 
 
 class Joint(Model):
-    """One joint: where it sits on a bus, how far and fast it may go, and what drives it.
+    """One joint: its place on a bus, how far and fast it may go, and its drive.
 
     Ticks = zero_ticks + sign * ratio * angle / (angle per tick of the servo). `drive` is in units of the range
     (-1 = min, 0 = rest, +1 = max) when `unit` is "range", in radians when it is "rad".
 
-    With `mirror_of` the joint takes over whatever it does not give itself from its twin on the other side, with the
+    With `mirror_of` the joint takes each value that it does not give itself from its twin on the other side, with the
     drive (and for `mirror_sense: opposite` the range) turned round; `sign` then differs when the sense is the same.
     """
 
@@ -74,7 +286,7 @@ class Joint(Model):
 
 
 class JointDefaults(Model):
-    """What every joint has that does not say otherwise."""
+    """Values of every joint that gives none itself."""
 
     bus: Name | None = None
     model: str | None = None
@@ -85,3 +297,44 @@ class JointDefaults(Model):
     limits: Name | None = None
     lag_ms: Lag | None = None
     unit: Literal["range", "rad"] | None = None
+
+
+def _family(name: str) -> str:
+    if name in BUS_FAMILIES:
+        return name
+    known = [*BUS_FAMILIES, *plugins(BUS_GROUP)]
+    if name not in known:
+        raise ValueError(f"is not a family of buses ({', '.join(known)})")
+    return name
+
+
+def _crc(crc: bool, info: ValidationInfo) -> bool:
+    if crc and info.data.get("family") != "maestro":
+        raise ValueError("expected false, as only a Maestro has this setting")
+    return crc
+
+
+class BusConfig(Model):
+    """One named bus of a head.
+
+    Attributes:
+        read_deadline_ms: a servo that does not answer for this long counts as silent.
+        fast_read: all servos answer in one packet; "auto" tries it at start.
+        watchdog_ms: of the servos' own watchdog; 0 leaves it off.
+        stagger_ms: between the torque of one servo and that of the next.
+        reconnect_s: a bus without any answer for this long has failed.
+        rs485: the direction of a half-duplex RS-485 driver is switched by the program through the RTS line (rts) or by
+            the driver (kernel); None for adapters that switch it themselves.
+        crc: a Maestro has "Enable CRC" on, and gets one with every command.
+    """
+
+    family: Annotated[str, AfterValidator(_family), WithJsonSchema({"enum": list(BUS_FAMILIES)})]
+    baud: Annotated[int, Field(gt=0)]
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
+    read_deadline_ms: Annotated[float, Field(gt=0, le=100)] = 3.0
+    fast_read: Literal["auto", "on", "off"] = "auto"
+    watchdog_ms: Annotated[int, Field(ge=0, le=2540)] = 200
+    stagger_ms: Annotated[float, Field(ge=0, le=1000)] = 5.0
+    reconnect_s: Positive = 30.0
+    rs485: Literal["rts", "kernel"] | None = None
+    crc: Annotated[bool, AfterValidator(_crc)] = False

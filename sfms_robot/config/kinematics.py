@@ -1,15 +1,12 @@
-"""How a head's neck turns a pose into joints: one section of a head's file, `kind: serial` or `kind: stewart`."""
+"""The neck of a head, which turns a pose into joints: one section of its file, `kind: serial` or `kind: stewart`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
-from sfms_robot.config.joint import Joint
-from sfms_robot.config.mapping import Fold
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share
 
 AxisName = Literal["roll", "pitch", "yaw"]
 Triple = tuple[Finite, Finite, Finite]
@@ -20,12 +17,12 @@ class Split(Model):
     """One axis shared by two joints in series: by a fixed share, or low frequencies to the lower one.
 
     `lower_share` is the lower joint's part, 0..1. With `crossover_hz` a one-pole low-pass of the angle goes to the
-    lower joint and the rest to the upper one. What one joint cannot take for its limits goes to the other.
+    lower joint and the rest to the upper one. The part beyond the limits of one joint goes to the other.
     """
 
     lower: Name
     upper: Name
-    lower_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    lower_share: Share | None = None
     crossover_hz: Positive | None = None
 
     @model_validator(mode="after")
@@ -66,7 +63,7 @@ AxisJoints = Annotated[Annotated[Name, Tag("joint")] | Annotated[Split, Tag("spl
 
 
 class SerialNeck(Model):
-    """Axes one on top of the other, from the base to the head; the angle of an axis is that of its joint."""
+    """A neck of axes one on top of the other, from the base to the head; an axis has the angle of its joint."""
 
     kind: Literal["serial"]
     order: Annotated[tuple[AxisName, ...], Field(min_length=1, max_length=3)]
@@ -88,7 +85,7 @@ class SerialNeck(Model):
         return self
 
     def joints(self) -> tuple[str, ...]:
-        """Every joint that the neck moves, from the base up; a differential's two at its first axis."""
+        """Return every joint that the neck moves, from the base up; a differential has its two at its first axis."""
         names: list[str] = []
         for axis in self.order:
             place = self.axes.get(axis)
@@ -111,7 +108,7 @@ class Leg(Model):
 
 
 class PoseLimits(Model):
-    """How far the head may lean against the body, whatever the legs could do."""
+    """Largest lean of the head against the body, also where the legs could reach farther."""
 
     roll_deg: Positive = 180.0
     pitch_deg: Annotated[float, Field(gt=0, lt=90)] = 89.0
@@ -150,7 +147,7 @@ class StewartPlatform(Model):
         return self
 
     def joints(self) -> tuple[str, ...]:
-        """Body yaw first where there is one, then the legs in order."""
+        """Return the joint of body yaw, if any, then those of the legs in order."""
         body = (self.body_yaw.joint,) if self.body_yaw else ()
         return (*body, *(leg.joint for leg in self.legs))
 
@@ -162,30 +159,3 @@ def _distinct(joints: tuple[str, ...]) -> None:
     for joint in joints:
         if joints.count(joint) > 1:
             raise ValueError(f"joint {joint!r} is used twice")
-
-
-def problems(
-    kinematics: Kinematics, joints: Mapping[str, Joint | None], folds: Sequence[Fold | None] = ()
-) -> list[str]:
-    """Everything in which the neck and the head's joints do not agree, one line each; parts wrong alone are None."""
-    found = []
-    for index, fold in enumerate(folds):
-        if fold is not None and fold.into in kinematics.joints():
-            found.append(f"folds.{index}.into = {fold.into!r}: the neck moves this joint (kinematics)")
-    for name in kinematics.joints():
-        if name not in joints:
-            found.append(f"kinematics: {name!r} is not a joint of this head ({', '.join(joints)})")
-        elif (joint := joints[name]) is not None:
-            if joint.drive is not None:
-                found.append(f"joints.{name}.drive: the neck moves this joint (kinematics), leave its drive out")
-            if isinstance(kinematics, SerialNeck):
-                found += _home(name, joint)
-    return found
-
-
-def _home(name: str, joint: Joint) -> list[str]:
-    if not joint.min_rad <= 0.0 <= joint.max_rad:
-        return [f"joints.{name}: its range leaves out 0, where the neck stands at home"]
-    if joint.rest_deg != 0:
-        return [f"joints.{name}.rest_deg = {joint.rest_deg:g}: the neck rests at 0; shift zero_ticks instead"]
-    return []

@@ -1,21 +1,62 @@
-"""A listener: what its folder's config.yaml holds."""
+"""A listener: the settings in its folder's config.yaml, and how often it does things."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, Positive
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, parse, read
 from sfms_robot.config.hop import default_hop
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, PITCH_CHANNEL, SMILE_CORNERS, SPACE_CHANNELS
 
 Count = Annotated[int, Field(ge=1)]
-Share = Annotated[float, Field(ge=0, le=1)]
+PerMinute = Annotated[float, Field(ge=0, le=60)]
+Levels = Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
 Placement = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
-GAZE_CHANNELS = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
+GAZE_CHANNELS: Final = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
+# Conversational states of ARIG (3.3), in the order of the model's classes.
+STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
+# Those of a listener with events: visible feedback, by its kind, apart from audible feedback.
+EVENT_STATES: Final = (*STATES, "giving_feedback_nod", "giving_feedback_smile")
+
+
+class Calmness(Model):
+    """Events a minute by kind: more is livelier, 0 is never, None is as people do.
+
+    A rate holds for a person in a meeting, who is looked at some of the time. A head that is addressed and looked at
+    nods more often, one that is not nods less often.
+
+    Attributes:
+        nod, shake, tilt: of the head. Its own nods included, a head nods a tenth more often than the rate: 2.0 are
+            people's 2.2. Nods, shakes, smiles, laughs, brows and "mm-hm" only come while listening.
+        gaze_shift: looks away from the person; each is followed by a look back.
+        addressed: sense: the person's attention decides whether the head is addressed, and without any face it is;
+            assume: it always is; never: it never is.
+    """
+
+    nod: PerMinute | None = 2.0
+    shake: PerMinute | None = None
+    tilt: PerMinute | None = None
+    laugh: PerMinute | None = None
+    smile: PerMinute | None = None
+    mm_hm: PerMinute | None = None
+    brow_raise: PerMinute | None = None
+    blink: PerMinute | None = None
+    gaze_shift: PerMinute | None = None
+    addressed: Literal["sense", "assume", "never"] = "sense"
+
+    def per_minute(self, kind: str) -> float | None:
+        """Return the rate of one of `frames.EVENT_KINDS`; None: as people do."""
+        rate: float | None = getattr(self, kind)
+        return rate
 
 
 class ChannelGroup(Model):
@@ -28,7 +69,7 @@ class ChannelGroup(Model):
     """
 
     channels: Annotated[tuple[str, ...], Field(min_length=1)]
-    levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
+    levels: Levels
     keyframes: Count | None = None
     keyframe_cost: Positive | None = None
     transition_bias: Finite = 0.0
@@ -39,11 +80,11 @@ class ChannelGroup(Model):
 
 
 class SmileCourse(Model):
-    """How a smile that is told goes (`listeners.sfms.courses`), in shares of its size; found in training dyads.
+    """The course of a decided smile (`listeners.sfms.courses`), in shares of its size, from training dyads.
 
     Attributes:
         rise: at `RISE_S` after its beginning. fall: `FALL_S` before its end.
-        spread: deviation of the corners of a mouth (0 to 1) from that which is left to what the predictor draws.
+        spread: deviation of the corners of a mouth (0 to 1) from the course that is left to the predictor.
     """
 
     RISE_S: ClassVar[tuple[float, ...]] = (0.0, 0.12, 0.24, 0.36, 0.48, 0.6, 0.72, 0.96)
@@ -62,11 +103,11 @@ class SmileCourse(Model):
 
 
 class NodCourse(Model):
-    """How a nod that is told goes (`listeners.sfms.courses`), in shares of its size.
+    """The course of a nod that has been decided (`listeners.sfms.courses`), in shares of its size.
 
     Attributes:
-        fall: how large each swing is beside the one before it; found in training dyads.
-        spread: deviation, where swings turn, that is left to what the predictor draws.
+        fall: size of each swing relative to the one before it, from training dyads.
+        spread: deviation, where swings turn, that is left to the predictor.
     """
 
     spread: Positive
@@ -74,15 +115,15 @@ class NodCourse(Model):
 
 
 class Sampling(Model):
-    """How tokens are drawn and shown.
+    """Settings of drawing and showing tokens.
 
     Attributes:
         seam_frames: over these a plan fades into the motion before it.
         smoothing: how far the head moves from each frame toward the mean of the two beside it, 0 to 1: motion between
-            coarse codes has corners, which servos would make heard. 0 is the paper.
-        reach: may a code follow another only as fast as faces moved in training (`listeners.sfms.reachable`)? The paper
-            has no such rule.
-        nod, smile: the course that they keep to, of a listener with `events`; None: the predictor's own.
+            coarse codes has corners, which make servos audible. 0 is the paper.
+        reach: a code follows another only as fast as faces moved in training (`listeners.sfms.reachable`). Not in
+            the paper.
+        nod, smile: their courses, of a listener with `events`; None: those of the predictor.
     """
 
     temperature: Positive = 1.0
@@ -95,14 +136,14 @@ class Sampling(Model):
 
 
 def check_heads(heads: int, **widths: int) -> None:
-    """Raises ValueError for a width, by its key, that cannot be cut into `heads` heads of even width."""
+    """Raise ValueError for a width, by its key, that cannot be cut into `heads` heads of even width."""
     for key, width in widths.items():
         if width % (2 * heads):
             raise ValueError(f"{key} {width} is not a multiple of twice heads ({heads})")
 
 
 class Scores(Model):
-    """The network that ranks keyframes, of the learned placements. `sweeps`: rounds of second thoughts of `learned`."""
+    """The network that ranks keyframes, of the learned placements. `sweeps`: rounds of corrections of `learned`."""
 
     width: Count = 32
     layers: Count = 2
@@ -116,16 +157,16 @@ class Scores(Model):
 
 
 class Listener(Model):
-    """What every family of listeners says of itself: `configs/listeners/NAME/config.yaml`.
+    """Settings of every kind of listener: `configs/listeners/NAME/config.yaml`.
 
     Attributes:
-        motion_space: what the model works in (`frames.SPACE_CHANNELS`); plans are `FaceFrame`s whatever it is.
+        motion_space: channels of the model (`frames.SPACE_CHANNELS`); plans are `FaceFrame`s in any space.
         neutral: face at rest in that space, one number per channel; None: the space's own.
         metres_per_unit: scale of the space's translation; None: it has none and is left out.
         flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
-        events: is it told of nods, smiles and blinks that were decided elsewhere (`signals.control`)? Then it draws
-            everything but gaze: not the eyes' direction, nor the head's part of it, which follow it by kinematics.
-        sway: is slow motion of the head a process of its own (`listeners.sway`), not drawn by the model? Needs events.
+        events: the model is given nods, smiles and blinks decided elsewhere (`signals.control`). It then draws
+            everything but gaze: neither the direction of the eyes nor the head's part of it, which are kinematics.
+        sway: slow motion of the head is a separate process (`listeners.sway`), not drawn by the model. Needs events.
     """
 
     kind: str
@@ -143,7 +184,7 @@ class Listener(Model):
 
     @property
     def drawn_channels(self) -> tuple[str, ...]:
-        """Those that the model draws; the others stay 0."""
+        """Channels that the model draws; the others stay 0."""
         return tuple(name for name in self.channels if not (self.events and name in GAZE_CHANNELS))
 
     @model_validator(mode="after")
@@ -163,19 +204,19 @@ class Sfms(Listener):
     `groups` are written out, or named as a whole: `{preset: one|four|all, levels: [...], keyframes: k}`.
 
     Attributes:
-        hop: frames between plans; auto: chosen at the start of a run by what is measured (`hop.choose_hop`), and
-            `default_hop` where nothing is.
+        hop: frames between plans; auto: chosen at the start of a run from measurements (`hop.choose_hop`), and
+            `default_hop` without them.
         audio: features of the voice: mel (4 rows of 128 per frame, aligned by convolution and max-pool), mfcc78 or
             wav2vec2 (768), one row per frame.
         wav2vec2: folder of a model in the layout of transformers, beside config.yaml or absolute; only streams need it.
-        phase: is the speaker's place in a phrase an input? Beyond the paper; it reaches back further than 40 frames.
-        sequential: does each frame know the keyframes drawn before it? Beyond the paper, which draws 8 in parallel.
+        phase: the speaker's place in a phrase is an input. Beyond the paper; it reaches back further than 40 frames.
+        sequential: each frame knows the keyframes drawn before it. Beyond the paper, which draws 8 in parallel.
         placement: where keyframes go (`listeners.sfms.placement`); max_gap_frames bounds `exact` and `penalised`.
         ramp_frames: motion toward a keyframe begins so many frames before it at most; the one before is held till then;
             None: a straight line all the way, the paper's, which a stream cannot know beyond its plan.
         quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq); either has a group's number of
             codes, the product of its levels.
-        inpainter: added to straight lines (residual), or all by itself (paper).
+        inpainter: added to straight lines (residual), or in place of them (paper).
         tokenizer_layers: transformer blocks in each of the inpainter's three parts.
     """
 
@@ -244,12 +285,12 @@ class Sfms(Listener):
 
     @property
     def smiling_group(self) -> str | None:
-        """The group that holds both corners of the mouth; None: there is none."""
+        """Name of the group that holds both corners of the mouth, or None."""
         return next((name for name, group in self.groups.items() if {*SMILE_CORNERS} <= {*group.channels}), None)
 
     @property
     def nodding_group(self) -> str:
-        """The group that turns the head up and down."""
+        """Name of the group that turns the head up and down."""
         pitch = PITCH_CHANNEL[self.motion_space]
         return next(name for name, group in self.groups.items() if pitch in group.channels)
 
@@ -263,7 +304,7 @@ class Sfms(Listener):
 
 
 def preset_groups(space: str, wanted: dict[str, Any]) -> dict[str, Any]:
-    """Groups of channels by the number of keyframe sets: one, four (neck, brows, eyes, mouth and jaw), or all.
+    """Return groups of channels by the number of keyframe sets: one, four (neck, brows, eyes, mouth and jaw), or all.
 
     Raises ValueError for an unknown preset, key or space.
     """
@@ -291,3 +332,154 @@ def _part(channel: str) -> str:
     if channel not in BLENDSHAPES:
         return "neck"
     return "brows" if channel.startswith("brow") else "eyes" if channel.startswith("eye") else "mouth"
+
+
+def paper_state(state: int) -> int:
+    """Return a state of `EVENT_STATES` as one of the paper's seven."""
+    return min(state, len(STATES) - 1)
+
+
+def _both(value: Any) -> Any:
+    return (value, value) if isinstance(value, int | float) else value
+
+
+Temperature = Annotated[tuple[NonNegative, NonNegative], BeforeValidator(_both)]  # first and last; one number is both
+
+
+class Diffusion(Model):
+    """The DiffusionMLP and how it is sampled.
+
+    Attributes:
+        width: of its condition and blocks; the paper takes that of its motion, 262.
+        train_steps: noise levels in training.
+        steps: of them used to sample one frame, spread evenly.
+        sampler: `ddpm` is the paper's (4); `ddim` adds no noise between steps, which suits few of them.
+        temperature: factor on the noise that is added between steps; two: after the first step and before the last,
+            evenly in between. Early noise decides what happens, late noise is jitter.
+        temperatures: the same, in its place, for channels whose names begin so: `{eye: 1.1}`; the first that fits.
+        clamp: every estimate of the clean motion is kept within the range of the data; (4) does not.
+    """
+
+    width: Annotated[int, Field(ge=2, multiple_of=2)] = 262
+    blocks: Count = 3
+    train_steps: Annotated[int, Field(ge=2)] = 1000
+    steps: Count = 15
+    sampler: Literal["ddpm", "ddim"] = "ddpm"
+    temperature: Temperature = (1.0, 1.0)
+    temperatures: dict[str, Temperature] = {}
+    clamp: bool = True
+
+    def temperature_of(self, channel: str) -> tuple[float, float]:
+        fits = (value for prefix, value in self.temperatures.items() if channel.startswith(prefix))
+        return next(fits, self.temperature)
+
+    @model_validator(mode="after")
+    def _fits(self) -> Diffusion:
+        if self.steps > self.train_steps:
+            raise ValueError(f"steps {self.steps} is above train_steps {self.train_steps}")
+        return self
+
+
+class Arig(Listener):
+    """Frame-wise autoregression with a diffusion head.
+
+    Attributes:
+        sound: `mel` (4 rows of 128 per frame) or `wav2vec2` (768 per frame, brought with the data: trains, never runs).
+        phase: each track's place in a phrase (`signals.phase`) is an input beside its sound. Beyond the paper; it
+            reaches back further than a short context.
+        width, feedforward: of every block; heads: of every attention.
+        chunk_frames: c of the paper; context_chunks: w (4: ablation "w/o long-range context").
+        bidirectional_layers: 2 in the paper; integrated_layers, context_layers: the paper leaves them open.
+        sound_frames: of the agent, that the coarse motion looks at; motion_frames: that the temporal layer looks at.
+        state_guidance: false leaves the conversational states out; visual: false leaves motion out of the behaviours;
+            interaction: `linear` puts plain layers in place of bidirectional-integrated learning;
+            discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4), codes of `motion`
+            itself: what codes of steps get wrong would add up.
+        draws: target of the sampler: the `motion` of a frame, as in the paper; the `step` from the frame before, whose
+            errors are small where a face is still, but add up; or the `innovation` of a first-order autoregression
+            fitted on the data, a step that is forgotten as fast as people's motion returns to its mean.
+        precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
+    """
+
+    kind: Literal["arig"]
+    sound: Literal["mel", "wav2vec2"] = "mel"
+    phase: bool = True
+    width: Count = 512
+    feedforward: Count = 2048
+    heads: Count = 8
+    chunk_frames: Count = 6
+    context_chunks: Annotated[int, Field(ge=2)] = 512
+    bidirectional_layers: Count = 2
+    integrated_layers: Count = 1
+    context_layers: Count = 4
+    sound_frames: Count = 3
+    motion_frames: Count = 5
+    state_guidance: bool = True
+    visual: bool = True
+    interaction: Literal["bidirectional", "linear"] = "bidirectional"
+    discrete: bool = False
+    code_levels: Levels = (8, 5, 5, 5)
+    draws: Literal["motion", "step", "innovation"] = "motion"
+    diffusion: Diffusion = Diffusion()
+    precision: Literal["auto", "fp32", "int8"] = "auto"
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Arig:
+        check_heads(self.heads, width=self.width)
+        if self.discrete and self.draws != "motion":
+            raise ValueError(f"discrete: true is of draws: motion, not {self.draws}")
+        if self.events and self.motion_space != "arkit58":
+            raise ValueError(f"events: true needs motion_space arkit58, not {self.motion_space}")
+        for prefix in self.diffusion.temperatures:
+            if not any(channel.startswith(prefix) for channel in self.channels):
+                raise ValueError(f"diffusion.temperatures.{prefix}: no channel of {self.motion_space} begins so")
+        return self
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Conversational states that the model distinguishes."""
+        return EVENT_STATES if self.events else STATES
+
+
+@dataclass(frozen=True)
+class ListenerKind:
+    """A kind of listener that a folder may hold. Listeners of other packages are no folders of ours: see `plugins`.
+
+    Attributes:
+        settings: the model of config.yaml.
+        package: of the kind, imported when such a listener is loaded; it has `load` and `export_graphs`.
+    """
+
+    settings: type[Listener]
+    package: str
+
+    def load_folder(self, folder: Path, engine: str = "auto", threads: int | None = None) -> Any:
+        """Return the listener of a folder (`ports.BatchListener`), computed by `engine` (`engine.EngineName`).
+
+        Raises ConfigError or ModelError.
+        """
+        return import_module(self.package).load(folder, engine, threads)
+
+    def export_folder(self, folder: Path, out: Path, int8: bool) -> list[Path]:
+        """Write ONNX graphs of a folder's networks below `out`, in 8 bits too; return the files written."""
+        files: list[Path] = import_module(self.package).export_graphs(folder, out, int8)
+        return files
+
+
+LISTENER_KINDS: Final[Mapping[str, ListenerKind]] = {
+    "sfms": ListenerKind(Sfms, "sfms_robot.listeners.sfms"),
+    "arig": ListenerKind(Arig, "sfms_robot.listeners.arig"),
+}
+
+
+def load_listener(file: Path) -> Listener:
+    """Read one listener's YAML file, of any kind. Raises ConfigError."""
+    return parse_listener(read(file), file)
+
+
+def parse_listener(raw: Any, file: Path | str) -> Listener:
+    """Validate plain data of a listener. Raises ConfigError."""
+    name = str(raw.get("kind")) if isinstance(raw, dict) else ""
+    if name not in LISTENER_KINDS:
+        raise ConfigError.at(file, "kind", name, "is not a kind of listener", LISTENER_KINDS)
+    return parse(LISTENER_KINDS[name].settings, raw, file)

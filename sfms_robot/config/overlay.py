@@ -1,12 +1,12 @@
-"""What is known of one built head, laid over its shipped file: `$XDG_CONFIG_HOME/sfms-robot/heads/NAME.yaml`.
+"""Measurements of one built head, laid over its shipped file: `$XDG_CONFIG_HOME/sfms-robot/heads/NAME.yaml`.
 
-Two builds of a head differ in their zeros, ranges and directions, and in how their skin answers. Nobody edits the
-shipped file for that; each layer of the overlay replaces what it is about, always in this order:
+Two builds of a head differ in their zeros, ranges and directions, and in how their skin answers. These differences are
+kept apart from the shipped file, in layers that are applied in this order:
 
-    head file -> calibrate (zero, ends and direction of each joint) -> stored (what a servo stores, as confirmed)
+    head file -> calibrate (zero, ends and direction of each joint) -> stored (registers of a servo, as confirmed)
               -> fit (drives learnt from sight)
 
-A measurement holds for the servo and the head file that it was made with. Where one of them is another by now, the
+A measurement holds for the servo and the head file that it was made with. Where one of them has changed since, the
 joint counts as not calibrated.
 """
 
@@ -19,19 +19,16 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import yaml
 from pydantic import Field, model_validator
 
-from sfms_robot.config.base import Model, Name, load, parse
+from sfms_robot.config.base import Model, Name, load, parse, read, with_number
 from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import Head, load_head
-from sfms_robot.config.joint import Joint
-from sfms_robot.config.mapping import Expression
-from sfms_robot.config.safety_rules import Safety
-from sfms_robot.config.yaml_file import with_number
+from sfms_robot.config.head import NOT_SHARED, Head, load_head
+from sfms_robot.config.joint import Expression, Joint, Safety
 from sfms_robot.data import data_dir, find
 from sfms_robot.errors import ConfigError
 
@@ -44,7 +41,7 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Identity(Model):
-    """Which servo it is. None where the family does not tell; `drive_mode` holds the direction bit alone."""
+    """Identity of a servo. None where the family does not report it; `drive_mode` holds the direction bit alone."""
 
     id: Annotated[int, Field(ge=0, le=253)]
     model: str
@@ -54,12 +51,12 @@ class Identity(Model):
 
     @property
     def stored(self) -> dict[str, int]:
-        """What a measurement of zero and direction declares to be stored in the servo."""
+        """Registers that a measurement of zero and direction declares to be stored in the servo."""
         known = {"homing_offset": self.homing_offset, "drive_mode": self.drive_mode}
         return {name: value for name, value in known.items() if value is not None}
 
     def difference(self, now: Identity) -> str | None:
-        """What is another now, or None."""
+        """Return the first difference to `now` in words, or None."""
         for key in Identity.model_fields:
             was, is_ = getattr(self, key), getattr(now, key)
             if was != is_:
@@ -68,7 +65,7 @@ class Identity(Model):
 
 
 class Measured(Identity):
-    """One joint as somebody has found it, in servo ticks; `sign` +1: ticks rise towards the joint's upper end."""
+    """Measurement of one joint in servo ticks; `sign` +1: ticks rise towards the joint's upper end."""
 
     date: date
     min_ticks: int
@@ -105,7 +102,7 @@ class StoredLayer(Model):
 
 
 class Fitted(Model):
-    """The drive that takes the place of a joint's own."""
+    """A learnt drive, which replaces that of the joint."""
 
     drive: Expression
 
@@ -128,7 +125,7 @@ class Overlay(Model):
     fit: FitLayer | None = None
 
     def confirmed(self, sha256: str) -> dict[str, dict[str, int]]:
-        """Return what is recorded as stored in servos, by joint, for a head file of this hash."""
+        """Return the registers recorded as stored in servos, by joint, for a head file of this hash."""
         return self.stored.joints if self.stored is not None and self.stored.head_sha256 == sha256 else {}
 
     def recorded(self, sha256: str, joint: str, stored: Mapping[str, int]) -> Overlay:
@@ -162,17 +159,17 @@ def config_folder() -> Path:
 
 
 def overlay_file(head: str, practice: bool = False) -> Path:
-    """Where the overlay of a head lies; what is practised on emulated servos lies beside it and is never used."""
+    """Return the file of a head's overlay; `practice`: that of emulated servos, beside it, which is never used."""
     return config_folder() / "heads" / (f"{head}.practice.yaml" if practice else f"{head}.yaml")
 
 
 def head_hash(name: str) -> str:
-    """SHA-256 of a head's file, by shipped name or folder."""
+    """Return the SHA-256 of a head's file, by shipped name or folder."""
     return hashlib.sha256((find("heads", name, "head.yaml") / "head.yaml").read_bytes()).hexdigest()
 
 
 def load_overlay(head: Head, file: Path | None = None) -> Overlay:
-    """Empty when there is none. Raises ConfigError for one of another head, or with joints that this one lacks."""
+    """Return a head's overlay, empty without a file. Raises ConfigError for another head's, or for unknown joints."""
     file = file or overlay_file(head.name)
     if not file.is_file():
         return Overlay(head=head.name)
@@ -233,9 +230,11 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
         notes.append(f"the fit of {fit.date} is not used: {OLD_FILE}")
     elif fit is not None:
         fitted = frozenset(fit.joints)
-        joints |= {name: joints[name].model_copy(update={"drive": fit.joints[name].drive}) for name in fitted}
-        if found_wrong := problems(joints, head.expressions, head.couplings, head.folds, head.regions):
-            raise ConfigError(f"{overlay_file(head.name)}: fit: {found_wrong[0]}")
+        drives = {name: {"drive": fit.joints[name].drive} for name in fitted}
+        checked = {name: head.joints[name].model_copy(update=drive) for name, drive in drives.items()}
+        if wrong := problems(head.model_copy(update={"joints": {**head.joints, **checked}})):
+            raise ConfigError(f"{overlay_file(head.name)}: fit: {wrong[0]}")
+        joints |= {name: joints[name].model_copy(update=drive) for name, drive in drives.items()}
     holds = frozenset(measured) - frozenset(refused)
     return Layered(head.model_copy(update={"joints": joints}), holds, refused, fitted, tuple(notes))
 
@@ -250,9 +249,9 @@ def _another(found: Measured, joint: Joint, servos: Mapping[str, Identity | None
 
 
 def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Joint:
-    """Return the joint with measured zero, direction and ends; its rest keeps its angle, and is where the centre is.
+    """Return the joint with measured zero, direction and ends; its rest keeps its angle, at the measured centre.
 
-    `usual`: that of the head, under the joint's own.
+    `usual`: safety of the head, which that of the joint overrides.
     """
     ticks_per_deg = found.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
     zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
@@ -269,7 +268,7 @@ def declared(joint: Joint, stored: Mapping[str, int], usual: Safety) -> Joint:
 
 
 def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bool = False) -> Path:
-    """Declare in the file of head `name` all that the servo of a joint stores; return the file that was written.
+    """Record in the file of head `name` the registers that the servo of a joint stores; return the file written.
 
     The head.yaml of the user is edited. The overlay is written instead for a shipped head, for one that has an overlay
     (an edit would end its measurements), for a file that cannot be written, and for one whose form (an alias, a twin)
@@ -291,3 +290,53 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
                 return own
     save_overlay(load_overlay(head, file).recorded(head_hash(name), joint, stored), file)
     return file
+
+
+# --- Origin of each value: its own line, its twin, the head's defaults, or nowhere; then this build -------------------
+
+SHOWN: Final = (
+    "bus", "id", "model", "zero_ticks", "sign", "ratio", "min_deg", "rest_deg", "max_deg", "limits", "lag_ms", "unit",
+    "drive",
+)  # fmt: skip
+MEASURED: Final = ("zero_ticks", "sign", "min_deg", "max_deg")  # given by a calibration
+
+
+def provenance(name: str) -> dict[str, dict[str, tuple[Any, str]]]:
+    """Return the value and its origin per joint and key.
+
+    Measurements count here whichever servos are plugged in now. Raises ConfigError for a head that is not sound.
+    """
+    head = load_head(name)
+    raw = read(find("heads", name, "head.yaml") / "head.yaml")
+    overlay = load_overlay(head)
+    layers = layered(head, overlay, head_hash(name))
+    measured = overlay.calibrate.joints if overlay.calibrate is not None else {}
+    found: dict[str, dict[str, tuple[Any, str]]] = {}
+    for joint, config in layers.head.joints.items():
+        origins = {key: _origin(key, head.joints[joint], raw["joints"][joint], raw) for key in SHOWN}
+        if joint in layers.calibrated:
+            origins |= dict.fromkeys(MEASURED, f"{CALIBRATE} {measured[joint].date}")
+        if joint in layers.fitted and overlay.fit is not None:
+            origins |= {"drive": f"{FIT} {overlay.fit.date}"}
+        values = {key: getattr(config, key) for key in SHOWN}
+        if isinstance(drive := values["drive"], Model):
+            values["drive"] = drive.model_dump(mode="json", exclude_defaults=True)
+        found[joint] = {key: (values[key], origins[key]) for key in SHOWN}
+    return found
+
+
+def refusals(name: str) -> list[str]:
+    """Return one line for each measurement and fit that is there and does not hold."""
+    head = load_head(name)
+    layers = layered(head, load_overlay(head), head_hash(name))
+    return [f"{joint}: its calibration does not hold: {why}" for joint, why in layers.refused.items()] + [*layers.notes]
+
+
+def _origin(key: str, config: Joint, own: Mapping[str, Any], raw: Mapping[str, Any]) -> str:
+    if key in own:
+        return "head file"
+    twin = config.mirror_of
+    shared = key not in NOT_SHARED or key == "drive"
+    if twin is not None and shared and (key in raw["joints"][twin] or key == "sign"):
+        return f"mirror of {twin}"
+    return "joint_defaults" if key in (raw.get("joint_defaults") or {}) else "built in"

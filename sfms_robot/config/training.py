@@ -1,7 +1,4 @@
-"""How listeners are trained: what every phase of training shares, the two phases of SFMS, and the one of ARIG.
-
-The tokenizers of the comparison tables come last.
-"""
+"""Settings of training: those of every phase, of the two phases of SFMS, of ARIG, and of the tokenizers in tables."""
 
 from __future__ import annotations
 
@@ -11,10 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from sfms_robot.config.arig import Arig
-from sfms_robot.config.base import Model, Name, NonNegative, Positive, parse
-from sfms_robot.config.listener import Count, Sfms, Share, check_heads
-from sfms_robot.config.yaml_file import read
+from sfms_robot.config.base import Model, Name, NonNegative, Positive, Share, parse, read
+from sfms_robot.config.listener import Arig, Count, Levels, Sfms, check_heads
 from sfms_robot.errors import ConfigError
 
 HALVINGS = 3  # of time, in a grouped tokenizer: 8 frames to a code
@@ -29,9 +24,9 @@ class Phase(Model):
         learning_rate: where the warm-up ends and the cosine begins.
         warm_up_steps: at most a tenth of `steps`.
         clip_norm: largest gradient norm of each optimizer's parameters.
-        precision: bf16 is autocast; a CPU without instructions for it computes in fp32 whatever is asked.
-        evaluate_every: steps from one look at the held-out loss to the next; 0: never, the last weights are kept.
-        patience: looks without a better held-out loss before training stops; None: it goes on to the last step.
+        precision: bf16 is autocast; a CPU without instructions for it always computes in fp32.
+        evaluate_every: steps between evaluations of the held-out loss; 0: never, the last weights are kept.
+        patience: evaluations without a better held-out loss before training stops; None: train to the last step.
         checkpoint_every, checkpoint_minutes: whichever comes first.
     """
 
@@ -54,7 +49,7 @@ class Phase(Model):
         return self
 
     def identity(self) -> dict[str, Any]:
-        """What must not change between a checkpoint and its resumption: all that decides the weights of a step."""
+        """Return the settings that must not change between a checkpoint and its resumption."""
         return self.model_dump(mode="json", exclude=set(_RESUMABLE))
 
 
@@ -80,18 +75,18 @@ class PredictorTraining(Phase):
     """Phase 2: the next-token predictor.
 
     Attributes:
-        transition_weight: of class 0 in (14); a keyframe weighs 1. undo_weight: is it taken out of the probabilities
-            again afterwards? The paper says nothing of that.
+        transition_weight: of class 0 in (14); a keyframe weighs 1. undo_weight: it is taken out of the probabilities
+            again afterwards, which the paper leaves open.
         dtw_weight, dtw_gamma: of the soft-DTW on the keyframe indicator (IV-D3), and how soft its minima are.
         neutral_prefix: share of windows that begin as a stream does; drop_audio, drop_face: that lack a modality.
         history_noise: share of past keyframes that are one level off.
         missed_keyframes: share of windows and groups whose last keyframes are missing, as in a roll-out, and have to be
             made up for (`learning.sfms.missed_keyframes`); of placement `penalised`.
         group_weights: of each group's loss; 1 where it is not named.
-        event_windows: share of windows in whose future an event other than a blink is under way, for listeners that are
-            told; what is told decides it, so it changes no odds.
-        calibration_rounds: roll-outs that bring keyframe rates to those of the data; if any, one more finds how large
-            nods come out of a listener that is told how large they are to be.
+        event_windows: share of windows in whose future an event other than a blink is under way, for listeners with
+            events; the events are given, so it changes no odds.
+        calibration_rounds: roll-outs that bring keyframe rates to those of the data; if any, one more measures the size
+            of nods that a listener with events produces for a given size.
     """
 
     transition_weight: Positive = 0.5
@@ -110,7 +105,7 @@ class PredictorTraining(Phase):
 
 
 class Training(Model):
-    """How an SFMS listener is trained: `configs/training/NAME.yaml`."""
+    """Training of an SFMS listener: `configs/training/NAME.yaml`."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     listener: Sfms
@@ -131,8 +126,8 @@ class Stage(Model):
 
     Attributes:
         share: of all steps.
-        speaking, listening, interaction: how its windows are drawn from the sets of these names, as weights. A set that
-            the data lack is left out.
+        speaking, listening, interaction: weights of the sets of these names when windows are drawn. A set that the data
+            lack is left out.
     """
 
     share: Annotated[float, Field(gt=0, le=1)]
@@ -148,7 +143,7 @@ class Stage(Model):
 
 
 class GroupWeights(Model):
-    """What the mean loss of a group of channels weighs (`learning.arig.losses.GROUPS`), whatever their number."""
+    """Weights of the mean loss of each group of channels (`learning.arig.losses.GROUPS`), whatever their number."""
 
     head: NonNegative = 1.0
     lids: NonNegative = 1.0
@@ -171,16 +166,16 @@ class ArigPhase(Phase):
         state_weight: of the states' cross-entropy (3.3); coarse_weight: of the coarse motion's squared error (3.4);
             equation (3) weighs 1. The paper gives no weights.
         history_noise: most that the past motion is off by, in standard deviations: in a stream it is the model's own.
-        speaking_noise: likewise of jaw and mouth while the agent speaks: what it says decides them, not what they did.
-        state_noise: share of previous states that are drawn by lot. A stream that goes on from its own best guess needs
-            it: true ones would be copied, and it has none. One that draws its states (events) is taught with true ones.
+        speaking_noise: the same of jaw and mouth while the agent speaks: its words decide them, not their past.
+        state_noise: share of previous states that are drawn at random. A stream that continues from its own best guess
+            needs it: true ones would be copied. One that draws its states (events) is trained with true ones.
         group_weights: of groups of channels in equation (3); None: every channel counts the same, which is the paper.
         event_windows: share of windows in which an event other than a blink is under way, every kind as often as any
-            other, for listeners that are told of them: smiles are rare.
-        drop_audio, drop_face: share of windows in which the user is not heard, not seen; drop_agent: of those in which
-            the agent says nothing, that have no agent's track.
-        quiet_room: share of windows in which what the user's microphone has besides speech is weaker, down to that of a
-            gate that is shut; silent_user: share in which it has nothing at all. No recording is as silent as that.
+            other, for listeners with events: smiles are rare.
+        drop_audio, drop_face: share of windows without the user's sound, without the face; drop_agent: share of the
+            windows in which the agent is silent that have no agent's track.
+        quiet_room: share of windows in which the noise of the user's microphone is weaker, down to that of a gate that
+            is shut; silent_user: share without any sound of it. No recording is that silent.
         gain_db: most that either track is louder or softer; colour_db: most that its bands are, smoothly from low to
             high, as another microphone has it; grain_db: deviation of every band of every row.
         stages: the curriculum, in order; shares add up to 1.
@@ -217,7 +212,7 @@ class ArigPhase(Phase):
         return self
 
     def stage(self, step: int) -> Stage:
-        """The stage of a step; the last one from the end of its shares on."""
+        """Return the stage of a step; the last one from the end of its shares on."""
         done = 0.0
         for stage in self.stages:
             done += stage.share
@@ -227,7 +222,7 @@ class ArigPhase(Phase):
 
 
 class ArigTraining(Model):
-    """How an ARIG listener is trained: `configs/training/arig.yaml`."""
+    """Training of an ARIG listener: `configs/training/arig.yaml`."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     listener: Arig
@@ -261,7 +256,7 @@ class Baseline(Model):
 
     window_frames: Annotated[int, Field(ge=1)] = 48
     quantizer: Literal["fsq", "vq"]
-    levels: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
+    levels: Levels
     code_dims: Count = 8
     width: Count = 64
     layers: Count = 2
@@ -278,13 +273,13 @@ class Baseline(Model):
 
 
 class Dense(Baseline):
-    """Every frame has its code (Dense-FSQ, VQ-only)."""
+    """A tokenizer with one code for every frame (Dense-FSQ, VQ-only)."""
 
     kind: Literal["dense"] = "dense"
 
 
 class Grouped(Baseline):
-    """Every 8 frames have one code (Learning2Listen)."""
+    """A tokenizer with one code for every 8 frames (Learning2Listen)."""
 
     kind: Literal["grouped"] = "grouped"
 

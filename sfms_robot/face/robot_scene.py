@@ -34,7 +34,7 @@ _POSE: Final = tuple(f"pose_{channel}" for channel in POSE_CHANNELS)
 
 
 class ForwardNeck(Protocol):
-    """What a scene needs of a neck (`retarget.kinematics.Neck`)."""
+    """What a scene needs of a neck (`retarget.head_retargeter.Neck`)."""
 
     @property
     def joints(self) -> Sequence[str]: ...

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfms_robot.face.human import HumanHead, load_human
 from sfms_robot.frames import BLENDSHAPES, Doubles, Floats
-from sfms_robot.signals.bounded import bounded_least_squares
+from sfms_robot.signals.spaces import bounded_least_squares
 
 _LEAST_MOTION_PRICE: Final = 0.002  # of skin motion, against a joint's value that is not explained
 _SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin

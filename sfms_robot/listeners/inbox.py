@@ -10,7 +10,7 @@ import queue
 from collections import deque
 from typing import Any, Final
 
-from sfms_robot.config.calmness import Calmness
+from sfms_robot.config.listener import Calmness
 from sfms_robot.frames import FRAME_HZ, SpeakerFrame
 from sfms_robot.ports import Listener
 

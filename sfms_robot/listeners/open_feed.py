@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfms_robot.config.calmness import Calmness
+from sfms_robot.config.listener import Calmness
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote import RemoteListener

@@ -49,8 +49,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.child_process import end_child, messages, start_child
-from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.hop import HopChoice, Latencies, Probe, choose_hop
+from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName

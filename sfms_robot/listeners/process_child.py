@@ -19,8 +19,8 @@ from typing import IO, Any, Final
 import numpy as np
 
 from sfms_robot.child_process import cores, messages, take_pipes
-from sfms_robot.config.calmness import Calmness
 from sfms_robot.config.hop import Probe
+from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import RobotError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.inbox import Inbox, calmed

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from sfms_robot.config.calmness import Calmness
-from sfms_robot.config.listener_kinds import LISTENER_KINDS
+from sfms_robot.config.listener import LISTENER_KINDS, Calmness
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.listeners.engine import Engine, EngineName
 from sfms_robot.listeners.eventful import EventfulListener, MotionModel

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
-from sfms_robot.config.calmness import Calmness
+from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import FRAME_HZ, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.jitter_buffer import JitterBuffer

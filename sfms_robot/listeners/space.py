@@ -10,7 +10,7 @@ import numpy as np
 from sfms_robot import config
 from sfms_robot.frames import MOTION_DIM, SPACE_CHANNELS, Doubles, Floats
 from sfms_robot.signals import spaces
-from sfms_robot.signals.flame import FlameMatrix, read_matrix
+from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
 
 @dataclass(frozen=True)

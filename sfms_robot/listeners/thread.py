@@ -13,7 +13,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sfms_robot.config.calmness import Calmness
+from sfms_robot.config.listener import Calmness
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.listeners.inbox import MOST_WAITING, Inbox, calmed
 from sfms_robot.listeners.process import CLOSE_LIMIT_S, HUNG_S, Lateness

@@ -1,7 +1,7 @@
-"""Counts what a command stream did, from the outside: it shares no arithmetic with the limiter.
+"""Audit of a command stream, which shares no arithmetic with the limiter.
 
-Angles are judged as float64, by finite differences at nominal dt; ticks as they went over the wire, where rounding
-allows one tick more per period.
+Angles are checked as float64, by finite differences at nominal dt; ticks as sent over the wire, where rounding allows
+one tick more per period.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class AuditState:
 
 
 class CommandAudit:
-    """Holds the limits of the joints of one bus; `calibration` has the same joints in the same order."""
+    """Audit of the joints of one bus; `calibration` has the same joints in the same order."""
 
     def __init__(self, limits: JointLimits, calibration: Calibration, dt_s: float) -> None:
         self._own, self._calibration = limits.range, calibration
@@ -39,20 +39,20 @@ class CommandAudit:
         self._stride_ticks = limits.speed * dt_s * np.abs(calibration.ticks_per_rad) * (1 + _TOLERANCE) + 1
 
     def start(self, angles_rad: Doubles) -> AuditState:
-        """Standing still at `angles_rad` (J,), where the limiter started."""
+        """Return the state at rest at `angles_rad` (J,), the start of the limiter."""
         return AuditState(np.tile(angles_rad, (3, 1)), self._calibration.to_ticks(angles_rad))
 
     def restart(self, joints: NDArray[np.bool_], angles_rad: Doubles, state: AuditState) -> AuditState:
-        """Some `joints` (J,) were away and stand still at `angles_rad` (J,); their way there was not commanded."""
+        """Return the state with some `joints` (J,) at rest at `angles_rad` (J,); their way there was not commanded."""
         recent = np.where(joints, angles_rad, state.recent_rad)
         ticks = np.where(joints, self._calibration.to_ticks(angles_rad), state.ticks)
         return replace(state, recent_rad=recent, ticks=ticks)
 
     def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: AuditState) -> AuditState:
-        """Count one command (J,) against the limits, and against `wanted_rad` (J,), what the limiter was asked for.
+        """Count one command (J,) against the limits, and against `wanted_rad` (J,), the reference of the limiter.
 
         A joint that breaks several limits in one tick counts once. One outside its own range may stay there and come
-        in, not go farther out (`sfms_robot.ranges`). An angle that is not finite is a violation, and is not carried on.
+        in, not go farther out (`sfms_robot.ranges`). An angle that is not finite is a violation, and not kept.
         """
         finite = np.isfinite(angles_rad)
         angles = np.where(finite, angles_rad, state.recent_rad[-1])

@@ -1,4 +1,4 @@
-"""Joint angles <-> servo ticks: zero, sign and ratio of every joint, and limits rounded inward.
+"""Conversion between joint angles and servo ticks: zero, sign and ratio of every joint, and limits rounded inward.
 
 ticks = zero_ticks + sign x ratio x angle / (2 pi / ticks per revolution)
 """
@@ -18,7 +18,7 @@ _ROUNDING_TICKS = 1e-6  # a limit this close to a whole tick is that tick
 
 
 class Calibration:
-    """Implements `ports.TickConversion` for the joints of one bus.
+    """The `ports.TickConversion` of the joints of one bus.
 
     Args:
         joints: name -> joint, in the order of the angles.
@@ -51,16 +51,16 @@ class Calibration:
                 raise ConfigError(f"joints.{name}: min_deg..max_deg holds no tick of the servo")
 
     def to_ticks(self, angles_rad: Doubles) -> NDArray[np.int64]:
-        """Nearest ticks (J,) inside the position limits. Raises ValueError for what is not finite."""
+        """Return the nearest ticks (J,) inside the limits. Raises ValueError for an angle that is not finite."""
         finite = np.isfinite(angles_rad)
         if np.count_nonzero(finite) < finite.size:
-            raise ValueError(f"joint {int(np.argmin(finite))} is asked for {angles_rad}: not finite")
+            raise ValueError(f"joint {int(np.argmin(finite))} angle is not finite: {angles_rad}")
         ticks = self.ticks_per_rad * angles_rad
         ticks += self.zero_ticks
         inside: NDArray[np.float64] = np.minimum(np.maximum(np.rint(ticks), self.low_ticks), self.high_ticks)
         return inside.astype(np.int64)
 
     def to_rad(self, ticks: NDArray[np.int64]) -> Doubles:
-        """Angles (J,) of servo positions, also of those outside the limits."""
+        """Return angles (J,) of servo positions, also of those outside the limits."""
         angles: Doubles = (ticks - self.zero_ticks) / self.ticks_per_rad
         return angles

@@ -6,7 +6,7 @@ range, its speed and acceleration being within their limits all the way. A tick 
 1. If one tick of bounded jerk leads exactly to the reference sample, and the law holds there, the sample passes
    unchanged: no lag, no chatter. Three equal pieces of constant jerk meet any position, speed and acceleration
    exactly, so the test is a 3x3 product for all joints at once.
-2. Otherwise the candidate is the first tick of a way to the reference (`motion.chase`), if the law holds.
+2. Otherwise the candidate is the first tick of a way to the reference (`motion.jerk_step`), if the law holds.
 3. Otherwise the joint brakes for one tick. The braking curve of a lawful state stays lawful, so by induction there
    is always a way out.
 
@@ -15,8 +15,8 @@ show it. The joints that they do not settle are looked at one by one.
 
 A joint that is found outside its own range starts there, and the range in force (`sfms_robot.ranges`) reaches out to
 it. There the law also says that the stop of a joint never turns back: it moves in or stands still, and its braking
-curve inherits that. Where the reference does not bring it in, `WayIn` does, so that it is inside its own range
-after `latest_s` whatever the reference is, and stays.
+curve inherits that. Where the reference does not bring it in, `Recovery` does, so that it is inside its own range
+after `latest_in_s` for any reference, and stays.
 
 Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, hence within
 the same limits. A reference that is not finite is refused: the joint brakes, and the tick is counted.
@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Final
 
@@ -34,20 +34,20 @@ import numpy as np
 
 from sfms_robot.config import Head
 from sfms_robot.frames import Doubles
-from sfms_robot.motion.chase import SLACK, Bound, ChaseFactory, State, Stop, build_chase, lawful, moves_in
+from sfms_robot.motion.jerk_step import SLACK, Bound, ChaseFactory, State, Stop, build_chase, lawful, moves_in
 from sfms_robot.ranges import Bools, Range
 from sfms_robot.signals.minimum_jerk import minimum_jerk
 
 _HEADROOM: Final = 1 - 2e-7  # of a limit, for rounding; the law is tested at 1e-6
 _EDGE_SLACK_RAD: Final = 1e-12  # so that rounding does not make a joint at the end of its range a hard case
 
-GENTLE_S: Final = 2.0  # longer than the easing of a run, so that usually the face asked for is ahead of the curve
+GENTLE_S: Final = 2.0  # longer than the easing of a run, so that usually the requested face is ahead of the curve
 _SHARE: Final = 0.8
 # Highest speed, acceleration and jerk of 10 u^3 - 15 u^4 + 6 u^5 over u = 0..1.
 _PEAKS: Final = (15 / 8, 10 / 3**0.5, 60.0)
 
-# Three pieces of a third each, jerks (1, 0, 0), (0, 1, 0), (0, 0, 1): what they add to acceleration, speed, position
-# at the end of a tick of length 1. The inverse turns what is missing into jerks.
+# Three pieces of a third each, jerks (1, 0, 0), (0, 1, 0), (0, 0, 1): rows are their effects on acceleration, speed and
+# position at the end of a tick of length 1. The inverse turns missing effects into jerks.
 _JERKS_FOR = np.linalg.inv(np.array([[1 / 3, 1 / 3, 1 / 3], [5 / 18, 3 / 18, 1 / 18], [19 / 162, 7 / 162, 1 / 162]]))
 
 
@@ -63,7 +63,7 @@ class JointLimits:
 
     @classmethod
     def of(cls, head: Head, joints: Sequence[str] | None = None) -> JointLimits:
-        """Of a head's joints, all of them or those of one bus."""
+        """Return the limits of a head's joints, all of them or those of one bus."""
         names = tuple(head.joints) if joints is None else joints
         classes = [head.limit(name) for name in names]
         return cls(
@@ -80,32 +80,22 @@ class JointLimits:
 
 
 def curve_s(distance_rad: Doubles, speed: Doubles, acceleration: Doubles, jerk: Doubles) -> Doubles:
-    """Duration [s] (J,) of the curves over `distance_rad` (J,), under limits (J,)."""
+    """Return the duration [s] (J,) of the curves over `distance_rad` (J,), under limits (J,)."""
     v, a, j = (peak * distance_rad / _SHARE for peak in _PEAKS)
     return np.asarray(np.maximum.reduce([v / speed, np.sqrt(a / acceleration), np.cbrt(j / jerk)]).clip(GENTLE_S))
 
 
-def latest_s(distance_rad: Doubles, speed: Doubles, acceleration: Doubles, jerk: Doubles) -> Doubles:
-    """Time [s] (J,) in which a joint `distance_rad` (J,) outside its range is inside it, whatever it is asked for.
-
-    The duration of its curve, and once it stands still at the end of that: to come to a stop, wherever the joint is
-    by then, and to come in from there as fast as the limits allow.
-    """
-    ramp = speed / acceleration + acceleration / jerk
-    return np.asarray(curve_s(distance_rad, speed, acceleration, jerk) + distance_rad / speed + 2 * ramp)
-
-
 @dataclass(frozen=True)
-class WayIn:
+class Recovery:
     """The curves by which joints that were found outside their own ranges come in, (J,) each.
 
     From the angle where a joint was found to the near end of its range leads a quintic with neither speed nor
-    acceleration at its ends. It is slow (at least `GENTLE_S`) and uses at most `_SHARE` of each limit. A joint that is
-    asked to be farther out than this curve, or for a value that is not finite, gets the curve as its reference. A joint
-    that was found inside has a curve of no length, which is not used.
+    acceleration at its ends. It is slow (at least `GENTLE_S`) and uses at most `_SHARE` of each limit. Where the
+    reference is farther out than this curve, or not finite, the curve takes its place. A joint that was found inside
+    has a curve of length 0, which is not used.
 
     Attributes:
-        found_rad: where each was found.
+        found_rad: angle at which each joint was found.
         edge_rad: the near end of its range.
         duration_s: of its curve.
         elapsed_s: since it was found.
@@ -117,22 +107,17 @@ class WayIn:
     elapsed_s: Doubles
 
     @classmethod
-    def of(cls, found_rad: Doubles, own: Range, *limits: Doubles) -> WayIn:
-        """`limits`: speed, acceleration, jerk (J,)."""
+    def of(cls, found_rad: Doubles, own: Range, *limits: Doubles) -> Recovery:
+        """Return the curves from `found_rad`; `limits`: speed, acceleration, jerk (J,)."""
         edge_rad = own.nearest(found_rad)
         return cls(found_rad, edge_rad, curve_s(np.abs(found_rad - edge_rad), *limits), np.zeros_like(found_rad))
 
-    def after(self, dt_s: float) -> WayIn:
-        return WayIn(self.found_rad, self.edge_rad, self.duration_s, self.elapsed_s + dt_s)
-
-    def replaced(self, joints: Bools, by: WayIn) -> WayIn:
-        """With other curves of some `joints` (J,)."""
-        mine = (self.found_rad, self.edge_rad, self.duration_s, self.elapsed_s)
-        theirs = (by.found_rad, by.edge_rad, by.duration_s, by.elapsed_s)
-        return WayIn(*(np.where(joints, new, old) for new, old in zip(theirs, mine, strict=True)))
+    def replaced(self, joints: Bools, by: Recovery) -> Recovery:
+        """Return the curves with others for some `joints` (J,)."""
+        return Recovery(*(np.where(joints, getattr(by, f.name), getattr(self, f.name)) for f in fields(self)))
 
     def now(self) -> Doubles:
-        """Angle, speed and acceleration (3, J) of the curves."""
+        """Return angle, speed and acceleration (3, J) of the curves."""
         u = np.minimum(self.elapsed_s / self.duration_s, 1.0)
         left = 1.0 - minimum_jerk(u)
         speed = -30 * u**2 * (1 - u) ** 2 / self.duration_s
@@ -142,7 +127,7 @@ class WayIn:
         return curve
 
     def guided(self, reference_rad: Doubles) -> Doubles:
-        """References (3, J), and the curve in place of those that are farther out than it, or not finite."""
+        """Return references (3, J), with the curve in place of those that are farther out than it, or not finite."""
         curve = self.now()
         way_out = np.sign(self.found_rad - self.edge_rad)
         with np.errstate(invalid="ignore"):
@@ -152,29 +137,29 @@ class WayIn:
 
 @dataclass(frozen=True)
 class LimiterState:
-    """Position, speed, acceleration (3, J) after the last tick, and what was counted.
+    """Position, speed, acceleration (3, J) after the last tick, and counters.
 
     Attributes:
-        way_in: how joints that were found outside their own ranges come in; None once all are inside.
+        recovery: curves of joints that were found outside their own ranges; None once all are inside.
         chased: ticks x joints where the reference was out of reach.
         refused: ticks x joints where the reference was not finite.
     """
 
     motion: Doubles
-    way_in: WayIn | None = None
+    recovery: Recovery | None = None
     chased: int = 0
     refused: int = 0
 
 
 @dataclass(frozen=True)
 class _Bounds:
-    """A range in force, as the array arithmetic needs it.
+    """A range in force, prepared for the array arithmetic.
 
     Attributes:
         range: (J,).
         middle: (J,).
-        floor, ceiling: (3, J) just out of the limits: what is farther out is brought here, for 1e300 overflows.
-        needed: (10, J) at most, of what `JerkLimiter._needed` gives.
+        floor, ceiling: (3, J) just outside the limits: values farther out are moved here, because 1e300 overflows.
+        needed: (10, J) bounds of the sizes that `JerkLimiter._needed` returns.
     """
 
     range: Range
@@ -185,7 +170,7 @@ class _Bounds:
 
 
 class JerkLimiter:
-    """Implements `ports.Limiter` for joints that share one tick of `dt_s`. `chase`: the fastest there is by default."""
+    """Limiter of joints that share one tick of `dt_s`. `chase`: the fastest available by default."""
 
     def __init__(self, limits: JointLimits, dt_s: float, chase: ChaseFactory = build_chase) -> None:
         self._speed = limits.speed * _HEADROOM
@@ -202,50 +187,55 @@ class JerkLimiter:
         self._chase = chase(self._bounds, dt_s)
 
     def start(self, angles_rad: Doubles) -> LimiterState:
-        """At rest at `angles_rad` (J,), in its range or not. Raises ValueError when an angle is not finite."""
+        """Return the state at rest at `angles_rad` (J,), in range or not. Raises ValueError if one is not finite."""
         if not np.isfinite(angles_rad).all():
             raise ValueError(f"joint {int(np.argmin(np.isfinite(angles_rad)))} starts at an angle that is not finite")
         still = np.zeros_like(self._own.low)
         return self._found(LimiterState(np.stack([angles_rad, still, still])), np.ones(len(still), np.bool_))
 
     def restart(self, joints: Bools, angles_rad: Doubles, state: LimiterState) -> LimiterState:
-        """Some `joints` (J,) stand still at `angles_rad` (J,), in their range or not; the others go on."""
+        """Return the state with some `joints` (J,) at rest at `angles_rad` (J,), in range or not."""
         still = np.zeros_like(angles_rad)
         motion = np.where(joints, np.stack([angles_rad, still, still]), state.motion)
         return self._found(replace(state, motion=motion), joints)
 
     def latest_in_s(self, angles_rad: Doubles) -> Doubles:
-        """Time [s] (J,) after which joints found at `angles_rad` (J,) are inside their ranges, whatever is asked."""
+        """Return the time [s] (J,) after which joints found at `angles_rad` (J,) are in range for any reference.
+
+        The duration of the curve; then, from standing still at its end, the time to come to a stop wherever the joint
+        is by then, and to come in from there as fast as the limits allow.
+        """
         out_rad = np.abs(angles_rad - self._own.nearest(angles_rad))
-        latest = latest_s(out_rad, self._speed, self._acceleration, self._jerk)
+        ramp = self._speed / self._acceleration + self._acceleration / self._jerk
+        latest = curve_s(out_rad, self._speed, self._acceleration, self._jerk) + out_rad / self._speed + 2 * ramp
         return np.where(out_rad == 0, 0.0, latest)
 
     def _found(self, state: LimiterState, joints: Bools) -> LimiterState:
         angles_rad = state.motion[0]
         if self._own.holds(angles_rad).all():
-            return replace(state, way_in=None)
-        found = WayIn.of(angles_rad, self._own, self._speed, self._acceleration, self._jerk)
-        return replace(state, way_in=found if state.way_in is None else state.way_in.replaced(joints, found))
+            return replace(state, recovery=None)
+        found = Recovery.of(angles_rad, self._own, self._speed, self._acceleration, self._jerk)
+        return replace(state, recovery=found if state.recovery is None else state.recovery.replaced(joints, found))
 
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
-        """Reference (3, J) one tick ahead -> angles (J,) that may be sent, and the state after the tick."""
-        if state.way_in is None:
+        """Return angles (J,) that may be sent for a reference (3, J) one tick ahead, and the state after the tick."""
+        if state.recovery is None:
             after, chased, refused = self._tick(reference_rad, state.motion, self._own_bounds)
             return after[0].copy(), LimiterState(after, None, state.chased + chased, state.refused + refused)
-        way_in = state.way_in.after(self._dt_s)
+        recovery = replace(state.recovery, elapsed_s=state.recovery.elapsed_s + self._dt_s)
         outside = ~self._own.holds(state.motion[0])
-        guided = np.where(outside, way_in.guided(reference_rad), reference_rad)
+        guided = np.where(outside, recovery.guided(reference_rad), reference_rad)
         within = self._within(self._own.reaching(state.motion[0]))
         after, chased, refused = self._tick(guided, state.motion, within, outside)
         left_out = outside & ~np.isfinite(reference_rad).all(axis=0)
         refused += int(np.count_nonzero(left_out))
-        still_out = way_in if not self._own.holds(after[0]).all() else None
+        still_out = recovery if not self._own.holds(after[0]).all() else None
         return after[0].copy(), LimiterState(after, still_out, state.chased + chased, state.refused + refused)
 
     def brake(self, state: LimiterState) -> tuple[Doubles, LimiterState]:
-        """Every joint one tick on its way to a stop, as fast as its limits allow; one that stands stays.
+        """Brake every joint for one tick, as fast as its limits allow; one that stands stays.
 
-        Angles (J,) that may be sent, and the state after the tick. Never leads a joint farther out than it is.
+        Returns angles (J,) that may be sent, and the state after the tick. Never leads a joint farther out than it is.
         """
         before = state.motion.T.tolist()
         after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).T
@@ -256,19 +246,20 @@ class JerkLimiter:
     def _tick(
         self, reference_rad: Doubles, motion: Doubles, within: _Bounds, outside: Bools | None = None
     ) -> tuple[Doubles, int, int]:
-        """The state (3, J) one tick after `motion` (3, J), and how many joints were chased and refused.
+        """Return the state (3, J) one tick after `motion` (3, J), and how many joints were chased and refused.
 
-        `outside` (J,): who is outside its own range; None: nobody.
+        `outside` (J,): joints outside their own ranges; None for none.
         """
         low, high = within.range.low, within.range.high
+        # 1. Joints that can meet the reference in one tick, and stop from there by the strict bounds, pass unchanged.
         after = np.minimum(np.maximum(reference_rad, within.floor), within.ceiling)
         fine = self._needed(motion, after, within.middle) <= within.needed  # False for NaN
         if outside is not None:
-            fine[6:, outside] = False
+            fine[6:, outside] = False  # the bounds of a stop do not know that it must not turn back
         chased = refused = 0
         if np.count_nonzero(fine) < fine.size:
             hard = np.flatnonzero(~np.logical_and.reduce(fine, axis=0))
-            met = np.logical_and.reduce(fine[:6, hard], axis=0)
+            met = np.logical_and.reduce(fine[:6, hard], axis=0)  # in one tick; only the stop is in doubt
             each = [*motion[:, hard], *reference_rad[:, hard], *after[:, hard], low[hard], high[hard]]
             settled = []
             for j, ok, column in zip(hard.tolist(), met.tolist(), np.stack(each).T.tolist(), strict=True):
@@ -282,18 +273,19 @@ class JerkLimiter:
                     settled.append(self._chased(j, before, wanted, *ends))
                     chased += 1
             after[:, hard] = np.array(settled).T
+        # Rounding may have left the range by an ulp.
         np.maximum(after[0], low, out=after[0])
         np.minimum(after[0], high, out=after[0])
         return after, chased, refused
 
     def _lawful(self, j: int, state: State, low: float, high: float) -> bool:
-        """Whether joint j, the range in force being low..high, may go to `state`."""
+        """Return whether joint j may go to `state`, the range in force being low..high."""
         first, last, bound = self._ends[j][0], self._ends[j][1], self._bounds[j]
-        if low == first and high == last:
+        if low == first and high == last:  # inside its own range
             return lawful(state, low, high, bound)
         if not low <= state[0] <= high:
             return False
-        if first <= state[0] <= last:
+        if first <= state[0] <= last:  # it comes in: from here on the own range holds
             return lawful(state, first, last, bound)
         way = 1.0 if low < first else -1.0
         return lawful(state, low, high, bound) and moves_in(state, way, bound)
@@ -302,39 +294,46 @@ class JerkLimiter:
         low, high = limits.low, limits.high
         ceiling = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
         half = (high - low) / 2 + _EDGE_SLACK_RAD
+        # Rows as in `_needed`: three jerks, two accelerations, the way of one tick;
         one_tick = [self._jerk] * 3 + [self._acceleration] * 2 + [self._speed * self._dt_s]
+        # then speed and acceleration of the stop, and half the range, along its way and against it.
         stop = [self._speed * (1 + SLACK), self._acceleration * (1 + SLACK), half, half]
         floor = np.stack([low - 1, -ceiling[1], -ceiling[2]])
         return _Bounds(limits, (low + high) / 2, floor, ceiling, np.stack([*one_tick, *stop]))
 
     def _needed(self, motion: Doubles, wanted: Doubles, middle: Doubles) -> Doubles:
-        """What it takes to go from `motion` to `wanted` (3, J) in one tick, and to stop from there: sizes (10, J).
+        """Return the sizes (10, J) needed to go from `motion` to `wanted` (3, J) in one tick, and to stop from there.
 
-        The six of `_one_tick`; the highest speed and acceleration of the stop; and how far from the middle of the
-        range it leads, along and against its way. Stopping takes no more way than: acceleration to 0 first, then a
-        whole stop from the highest speed. The other way it only goes until it has turned round, which takes no longer
-        than the acceleration lasts.
+        Rows 0..5 are those of `_one_tick`; 6 and 7 the highest speed and acceleration of the stop; 8 and 9 its farthest
+        points from the middle of the range, along its way and against it. They are compared with `_Bounds.needed`.
         """
         out = np.empty((10, wanted.shape[1]))
-        np.matmul(self._piece, np.concatenate([motion, wanted]), out=out[:6])
-        speed, size = np.abs(wanted[1:])
-        lasts = size / self._jerk  # how long it takes until the acceleration is gone
-        gain = 0.5 * size * lasts  # of speed by then
-        top = speed + gain
-        onward = wanted[1] + np.copysign(gain, wanted[2])
-        off = wanted[0] - middle
-        out[6], out[7] = top, size
-        np.add(off, np.copysign(top * (lasts + self._stop_s + top * self._per_acceleration), onward), out=out[8])
-        np.subtract(off, np.copysign(speed * lasts, onward), out=out[9])
+        met, top, size, along, against = out[:6], out[6], out[7], out[8], out[9]
+        np.matmul(self._piece, np.concatenate([motion, wanted]), out=met)
+        q, v, a = wanted
+        speed = np.abs(v)
+        np.abs(a, out=size)
+        # The acceleration is gone after |a| / J, and until then changes the speed by |a| / 2 on average.
+        lasts = size / self._jerk
+        gain = 0.5 * size * lasts
+        np.add(speed, gain, out=top)
+        # The way of the stop is that of the speed once the acceleration is gone.
+        onward = v + np.copysign(gain, a)
+        off = q - middle
+        # Along its way a stop is no longer than |a| / J at the highest speed, then a whole stop from it: the ramp of
+        # the acceleration, A / J, at that speed, and the way of constant deceleration, top^2 / 2A.
+        np.add(off, np.copysign(top * (lasts + self._stop_s + top * self._per_acceleration), onward), out=along)
+        # Against it the joint moves only until it has turned round, which takes no longer than |a| / J.
+        np.subtract(off, np.copysign(speed * lasts, onward), out=against)
         return np.abs(out, out=out)
 
     def _chased(self, j: int, before: State, wanted: State, low: float, high: float) -> State:
-        """Joint j one tick on its way to what is possible of `wanted`; braked where that is not lawful."""
+        """Return joint j one tick on its way to the possible part of `wanted`; braked where that is not lawful."""
         target = _possible(wanted, low, high, self._bounds[j])
         lawful_next = partial(self._lawful, j, low=low, high=high)
         after = self._chase.step(j, before, target, lawful_next)
         if (low, high) != self._ends[j]:
-            # To meet a reference that moves, a joint may want to take a run-up. One outside its own range goes on.
+            # To meet a moving reference, a joint may want a run-up. Outside its own range it must not turn back.
             still = self._chase.step(j, before, (target[0], 0.0, 0.0), lawful_next)
             way = 1.0 if low < self._ends[j][0] else -1.0
             after = max((each for each in (after, still) if each), key=lambda each: way * each[1], default=None)
@@ -346,10 +345,16 @@ class JerkLimiter:
 
 
 def _one_tick(dt: float) -> Doubles:
-    """What three pieces of constant jerk lead from one state to the next take: (6, 6).
+    """Return the matrix (6, 6) from two states to the three pieces of constant jerk that lead from one to the other.
 
-    It takes both states, one below the other (6, J), to the three jerks, the two accelerations between, and the way.
+    Columns are the state before, x = [q, v, a], and the state after, x'. Rows are the jerks j1, j2, j3 of the three
+    thirds of the tick, the accelerations at the two inner corners, and the way q' - q.
     """
+    # With jerks j held for h = dt / 3 each, a tick of length 1 leads from x to
+    #   a' = a + (j1 + j2 + j3) / 3,   v' = v + a + (5 j1 + 3 j2 + j3) / 18,
+    #   q' = q + v + a / 2 + (19 j1 + 7 j2 + j3) / 162,
+    # the weights being `_JERKS_FOR` inverted. `missing` is the part of x' that jerk 0 does not reach, as jerk over the
+    # whole tick: its rows are a' - a, v' - v - a dt, q' - q - v dt - a dt^2 / 2, divided by dt, dt^2, dt^3.
     missing = np.array(
         [
             [0, 0, -1 / dt, 0, 0, 1 / dt],
@@ -358,6 +363,7 @@ def _one_tick(dt: float) -> Doubles:
         ]
     )
     jerks = _JERKS_FOR @ missing
+    # Acceleration is highest at a corner: after the first third a + j1 h, before the last one a' - j3 h.
     inner = np.stack([jerks[0] * (dt / 3), -jerks[2] * (dt / 3)])
     inner[0, 2] += 1.0
     inner[1, 5] += 1.0
@@ -365,7 +371,7 @@ def _one_tick(dt: float) -> Doubles:
 
 
 def _possible(wanted: State, low: float, high: float, bound: Bound) -> State:
-    """What may be aimed at: `wanted` where it is lawful, else inside the range, and slower or standing still."""
+    """Return the target of a chase: `wanted` where it is lawful, else inside the range, slower or standing still."""
     position = _clipped(wanted[0], low, high)
     speed = _clipped(wanted[1], -bound.speed, bound.speed)
     acceleration = _clipped(wanted[2], -bound.acceleration, bound.acceleration)

@@ -1,8 +1,8 @@
-"""Joins plans and plays them at any instant, with continuous speed and acceleration.
+"""Joining of plans, and their playback at any instant with continuous speed and acceleration.
 
 A plan gives a face every 40 ms; servos want one every tick, at tick time plus their own lead. Between two frames
-every channel follows a quintic that matches value, slope and curvature at both ends, so that a jerk limiter behind
-it has nothing to repair. Two rules for slope and curvature at a frame:
+every channel follows a quintic that matches value, slope and curvature at both ends, so that the jerk
+limiter behind it has nothing to correct. Two rules for slope and curvature at a frame:
 
 - pose: central differences of fourth order (second order where frames are unevenly spaced or too few). The head
   may swing a little past a frame, as a head does.
@@ -11,17 +11,17 @@ it has nothing to repair. Two rules for slope and curvature at a frame:
 
 A blink is two frames long; a peak that falls between two ticks would be shaved off, and a lid servo that is slower
 than the blink would turn back before it has closed. The blink channels are therefore widened by half a frame on
-either side: the lid starts a little early and stays closed for as long as the frame that says so.
+either side: the lid starts a little early and stays closed for a whole frame.
 
 A newer plan replaces the older from its first time on. Where both have a frame they are blended over two frames,
-blinks by maximum. What was played already (leads included), and the piece of curve that is in play, stay as they
-were: a late plan bends the future, it never makes the present jump. Past the last frame the curve goes on for
-one frame at most, then holds. A plan that comes too late for all its frames is still where the face goes next.
-When no plan came for half a second the face eases to neutral.
+blinks by maximum. Instants that were played already (leads included), and the piece of curve in play, do not
+change: a late plan bends the future, it never makes the present jump. Past the last frame the curve continues for one
+frame at most, then holds. A plan that comes too late for all its frames still gives the next target of the face. After
+half a second without a plan the face eases to neutral.
 
-A lead asks for the future of the plan in force, and there is no more of that than plans bring: how much is left when
-the next one comes is measured, and leads are cut to it (`lead_limit_s`). The limit follows slowly, so that time
-neither jumps nor stands still.
+A lead needs the future of the plan in force, which is limited: the part that is left when the next plan comes is
+measured, and leads are cut to it (`lead_limit_s`). The limit follows slowly, so that time neither jumps nor stands
+still.
 """
 
 from __future__ import annotations
@@ -33,14 +33,24 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from sfms_robot.frames import BLINKS, CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats, Plan
+from sfms_robot.frames import (
+    BLINKS,
+    CHANNEL_INDEX,
+    FRAME_S,
+    JAW_FULL_OPEN_RAD,
+    MOTION_DIM,
+    POSE,
+    SHAPES,
+    Doubles,
+    Floats,
+    Plan,
+)
 from sfms_robot.signals.minimum_jerk import ease
 
 BLEND_FRAMES = 2
 STALL_S = 0.5  # without a plan for this long, ease to neutral
 EASE_S = 1.0
 HISTORY = 8  # frames kept before the one in play
-JAW_FULL_OPEN_RAD = math.radians(25.0)  # jaw pitch that stands for jawOpen = 1
 LEAD_S = 0.25  # the limit of a lead before anything is measured
 FALL, RISE = 0.25, 0.02  # how fast the limit follows, seconds a second: it stays with the shortest that was left
 _EVEN = 1e-3  # frames count as evenly spaced within this share of a frame
@@ -67,10 +77,10 @@ class _Knots:
 
 @dataclass(frozen=True)
 class Curve:
-    """A piecewise quintic. The last knot is made up: one frame of extrapolation, then rest.
+    """A piecewise quintic. The last knot is extrapolated by one frame, then follows rest.
 
     Attributes:
-        knots: K frames; everything is known up to `end_s`, the last but one.
+        knots: K frames; the curve is known up to `end_s`, the last but one.
         coefficients: (K-1, 6, 58) of the powers 0..5 of the position in the piece, 0..1.
         low, high: (K-1, 58) bounds of each piece.
         made_at_s: of the newest plan.
@@ -91,18 +101,18 @@ class Curve:
 
 @dataclass(frozen=True)
 class TimelineState:
-    """What the timeline remembers; bounded, whatever the length of the run.
+    """Memory of the timeline, of bounded size.
 
     Attributes:
         curve: None before the first plan.
-        played_s: latest instant of the curve that was asked for.
+        played_s: latest instant of the curve that was sampled.
         held: samples that ran past the horizon and one frame more.
-        eased: samples on the way to neutral, or there, because no plan came.
+        eased: samples on the way to neutral, or there, for lack of a plan.
         late: plans whose frames were all in the past.
-        refused: plans thrown away: not finite, or older than the one before.
+        refused: discarded plans: not finite, or older than the one before.
         now_s: of the last tick.
         until_s: last time of the plan in force.
-        left_s: how much of the plan in force was left at the last tick before a newer one came.
+        left_s: time left of the plan in force at the last tick before a newer one came.
         lead_limit_s: follows `left_s`, never below 0.
     """
 
@@ -119,7 +129,7 @@ class TimelineState:
 
 
 class PlanTimeline:
-    """Implements `ports.Timeline`.
+    """The timeline of a run (`ports.Timeline`).
 
     Args:
         tick_s: period of the ticks it will be sampled at; blinks are widened by half of it where it is longer than
@@ -133,7 +143,7 @@ class PlanTimeline:
         return TimelineState()
 
     def accept(self, plan: Plan, state: TimelineState) -> TimelineState:
-        """The state with `plan` joined on; a plan that cannot be used is counted in `refused`, never raised."""
+        """Return the state with `plan` joined on; an unusable plan is counted in `refused` and raises nothing."""
         old = state.curve
         if not _usable(plan) or (old is not None and plan.made_at_s < old.made_at_s):
             return replace(state, refused=state.refused + 1)
@@ -161,11 +171,11 @@ class PlanTimeline:
         return replace(state, curve=curve, played_s=played_s, late=state.late + late, until_s=until_s, left_s=left_s)
 
     def lead_limit_s(self, state: TimelineState) -> float:
-        """Longest time after a tick [s] for which `sample` may be asked without running past the plan in force."""
+        """Return the longest time after a tick [s] that `sample` can give without running past the plan in force."""
         return state.lead_limit_s
 
     def sample(self, times_s: Doubles, now_s: float, state: TimelineState) -> tuple[Floats, TimelineState]:
-        """Motion (N, 58) at (N,) instants, in any order; neutral before the first plan.
+        """Return motion (N, 58) at (N,) instants, in any order, and the state; neutral before the first plan.
 
         `now_s` is the time of the tick; instants after it are leads.
         """
@@ -186,7 +196,7 @@ class PlanTimeline:
         )
 
     def _near(self, curve: Curve, asked_s: Doubles) -> Doubles:
-        """Blink (N, 2) of a frame close enough to be widened to here, 0 where there is none."""
+        """Return the blink (N, 2) of a frame close enough to be widened to each instant, 0 without one."""
         times_s = curve.knots.times_s
         nearest = times_s.searchsorted(asked_s + self._widening_s, side="right") - 1
         frame = np.maximum(nearest, 0)
@@ -196,28 +206,28 @@ class PlanTimeline:
 
 
 def _ticked(now_s: float, state: TimelineState) -> TimelineState:
-    """The state at the next tick, its limit of leads a little nearer to what is left of plans."""
+    """Return the state at the next tick, its limit of leads a little nearer to the time left of plans."""
     dt_s = max(now_s - state.now_s, 0.0) if math.isfinite(state.now_s) else 0.0
     limit_s = min(max(state.left_s, state.lead_limit_s - FALL * dt_s), state.lead_limit_s + RISE * dt_s)
     return replace(state, now_s=now_s, lead_limit_s=max(limit_s, 0.0))
 
 
 def _distinct(times_s: Doubles) -> tuple[Doubles, NDArray[np.intp]]:
-    """The instants, each once, and which of them each of (N,) is: joints share their leads."""
+    """Return the instants, each once, and the place of each of (N,) among them: joints share their leads."""
     seen: dict[float, int] = {}
     which = [seen.setdefault(time_s, len(seen)) for time_s in times_s.tolist()]
     return np.array(list(seen)), np.array(which, dtype=np.intp)
 
 
 def _blend(before: Doubles, after: Doubles, share: float) -> Doubles:
-    """Between two motions (58,), `share` of the later one; blinks by maximum."""
+    """Blend two motions (58,), with `share` of the later one; blinks by maximum."""
     blend = (1 - share) * before + share * after
     blend[BLINKS] = np.maximum(before[BLINKS], after[BLINKS])
     return blend
 
 
 def _usable(plan: Plan) -> bool:
-    """Finite, in time order, 58 wide."""
+    """Return whether a plan is finite, in time order and 58 wide."""
     frames, times_s = np.asarray(plan.frames), np.asarray(plan.times_s)
     shaped = times_s.ndim == 1 and len(times_s) > 0 and frames.shape == (len(times_s), MOTION_DIM)
     jaw_ok = plan.jaw_rad is None or bool(np.isfinite(plan.jaw_rad).all())
@@ -230,9 +240,9 @@ def _usable(plan: Plan) -> bool:
 
 
 def _frames(plan: Plan) -> Doubles:
-    """Frames (H, 58) with blendshapes in 0..1, and the jaw pose, when there is one, in the place of jawOpen.
+    """Return frames (H, 58) with blendshapes in 0..1, and the jaw pose, if any, in the place of jawOpen.
 
-    A pose beyond all sense stays one, but no curve through it overflows.
+    A pose is cut to `_FARTHEST`, so that no curve through it overflows.
     """
     frames = np.array(plan.frames, dtype=np.float64)
     if plan.jaw_rad is not None:  # axis-angle; y points left, so + about y lowers the chin
@@ -243,11 +253,11 @@ def _frames(plan: Plan) -> Doubles:
 
 
 def _past(old: Curve | None, played_s: float, first_s: float, step_s: float) -> tuple[_Knots, bool]:
-    """Knots that a plan starting at `first_s` joins on to, and whether the old curve had run out before it."""
+    """Return the knots that a plan starting at `first_s` continues, and whether the old curve had run out before."""
     if old is not None and played_s <= old.knots.times_s[-1]:
         times_s = old.knots.times_s
         in_play = int(np.searchsorted(times_s, played_s, side="left"))  # the knot that ends the piece in play
-        if in_play == len(times_s) - 1:  # that knot is made up: leave the piece where it is now
+        if in_play == len(times_s) - 1:  # that knot is extrapolated: leave the piece at its present point
             known, here = old.knots.part(max(0, in_play - HISTORY), in_play), _here(old, played_s)
             return _Knots(*(np.concatenate(pair) for pair in zip(known.fields(), here.fields(), strict=True))), False
         before = int(np.searchsorted(times_s[:-1], first_s - step_s / 4, side="left"))
@@ -258,7 +268,7 @@ def _past(old: Curve | None, played_s: float, first_s: float, step_s: float) -> 
 
 
 def _here(curve: Curve, at_s: float) -> _Knots:
-    """The curve at one instant of its last piece, as a knot."""
+    """Return the curve at one instant of its last piece, as a knot."""
     start_s, end_s = curve.knots.times_s[-2:]
     width, c = end_s - start_s, curve.coefficients[-1]
     u = (at_s - start_s) / width
@@ -269,7 +279,7 @@ def _here(curve: Curve, at_s: float) -> _Knots:
 
 
 def _joined(past: _Knots, times_s: Doubles, frames: Doubles, step_s: float, played_s: float) -> _Knots:
-    """All knots, the made-up last one included; slopes are kept where they were played, made anew after."""
+    """Return all knots with the extrapolated last one; slopes that were played are kept, later ones recomputed."""
     overrun = frames[-1] + (frames[-1] - (frames[-2] if len(frames) > 1 else past.values[-1]))
     overrun[SHAPES] = np.clip(overrun[SHAPES], 0.0, 1.0)
     all_times = np.concatenate([past.times_s, times_s, times_s[-1:] + step_s])
@@ -281,20 +291,22 @@ def _joined(past: _Knots, times_s: Doubles, frames: Doubles, step_s: float, play
 
 
 def _derivatives(times_s: Doubles, values: Doubles) -> tuple[Doubles, Doubles]:
-    """Slopes and curvatures (K, 58) at the knots; both 0 at the two ends."""
+    """Return slopes and curvatures (K, 58) at the knots; both 0 at the two ends."""
     width = np.diff(times_s)[:, None]
     chord = np.diff(values, axis=0) / width
     left, right, wl, wr = chord[:-1], chord[1:], width[:-1], width[1:]
     slopes, bends = np.zeros_like(values), np.zeros_like(values)
+    # Second order, of chords of any width.
     slopes[1:-1] = (wr * left + wl * right) / (wl + wr)
     bends[1:-1] = 2 * (right - left) / (wl + wr)
     if len(times_s) > 4:
+        # Fourth order where four widths in a row are equal.
         a, b, c, d, e = (values[k : len(values) - 4 + k] for k in range(5))
         after = width[2:-1]
         even = np.ptp(sliding_window_view(width[:, 0], 4), axis=1)[:, None] < _EVEN * after
         slopes[2:-2] = np.where(even, (a - 8 * b + 8 * d - e) / (12 * after), slopes[2:-2])
         bends[2:-2] = np.where(even, (-a + 16 * b - 30 * c + 16 * d - e) / (12 * after**2), bends[2:-2])
-    if len(times_s) > 3 and np.ptp(width[-3:-1]) < _EVEN * width[-2]:  # nothing is known past the last frame
+    if len(times_s) > 3 and np.ptp(width[-3:-1]) < _EVEN * width[-2]:  # one-sided: there is no frame after the last one
         a, b, c = values[-4:-1]
         slopes[-2], bends[-2] = (a - 4 * b + 3 * c) / (2 * width[-2]), (a - 2 * b + c) / width[-2] ** 2
 
@@ -302,6 +314,7 @@ def _derivatives(times_s: Doubles, values: Doubles) -> tuple[Doubles, Doubles]:
     left, right = left[:, SHAPES], right[:, SHAPES]
     turns = left * right <= 0
     safe_left, safe_right = np.where(turns, 1.0, left), np.where(turns, 1.0, right)
+    # Fritsch and Carlson: the weighted harmonic mean of the chords, 0 where they differ in sign.
     a, b = 2 * wr + wl, wr + 2 * wl
     slopes[1:-1, SHAPES] = np.where(turns, 0.0, (a + b) / (a / safe_left + b / safe_right))
     bends[1:-1, SHAPES] *= (left != 0) & (right != 0)
@@ -314,6 +327,7 @@ def _curve(knots: _Knots, made_at_s: float, delay_s: float) -> Curve:
     rise = end - start
     m0, m1 = knots.slopes[:-1] * width, knots.slopes[1:] * width
     b0, b1 = knots.bends[:-1] * width**2, knots.bends[1:] * width**2
+    # The quintic through value, slope m and curvature b at u = 0 and 1.
     coefficients = np.stack(
         [
             start,
@@ -331,7 +345,7 @@ def _curve(knots: _Knots, made_at_s: float, delay_s: float) -> Curve:
 
 
 def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:
-    """Motion (N, 58) on the curve's own time; held outside it, faded to neutral once plans stopped coming."""
+    """Return motion (N, 58) at instants of the curve's time; held outside it, faded to neutral after a stall."""
     if curve is None:
         return np.zeros((len(asked_s), MOTION_DIM))
     times_s = curve.knots.times_s
@@ -351,7 +365,7 @@ def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:
 
 
 def _powers(x: Doubles) -> Doubles:
-    """(N,) -> (N, 6): 1, x, x^2, ... x^5."""
+    """Return (N, 6): 1, x, x^2, ... x^5 of x (N,)."""
     powers = np.empty((len(x), 6))
     powers[:, 0], powers[:, 1:] = 1.0, x[:, None]
     np.multiply.accumulate(powers, axis=1, out=powers)

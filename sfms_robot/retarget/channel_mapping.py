@@ -1,12 +1,17 @@
-"""Motion -> joint angles of one head, as its file says.
+"""Motion to joint angles of one head, by the drives of its file.
 
     drives -> range -> knobs -> couplings
 
-in joint units: -1 = min, 0 = rest, +1 = max, or radians from rest. Everything is a function of the motion alone, so
-that the neutral face is the rest pose whatever came before, and of the knobs, which may be others at every call.
+in joint units: -1 = min, 0 = rest, +1 = max, or radians from rest. The result depends on the motion alone, so that the
+neutral face is the rest pose whatever came before, and on the knobs, which may differ at every call.
 
 A value u inside its range, |u| = 1 at the end of it, leaves the knobs as intensity x u x (1 + (style - 1)(1 - |u|)):
 style bends the response without moving its ends, so that small motions come out doubled (2) or vanish (0).
+
+The drives of all joints are one forest, compiled into a few array operations. It is cut into levels, deepest first: all
+leaves are one gather from the motion, and every level above is one `reduceat` per kind of group over its children, then
+dead band, curve, gain, offset and clamp. So the cost does not depend on the form of the file, only a little on the
+depth of the deepest expression; groups of one and sums inside sums are merged first.
 """
 
 from __future__ import annotations
@@ -16,17 +21,24 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sfms_robot.config import Coupling, Head
-from sfms_robot.config.drives import drives
+from sfms_robot.config import Coupling, Expression, Head
+from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNELS, MOTION_DIM, Doubles, Floats
-from sfms_robot.retarget.compile import Indices, Program
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
+
+Indices = NDArray[np.intp]
+Tree = tuple[int, Expression]  # joint, node
+
+STILL = Expression(channel=CHANNELS[0], gain=0.0)
+_REDUCE = {"sum": np.add, "mean": np.add, "max": np.maximum, "min": np.minimum, "product": np.multiply}
+_PRODUCT_LIMIT = 1e6  # what keeps products of products finite, whatever the motion
 
 
 @dataclass(frozen=True)
 class Knobs:
-    """How much every joint shows, (J,) each, 0..2 and 1 for as it is; made by `ChannelMapping.knobs`."""
+    """Knobs of every joint, (J,) each, 0..2, 1 for no change; made by `ChannelMapping.knobs`."""
 
     intensity: Doubles
     style: Doubles
@@ -40,7 +52,7 @@ class Knobs:
 class _Couplings:
     """C sums of joints that may not fall below a bound: weights (C, J), at_least (C,).
 
-    `turns`: who gives way first, second, ...: for some of the couplings, the joint and its weight.
+    `turns`: the joints that give way first, second, ...: couplings, and of each the joint and its weight.
     """
 
     weights: Doubles
@@ -58,7 +70,7 @@ class _Couplings:
         return cls(weights, np.array([coupling.at_least for coupling in couplings]), tuple(turns))
 
     def apply(self, values: Doubles, low: Doubles, high: Doubles) -> None:
-        """Change values (..., J), which lie inside low..high (J,), as far as it takes and the ranges allow."""
+        """Change values (..., J) inside low..high (J,) until the sums are met, as far as the ranges allow."""
         missing = np.maximum(self.at_least - values @ self.weights.T, 0.0)
         if not np.count_nonzero(missing):
             return
@@ -71,7 +83,7 @@ class _Couplings:
 
 @dataclass(frozen=True)
 class Units:
-    """Joint angles (..., J) [rad] <-> joint units of the drives: -1 = min, 0 = rest, +1 = max, or rad from rest."""
+    """Conversion of angles (..., J) [rad] to joint units: -1 = min, 0 = rest, +1 = max, or rad from rest."""
 
     rest: Doubles
     up: Doubles
@@ -105,7 +117,7 @@ class Units:
 
 
 class ChannelMapping:
-    """Implements `ports.Retargeter` for one head. A joint without a drive stays at rest.
+    """The mapping of one head. A joint without a drive stays at rest.
 
     Attributes:
         joints: names, in the order of the head's file.
@@ -129,7 +141,7 @@ class ChannelMapping:
         self._knobs = self.knobs()
 
     def knobs(self, intensity: Mapping[str, float] | None = None, style: Mapping[str, float] | None = None) -> Knobs:
-        """Knobs per region over those of the head's file. Raises ConfigError for an unknown region or a bad value."""
+        """Return knobs per region over those of the head's file. Raises ConfigError for an unknown region or value."""
         values = {"intensity": np.ones(len(self.joints)), "style": np.ones(len(self.joints))}
         for kind, given in (("intensity", intensity or {}), ("style", style or {})):
             for name, value in given.items():
@@ -144,7 +156,7 @@ class ChannelMapping:
         return Knobs(**values)
 
     def angles(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
-        """(58,) for all joints, or (..., J, 58) with row j for joint j -> rad (J,) or (..., J), float64.
+        """Return angles (J,) or (..., J) [rad] of motion (58,) for all joints, or (..., J, 58) with row j for joint j.
 
         Without `knobs` those of the head's file hold. Raises ValueError, naming the channel, where the motion is not
         finite: clipping would hide it.
@@ -168,11 +180,236 @@ class ChannelMapping:
 
     def _inside(self, values: Doubles) -> Doubles:
         np.maximum(values, self._units.low, out=values)
-        np.minimum(values, self._units.high, out=values)
-        return values
+        return np.minimum(values, self._units.high, out=values)
 
     def _turned(self, values: Doubles, knobs: Knobs) -> Doubles:
         ends = np.where(values > 0, self._units.high, -self._units.low)
         share = np.abs(values) / np.where(ends > 0, ends, 1.0)
         turned: Doubles = values * knobs.intensity * (1.0 + (knobs.style - 1.0) * (1.0 - share))
         return turned
+
+
+# --- Compiled drives ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Curves:
+    """Monotone cubics of the nodes `where`: C of them with at most K points, evaluated together.
+
+    `breaks` (C, K) is filled up with inf; `pieces` (C, K+1, 4) are coefficients about `origins` (C, K+1), highest
+    power first, the outermost two constant.
+    """
+
+    where: Indices
+    breaks: Doubles
+    origins: Doubles
+    pieces: Doubles
+
+    @classmethod
+    def of(cls, curves: Sequence[tuple[tuple[float, float], ...] | None], scale: Doubles) -> _Curves | None:
+        """Return the curves of n nodes; `scale` (n,): a curve's x is in units of its node's value divided by this."""
+        where = [i for i, curve in enumerate(curves) if curve is not None]
+        if not where:
+            return None
+        longest = max(len(curve) for curve in curves if curve is not None)
+        breaks = np.full((len(where), longest), np.inf)
+        origins = np.zeros((len(where), longest + 1))
+        pieces = np.zeros((len(where), longest + 1, 4))
+        for row, i in enumerate(where):
+            points = np.array(curves[i], dtype=np.float64)
+            x, y = points[:, 0] * scale[i], points[:, 1]
+            breaks[row, : len(x)] = x
+            origins[row, 1 : len(x)] = x[:-1]
+            pieces[row, 0, 3], pieces[row, len(x), 3] = y[0], y[-1]
+            with np.errstate(over="ignore"):  # slopes too small for a float are 0
+                pieces[row, 1 : len(x)] = _monotone_cubics(x, y)
+        return cls(np.array(where, dtype=np.intp), breaks, origins, pieces)
+
+    def into(self, values: Doubles) -> None:
+        """Replace the nodes' values (..., n) by those of their curves."""
+        x = values[..., self.where]
+        piece = (x[..., None] >= self.breaks).sum(axis=-1)
+        rows = np.arange(len(self.where))
+        c = self.pieces[rows, piece]
+        flat = (piece == 0) | np.isinf(self.breaks[rows, np.minimum(piece, self.breaks.shape[1] - 1)])
+        t = np.where(flat, 0.0, x - self.origins[rows, piece])  # outside, x may be too large to be cubed
+        t[piece == self.breaks.shape[1]] = 0.0
+        values[..., self.where] = ((c[..., 0] * t + c[..., 1]) * t + c[..., 2]) * t + c[..., 3]
+
+
+def _monotone_cubics(x: Doubles, y: Doubles) -> Doubles:
+    """Return cubics between K points (Fritsch, Butland 1984) without overshoot: (K-1, 4), highest power first."""
+    dx = np.diff(x)
+    rise = np.diff(y) / dx
+    slopes = np.full(len(x), rise[0])
+    if len(x) > 2:
+        w1, w2 = 2 * dx[1:] + dx[:-1], dx[1:] + 2 * dx[:-1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inner = 1.0 / ((w1 / rise[:-1] + w2 / rise[1:]) / (w1 + w2))
+        slopes[1:-1] = np.where(rise[:-1] * rise[1:] > 0, inner, 0.0)
+        slopes[0] = _end_slope(dx[0], dx[1], rise[0], rise[1])
+        slopes[-1] = _end_slope(dx[-1], dx[-2], rise[-1], rise[-2])
+    bend = (slopes[:-1] + slopes[1:] - 2 * rise) / dx
+    return np.stack([bend / dx, (rise - slopes[:-1]) / dx - bend, slopes[:-1], y[:-1]], axis=1)
+
+
+def _end_slope(dx0: float, dx1: float, rise0: float, rise1: float) -> float:
+    """Return the slope at an end by three points, limited against overshoot."""
+    slope = ((2 * dx0 + dx1) * rise0 - dx0 * rise1) / (dx0 + dx1)
+    if np.sign(slope) != np.sign(rise0):
+        return 0.0
+    return 3.0 * rise0 if np.sign(rise0) != np.sign(rise1) and abs(slope) > 3.0 * abs(rise0) else slope
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Operations on the values (..., n) of a level's nodes; None for one that no node has, to save time in a tick."""
+
+    dead_band: Doubles | None
+    curves: _Curves | None
+    gain_up: Doubles | None
+    gain_down: Doubles | None
+    offset: Doubles | None
+    low: Doubles | None
+    high: Doubles | None
+
+    @classmethod
+    def of(cls, nodes: Sequence[Expression]) -> _Shape:
+        count = np.array([float(len(node.mean or (1,))) for node in nodes])  # a mean is a sum, until it is scaled
+        dead = np.array([node.dead_band for node in nodes]) * count
+        gains = np.array([node.gains for node in nodes])
+        gains /= np.where([node.curve is None for node in nodes], count, 1.0)[:, None]
+        gained = bool((gains != 1).any())
+        offset = np.array([node.offset for node in nodes])
+        limit = [_PRODUCT_LIMIT if node.product else np.inf for node in nodes]
+        low, high = np.array([node.clamp or (-top, top) for node, top in zip(nodes, limit, strict=True)]).T
+        clamped = bool(np.isfinite(low).any())
+        return cls(
+            dead if dead.any() else None,
+            _Curves.of([node.curve for node in nodes], count),
+            gains[:, 1] if gained else None,
+            gains[:, 0] if (gains[:, 0] != gains[:, 1]).any() else None,
+            offset if offset.any() else None,
+            low if clamped else None,
+            high if clamped else None,
+        )
+
+    def __call__(self, values: Doubles) -> Doubles:
+        """Apply the operations in place, and return `values`."""
+        if self.dead_band is not None:
+            values -= np.minimum(np.maximum(values, -self.dead_band), self.dead_band)
+        if self.curves is not None:
+            self.curves.into(values)
+        if self.gain_up is not None:
+            values *= self.gain_up if self.gain_down is None else np.where(values > 0, self.gain_up, self.gain_down)
+        if self.offset is not None:
+            values += self.offset
+        if self.low is not None and self.high is not None:
+            np.maximum(values, self.low, out=values)
+            np.minimum(values, self.high, out=values)
+        return values
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Nodes whose children lie side by side one level below, from `starts` on; `kinds`: groups and masks of nodes."""
+
+    starts: Indices
+    kinds: tuple[tuple[np.ufunc, NDArray[np.bool_]], ...]
+    shape: _Shape
+
+    def __call__(self, below: Doubles) -> Doubles:
+        (first, _), *others = self.kinds
+        values: Doubles = first.reduceat(below, self.starts, axis=-1)
+        for combine, mask in others:
+            np.copyto(values, combine.reduceat(below, self.starts, axis=-1), where=mask)
+        return self.shape(values)
+
+
+@dataclass(frozen=True)
+class Program:
+    """The compiled drives of J joints: motion -> values in joint units.
+
+    Attributes:
+        columns: the channel of each leaf.
+        cells: the same in a flattened (J, 58), in the row of the leaf's joint.
+    """
+
+    columns: Indices
+    cells: Indices
+    leaves: _Shape
+    levels: tuple[_Level, ...]
+
+    @classmethod
+    def of(cls, trees: Sequence[Expression | None]) -> Program:
+        """Compile plain expressions, without shared ones; None gives 0."""
+        forest: list[Tree] = [(row, merged(tree) if tree else STILL) for row, tree in enumerate(trees)]
+        levels: list[_Level] = []
+        for _ in range(max(_depth(tree) for _, tree in forest)):
+            level, forest = _level(forest)
+            levels.insert(0, level)
+        nodes = [leaf for _, leaf in forest]
+        rows = np.array([row for row, _ in forest], dtype=np.intp)
+        columns = np.array([CHANNEL_INDEX[leaf.channel or ""] for leaf in nodes], dtype=np.intp)
+        return cls(columns, rows * MOTION_DIM + columns, _Shape.of(nodes), tuple(levels))
+
+    def __call__(self, motion: Floats) -> Doubles:
+        """Return values (J,) or (..., J) of motion (58,) or (..., J, 58), row j for joint j."""
+        flat = motion.reshape(*motion.shape[:-2], -1)
+        values = self.leaves(flat.take(self.columns if motion.ndim == 1 else self.cells, axis=-1).astype(np.float64))
+        for level in self.levels:
+            values = level(values)
+        return values
+
+
+def _depth(node: Expression) -> int:
+    return 1 + max((_depth(part) for part in node.parts), default=-1)
+
+
+def _level(forest: list[Tree]) -> tuple[_Level, list[Tree]]:
+    """Return one level and the forest of its children. A leaf above the deepest level becomes a sum of one."""
+    nodes = [(row, node if node.parts else Expression.model_construct(sum=(node,))) for row, node in forest]
+    groups = [[(row, part) for part in node.parts] for row, node in nodes]
+    starts = np.cumsum([0, *(len(group) for group in groups[:-1])])
+    ways = [_REDUCE[node.group or "sum"] for _, node in nodes]
+    needed = [way for way, group in zip(ways, groups, strict=True) if len(group) > 1] or [np.add]
+    ways = [way if way in needed else needed[0] for way in ways]  # a group of one is the same in every way
+    kinds = [(way, np.array([other is way for other in ways])) for way in dict.fromkeys(ways)]
+    level = _Level(starts, tuple(kinds), _Shape.of([node for _, node in nodes]))
+    return level, [part for group in groups for part in group]
+
+
+def merged(node: Expression) -> Expression:
+    """Return the same function with fewer levels."""
+    if node.group is None:
+        return node
+    parts = [merged(part) for part in node.parts]
+    if node.sum is not None:
+        parts = [term for part in parts for term in (_terms(part) or (part,))]
+    node = node.model_copy(update={node.group: tuple(parts)})
+    inner = parts[0]
+    linear = not node.dead_band and node.curve is None and node.gains[0] == node.gains[1]
+    if len(parts) > 1 or not linear or (node.clamp and inner.clamp):
+        return node
+    scaled = _scaled(inner, node.gains[0], node.offset)
+    return scaled.model_copy(update={"clamp": node.clamp}) if node.clamp else scaled
+
+
+def _terms(part: Expression) -> tuple[Expression, ...]:
+    """Return the terms of a sum that a sum around it can take over; none where it cannot."""
+    plain = not part.dead_band and part.curve is None and part.clamp is None and part.gains[0] == part.gains[1]
+    if part.sum is None or not plain:
+        return ()
+    gain = part.gains[0]
+    return tuple(_scaled(term, gain, part.offset if i == 0 else 0.0) for i, term in enumerate(part.sum))
+
+
+def _scaled(node: Expression, gain: float, offset: float) -> Expression:
+    """Return gain x node + offset as one node."""
+    down, up = node.gains
+    clamp = None
+    if node.clamp is not None:
+        low, high = sorted(gain * end + offset for end in node.clamp)
+        clamp = (low, high)
+    change = {"gain_up": gain * up, "gain_down": gain * down, "offset": gain * node.offset + offset, "clamp": clamp}
+    return node.model_copy(update=change)

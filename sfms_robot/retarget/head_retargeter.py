@@ -1,37 +1,47 @@
-"""Motion -> every joint of a head: the mapping moves the face, the neck's kinematics follow the pose.
+"""Joint angles of a head from motion: the mapping moves the face, the neck's kinematics follow the pose.
 
     face channels -> mapping -> joints
     pose channels -> neck    -> the neck's joints, all for one instant, because its joints move the head together
 
-A head without kinematics has the mapping alone. What the neck remembers (low-passed angles) is a value that the loop
-hands from tick to tick.
+A head without kinematics has the mapping alone. The memory of the neck (low-passed angles) is a value that the loop
+passes from tick to tick.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sfms_robot.config import Head
+from sfms_robot.config import Head, Joint
+from sfms_robot.config.kinematics import Kinematics, SerialNeck
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import ChannelMapping, Knobs
-from sfms_robot.retarget.kinematics import build_neck
+from sfms_robot.retarget.neck import Serial
+from sfms_robot.retarget.stewart import Stewart
+
+Neck = Serial | Stewart
 
 _POSE = len(POSE_CHANNELS)
-_LARGE = np.array([0.5, 0.6, 1.0, 0.05, 0.05, 0.05])  # roll, pitch, yaw [rad], place [m]: where style changes nothing
+_LARGE = np.array([0.5, 0.6, 1.0, 0.05, 0.05, 0.05])  # roll, pitch, yaw [rad], place [m]: style changes nothing there
 _HOME_RAD = np.radians(0.1)  # how far from its rest a joint may stand where the neck is at home
 
 
+def build_neck(config: Kinematics, joints: Mapping[str, Joint]) -> Neck:
+    """Return a head's neck from its section and joints. Raises ConfigError where its home is out of reach."""
+    ranges = {name: (joints[name].min_rad, joints[name].max_rad) for name in config.joints()}
+    return Serial(config, ranges) if isinstance(config, SerialNeck) else Stewart(config, ranges)
+
+
 class HeadRetargeter:
-    """Implements `ports.Retargeter` for one head at ticks of `dt_s`.
+    """The retargeter of one head at ticks of `dt_s` (`ports.Retargeter`).
 
     Attributes:
         joints: names, in the order of the head's file.
-        neck_columns: which of them the neck moves, in the neck's own order.
+        neck_columns: places of the neck's joints, in the neck's own order.
         blind_channels: channels that neither the mapping nor the neck shows.
-        dead_joints: joints that nothing moves.
+        dead_joints: joints without a drive, outside the neck.
 
     Raises ConfigError where the neck's home is out of reach, or is not the rest of its joints.
     """
@@ -56,11 +66,11 @@ class HeadRetargeter:
                 raise ConfigError.at(head.name, f"joints.{name}.rest_deg", head.joints[name].rest_deg, problem)
 
     def start(self) -> Doubles:
-        """Memory of a head at rest."""
+        """Return the memory of a head at rest."""
         return self.neck.start() if self.neck else np.zeros(0)
 
     def step(self, motion: Floats, memory: Doubles, knobs: Knobs | None = None) -> tuple[Doubles, Doubles]:
-        """(58,) for all joints, or (J, 58) with row j for joint j -> rad (J,), and the memory after this tick.
+        """Return angles (J,) for motion (58,) of all joints or (J, 58), row j for joint j, and the next memory.
 
         The pose is that of the row of the neck's first joint; the knobs of that joint's region turn it. Raises
         ValueError where the motion is not finite.
@@ -72,16 +82,16 @@ class HeadRetargeter:
         return angles, memory
 
     def angles(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
-        """As `step`, for a face held for ever, or (..., J, 58) for many of them."""
+        """Return angles as `step`, for a face held for ever, or (..., J, 58) for many faces."""
         angles = self.mapping.angles(motion, knobs)
         if self.neck is not None:
             angles[..., self.neck_columns] = self.neck.solve(self._pose(motion, knobs)).angles_rad
         return angles
 
     def shown_pose(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
-        """Motion (..., 58) -> the poses (..., 6) that the neck shows: after the knobs, as far as its joints go.
+        """Return the poses (..., 6) that the neck shows for motion (..., 58), after the knobs and within its ranges.
 
-        Always finite. Without kinematics a channel that no joint follows is 0, the others are as they were asked.
+        Always finite. Without kinematics a channel that no joint follows is 0, the others are unchanged.
         Raises ValueError where a pose is not finite.
         """
         if self.neck is None:
@@ -95,7 +105,7 @@ class HeadRetargeter:
         return self._turned(row[..., :_POSE].astype(np.float64), knobs)
 
     def _turned(self, pose: Doubles, knobs: Knobs | None) -> Doubles:
-        """Poses (..., 6), changed in place, as the knobs of the neck's region have them."""
+        """Apply the knobs of the neck's region to poses (..., 6), in place."""
         first, knobs = self.neck_columns[0], knobs or self._knobs
         if knobs.style[first] != 1.0:  # the same law as of the mapping's joints, over the pose
             pose *= 1.0 + (knobs.style[first] - 1.0) * (1.0 - np.minimum(np.abs(pose) / _LARGE, 1.0))

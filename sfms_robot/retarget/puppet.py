@@ -1,11 +1,11 @@
-"""What a program asks the face to show, laid over what the listener planned: a face, or a point to look at.
+"""Commands of a program to the face, laid over the listener's plan: a face, or a point to look at.
 
-    show       each channel goes from the listener's value to the one asked for, stays, and goes back
-    look_at    the eyes jump to the point, the head follows with its share, and the eyes give back what it brings
+    show       each channel goes from the listener's value to the requested one, stays, and goes back
+    look_at    the eyes jump to the point, the head follows with its share, and the eyes compensate for its turn
 
-Each channel has a weight: 0 leaves the listener's value, 1 is the value asked for. A weight rises and falls by smooth
-steps and is 0 again in the end, so that a face that nobody works is the listener's, bit for bit. What is asked for anew
-begins where the channel is.
+Each channel has a weight: 0 leaves the listener's value, 1 is the requested value. A weight rises and falls by smooth
+steps and is 0 again in the end, so that a face without commands is the listener's, bit for bit. A new command begins
+at the present value of the channel.
 
 Commands come from any thread and count from the latest instant of the tick that finds them: joints look ahead by
 different leads, and no instant that was already played is changed.
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Doubles, Floats
-from sfms_robot.signals.eye_angles import direction_to, directions, turn
+from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.25  # listener -> face
@@ -43,7 +43,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Ramp:
-    """Weights (C,) over time: from `start` up to 1 in `rise_s`, and down to 0 in `fall_s` from `until_s` (C,) on."""
+    """Weights (C,) over time: from `start` up to 1 in `rise_s`, and down to 0 in `fall_s` from `until_s` (C,)."""
 
     start: Doubles
     began_s: Doubles
@@ -56,14 +56,14 @@ class Ramp:
         return cls(np.zeros(size), np.full(size, _NEVER_S), np.full(size, _NEVER_S), rise_s, fall_s)
 
     def at(self, times_s: Doubles) -> Doubles:
-        """(N, C)."""
+        """Return the weights (N, C) at (N,) instants."""
         times = times_s[:, None]
         risen = self.start + (1.0 - self.start) * ease((times - self.began_s) / self.rise_s)
         weight: Doubles = risen * (1.0 - ease((times - self.until_s) / self.fall_s))
         return weight
 
     def hold(self, which: Bools, now_s: float, seconds: Doubles | float) -> Ramp:
-        """`which` (C,) bool go up from where they are and stay for `seconds`; those still up only stay."""
+        """Return the ramp on which `which` (C,) bool rise from their present weights and stay for `seconds`."""
         falling = which & (self.until_s <= now_s)
         start = np.where(falling, self.at(np.array([now_s]))[0], self.start)
         began = np.where(falling, now_s, self.began_s)
@@ -72,7 +72,7 @@ class Ramp:
 
     @property
     def over_s(self) -> float:
-        """From here on all weights are 0."""
+        """Time from which all weights are 0."""
         return float(self.until_s.max()) + self.fall_s
 
 
@@ -86,13 +86,13 @@ class Shown:
     since_s: float
 
     def values(self, times_s: Doubles) -> Doubles:
-        """(N, 58)."""
+        """Return the values (N, 58) at (N,) instants."""
         share = np.clip((times_s - self.since_s) / CHANGE_S, 0.0, 1.0)[:, None]
         value: Doubles = self.before + share * (self.after - self.before)
         return value
 
     def then(self, face: Doubles, which: Bools, seconds: Doubles, now_s: float) -> Shown:
-        """The same, with `which` (58,) bool of `face` (58,) asked for from now on."""
+        """Return the same with `which` (58,) bool of `face` (58,) requested from now on."""
         here = np.array([now_s])
         value, up = self.values(here)[0], self.ramp.at(here)[0] > 0
         after = np.where(which, face, self.after)
@@ -101,7 +101,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Turn:
-    """A direction (yaw, pitch) [rad] that eyes or head are turned to: from `before` on in `ramp.rise_s` to `after`."""
+    """A turn of eyes or head in (yaw, pitch) [rad]: from `before_rad` in `ramp.rise_s` to `after_rad`."""
 
     ramp: Ramp
     before_rad: Doubles
@@ -113,13 +113,13 @@ class Turn:
         return cls(Ramp.zero(2, rise_s, fall_s), np.zeros(2), np.zeros(2), 0.0)
 
     def directions_rad(self, times_s: Doubles) -> Doubles:
-        """(N, 2)."""
+        """Return the directions (N, 2) at (N,) instants."""
         share = ease((times_s - self.since_s) / self.ramp.rise_s)[:, None]
         direction: Doubles = self.before_rad + share * (self.after_rad - self.before_rad)
         return direction
 
     def then(self, direction_rad: Doubles, seconds: float, now_s: float) -> Turn:
-        """The same, turned to another direction from now on, for `seconds`."""
+        """Return the turn to another direction from now on, for `seconds`."""
         here = np.array([now_s])
         before = np.where(self.ramp.at(here)[0] > 0, self.directions_rad(here)[0], direction_rad)
         return Turn(self.ramp.hold(np.ones(2, bool), now_s, seconds), before, direction_rad, now_s)
@@ -127,7 +127,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class _Piece:
-    """What holds from `since_s` on."""
+    """The commands in force from `since_s` on."""
 
     since_s: float
     shown: Shown
@@ -136,17 +136,17 @@ class _Piece:
 
     @cached_property
     def over_s(self) -> float:
-        """From here on the face is the listener's; asked at every tick."""
+        """Time from which the face is the listener's; used at every tick."""
         return max(part.ramp.over_s for part in (self.shown, self.eyes, self.head))
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """What was asked for since the last tick; each channel's last word.
+    """Commands since the last tick; the last one of each channel.
 
     Attributes:
         face, which, seconds: (58,) of `show`; `which` is bool.
-        direction_rad, look_s: of `look_at`; None when nobody did.
+        direction_rad, look_s: of `look_at`; None without one.
     """
 
     face: Doubles
@@ -160,10 +160,10 @@ _NOTHING: Final = _Asked(np.zeros(MOTION_DIM), np.zeros(MOTION_DIM, bool), np.ze
 
 
 class Puppet:
-    """`show` and `look_at` from any thread; `overlay` from the loop.
+    """Commands to a face: `show` and `look_at` from any thread; `overlay` from the loop.
 
     Args:
-        gaze: how far eyes turn, and what share of the head's turn they take back.
+        gaze: the eyes' range, and the share of the head's turn that they take back.
         blind: channels that the head does not show; without eyes the head turns all the way, without a neck the eyes.
     """
 
@@ -181,7 +181,7 @@ class Puppet:
         self._pieces = [_Piece(_NEVER_S, shown, Turn.none(EYES_S, FALL_S), Turn.none(HEAD_S, HEAD_S))]
 
     def show(self, face: Floats | Mapping[str, float], seconds: float) -> None:
-        """A whole face (58,), or some channels by name, for `seconds` once it has risen. Never blocks.
+        """Show a whole face (58,), or some channels by name, for `seconds` once it has risen. Never blocks.
 
         Raises InputError for an unknown channel, a value that is not finite, a blendshape outside 0..1, a pose beyond
         pi or 1 m, and `seconds` that is not a positive number.
@@ -198,20 +198,20 @@ class Puppet:
             )
 
     def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float) -> None:
-        """A point in metres from the middle of the head: x forward, y to its left, z up. Never blocks.
+        """Look at a point in metres from the middle of the head: x forward, y to its left, z up. Never blocks.
 
         Raises InputError for a point that is not finite, or nearer than a centimetre, and for `seconds` as `show`.
         """
         point = np.array([x_m, y_m, z_m], np.float64)
         if not np.isfinite(point).all() or math.hypot(*point) < 0.01:
-            raise InputError(f"look_at({x_m:g}, {y_m:g}, {z_m:g}) is no point in front of a head, in metres")
+            raise InputError(f"look_at({x_m:g}, {y_m:g}, {z_m:g}) is not a point in front of a head, in metres")
         direction_rad = direction_to(point)
         checked_s = _checked_seconds(seconds)
         with self._lock:
             self._asked = replace(self._asked, direction_rad=direction_rad, look_s=checked_s)
 
     def overlay(self, motion: Floats, times_s: Doubles) -> Floats:
-        """Motion (N, 58) at (N,) instants -> the same with what was asked for. Never changes its input."""
+        """Return motion (N, 58) at (N,) instants with the commands. Never changes its input."""
         earliest_s = float(times_s.min())
         self._take(earliest_s, float(times_s.max()))
         if len(self._pieces) == 1 and self._pieces[0].over_s <= earliest_s:
@@ -226,7 +226,7 @@ class Puppet:
         return out
 
     def _take(self, earliest_s: float, latest_s: float) -> None:
-        """Commands begin at the latest instant of this tick; pieces that no later instant asks for are dropped."""
+        """Begin commands at the latest instant of this tick, and drop pieces that no later instant needs."""
         with self._lock:
             asked, self._asked = self._asked, _NOTHING
         if asked is not _NOTHING:
@@ -252,7 +252,7 @@ class Puppet:
         return out
 
     def _looking(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
-        """`motion` (N, 58) with head and eyes turned, in place."""
+        """Turn head and eyes of `motion` (N, 58), in place."""
         turned = piece.head.directions_rad(times_s) * self._head_share
         motion[:, YAW_PITCH] += (piece.head.ramp.at(times_s) * (turned - motion[:, YAW_PITCH])).astype(np.float32)
         wanted = piece.eyes.directions_rad(times_s) - self._gain * motion[:, YAW_PITCH]
@@ -263,7 +263,7 @@ class Puppet:
 
 
 def _channels(face: Floats | Mapping[str, float]) -> tuple[Doubles, Bools]:
-    """Values (58,) and which of them are asked for (58,) bool."""
+    """Return values (58,) and which of them are requested (58,) bool."""
     which = np.ones(MOTION_DIM, bool)
     if isinstance(face, Mapping):
         if unknown := sorted(set(face) - set(CHANNELS)):

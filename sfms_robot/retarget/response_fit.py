@@ -1,8 +1,8 @@
-"""How the joints of a face really look, learnt from seeing it, and the drives that make up for it.
+"""The response of a face's joints, learnt from a camera, and the drives that compensate for it.
 
-A face tracker looks at the robot's own face while its joints move. What the tracker saw goes through the head's own
-drives: that is the value each joint *looks like*, beside the value it *has*. For a servo whose skin answered as its
-file says they are the same. What joins them is the joint's response,
+A face tracker watches the robot's own face while its joints move. The tracked face goes through the head's own drives:
+that is the value each joint *looks like*, beside the value it *has*. For a servo whose skin moves as its file says they
+are the same. The relation between them is the joint's response,
 
     looks like = offset + r(has),    r(0) = 0, rising, no steeper or flatter than a bound, smooth,
 
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from sfms_robot.config import Expression, Head
-from sfms_robot.config.drives import drives
+from sfms_robot.config.head import drives
 from sfms_robot.frames import MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import ChannelMapping, Units
 
@@ -28,20 +28,20 @@ FLATTEST, STEEPEST = 0.2, 8.0  # slope of a response: no curve multiplies a moti
 _KNOTS: Final = 9  # from rest to each end, closer together near rest
 _NEAR_REST: Final = 2.0
 _BINS: Final = 200
-_LEAST_MOVED: Final = 0.2  # of a side's range: what moved less says nothing about it
+_LEAST_MOVED: Final = 0.2  # of a side's range: less motion than that gives no estimate
 _LEAST_SAMPLES: Final = 50
 _FULL_WEIGHT: Final = 20  # samples in a bin from which on more do not count more
 _SMOOTH: Final = 0.002  # price of a change of slope
-_PLAIN: Final = 0.002  # price of a slope other than 1: decides where nothing was seen
+_PLAIN: Final = 0.002  # price of a slope other than 1: decides where there is no data
 
 
 def looks_like(head: Head, shapes: Floats | Doubles) -> Doubles:
-    """Blendshapes (N, 52) of the robot's own face -> the joint values (N, J) that explain them."""
+    """Return the joint values (N, J) that explain blendshapes (N, 52) of the robot's own face."""
     return asked(head.model_copy(update={"couplings": ()}), shapes)
 
 
 def asked(head: Head, shapes: Floats | Doubles) -> Doubles:
-    """Blendshapes (N, 52) -> what the head makes of them, (N, J) in joint units; the neck's joints stay 0."""
+    """Return the joint values (N, J) for blendshapes (N, 52), in joint units; the neck's joints stay 0."""
     motion = np.zeros((len(shapes), MOTION_DIM), dtype=np.float32)
     motion[:, SHAPES] = shapes
     mapping = ChannelMapping(head)
@@ -51,9 +51,9 @@ def asked(head: Head, shapes: Floats | Doubles) -> Doubles:
 
 @dataclass(frozen=True)
 class Response:
-    """How one joint looks. `has` (K,) rising through 0, `looks` (K,) rising through 0; `offset` on top.
+    """The response of one joint: `has` (K,) and `looks` (K,), both rising through 0; `offset` on top.
 
-    `moved`: (lowest, highest) value that was seen.
+    `moved`: (lowest, highest) value in the recording.
     """
 
     has: Doubles
@@ -62,17 +62,17 @@ class Response:
     moved: tuple[float, float]
 
     def __call__(self, has: Doubles) -> Doubles:
-        """What it looks like (N,), offset left out."""
+        """Return the visible value (N,), without the offset."""
         return np.asarray(np.interp(has, self.has, self.looks))
 
     @property
     def curve(self) -> tuple[tuple[float, float], ...]:
-        """What is asked -> what it takes, as a curve of the language."""
+        """Curve from a requested value to the joint value that shows it, for an `Expression`."""
         return tuple((round(float(x), 5), round(float(y), 5)) for x, y in zip(self.looks, self.has, strict=True))
 
 
 def fit(has: Doubles, looks: Doubles, low: Doubles, high: Doubles) -> list[Response | None]:
-    """Responses from N pairs (N, J) in joint units, in the ranges low..high (J,); None for a joint that hardly moved.
+    """Fit responses to N pairs (N, J) in joint units, in the ranges low..high (J,); None for a joint that hardly moved.
 
     Raises ValueError where the pairs differ in shape. Rows that are not finite are left out.
     """
@@ -109,7 +109,7 @@ def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response
 
 
 def _binned(has: Doubles, looks: Doubles, low: float, high: float) -> tuple[Doubles, Doubles, Doubles]:
-    """Mean of `has` and median of `looks` per bin, and its weight: much time at rest counts no more."""
+    """Return mean of `has`, median of `looks` and weight per bin, so that long rest does not dominate."""
     bins = np.clip(((has - low) / (high - low) * _BINS).astype(int), 0, _BINS - 1)
     filled = np.unique(bins)
     x = np.array([has[bins == b].mean() for b in filled])
@@ -120,12 +120,12 @@ def _binned(has: Doubles, looks: Doubles, low: float, high: float) -> tuple[Doub
 
 
 def rms(errors: Doubles) -> float:
-    """Root of the mean square; 0 of nothing."""
+    """Return the root of the mean square; 0 for an empty array."""
     return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
 
 
 def fitted_drives(head: Head, responses: Sequence[Response | None]) -> dict[str, Expression]:
-    """The drives with the responses made up for, by joint; a twin of a fitted joint gets its own in any case."""
+    """Return the drives that compensate for the responses, by joint; a twin of a fitted joint always gets its own."""
     plain = drives(head)
     found: dict[str, Expression] = {}
     for name, response in zip(head.joints, responses, strict=True):
@@ -140,6 +140,6 @@ def fitted_drives(head: Head, responses: Sequence[Response | None]) -> dict[str,
 
 
 def _unfolded(head: Head, name: str, drive: Expression) -> Expression:
-    """The head's folds come on top of any drive: taken off here, because this drive holds them already."""
+    """Return the drive without the head's folds, which are added to any drive and which this one holds already."""
     folds = [Expression(channel=fold.channel, gain=-fold.gain) for fold in head.folds if fold.into == name]
     return Expression(sum=(drive, *folds)) if folds else drive

@@ -1,19 +1,25 @@
-"""Loop time: seconds from 0, real or virtual, and the pacer that turns it into ticks.
+"""Loop time, seconds from 0, real or virtual; the ticks in it; and a listener that is stepped in virtual time.
 
-A tick has an absolute deadline, so work never makes the rate drift. A tick that starts late is counted; ticks
-that were missed altogether are skipped, never chased: catching up would mean moving the head faster.
+A tick has an absolute deadline, so work never makes the rate drift. A tick that starts late is counted; ticks that were
+missed altogether are skipped, never chased: catching up would mean moving the head faster.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
-from sfms_robot.ports import Clock
+from sfms_robot.frames import Plan, SpeakerFrame
+from sfms_robot.ports import Clock, Listener
 
-_SAME = 1e-6  # of a period: a clock this close to a tick is at it
+_SAME: Final = 1e-6  # of a period: a clock this close to a tick is at it
+# Statistics of a feed whose steps have no duration and that leaves nothing out.
+IDLE_FEED: Final[Mapping[str, Any]] = {
+    "state": "listening", "restarts": 0, "skipped_frames": 0, "step_ms": {"p50": None, "p99": None},
+}  # fmt: skip
 
 
 class RealClock:
@@ -32,7 +38,7 @@ class RealClock:
 
 
 class VirtualClock:
-    """Time that jumps to where it is asked to be, and never runs by itself."""
+    """Time that advances only when it is waited for."""
 
     origin_s = 0.0
 
@@ -56,7 +62,7 @@ class TickTime:
 
 
 def tick_times(clock: Clock, rate_hz: float, start_s: float) -> Iterator[TickTime]:
-    """Endless ticks from now on, at `rate_hz`; nominal times are exact multiples of the period since `start_s`.
+    """Yield endless ticks from now on, at `rate_hz`; nominal times are exact multiples of the period since `start_s`.
 
     Blocks until each is due.
     """
@@ -69,3 +75,35 @@ def tick_times(clock: Clock, rate_hz: float, start_s: float) -> Iterator[TickTim
         index += skipped
         yield TickTime(index / rate_hz, late_s - skipped / rate_hz, skipped)
         index += 1
+
+
+class InlineFeed:
+    """A `ports.PlanFeed` that steps the listener in `push`, so that every run of one seed is the same run.
+
+    A plan becomes visible a fixed `latency_s` after its frame. `engine`: name of the listener's engine for the report.
+    """
+
+    lost = False
+
+    def __init__(self, listener: Listener, seed: int, latency_s: float, engine: str | None = None) -> None:
+        self._listener, self._engine = listener, engine
+        self._memory = listener.start(seed)
+        self._latency_s = latency_s
+        self._coming: list[tuple[float, Plan]] = []
+
+    def push(self, frame: SpeakerFrame, now_s: float) -> None:
+        plan, self._memory = self._listener.step(frame, self._memory)
+        if plan is not None:
+            self._coming.append((now_s + self._latency_s, plan))
+
+    def poll(self, now_s: float) -> Sequence[Plan]:
+        visible = [plan for at_s, plan in self._coming if at_s <= now_s]
+        self._coming = self._coming[len(visible) :]
+        return visible
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return the figures of `ports.PlanFeed`; in virtual time a step has no duration."""
+        return {**IDLE_FEED, "engine": self._engine, "hop": self._listener.hop}
+
+    def close(self) -> None:
+        """Do nothing: the feed holds no resources."""

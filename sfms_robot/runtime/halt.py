@@ -1,23 +1,37 @@
-"""Emergency stop: one latch that holds a set of causes and opens when all are cleared.
+"""Emergency stop: one latch that holds a set of causes and opens when all are cleared, and the switches that close it.
 
     close      from its next tick on the loop brakes every joint as fast as its limits allow, then holds or releases it
     resume     clears the causes that its door may clear; refused while a switch is still on
 
-A door is where the request comes from: the device itself, the page or the fleet. A cause is cleared at the door that
-it names, or at the device. The table of causes is in docs/safety.md. A loop that does not answer within `ANSWER_S` is
-dead: torque goes off at once, from the thread that waits for the answer. The lock is held for assignments only, never
-while anything is logged, read or sent.
+A door is the place that the request comes from: the device itself, the page or the fleet. A cause is cleared at the
+door that it names, or at the device. The table of causes is in docs/safety.md. A loop that does not answer within
+`ANSWER_S` is dead: torque goes off at once, from the thread that waits for the answer. The lock is held for assignments
+only, never while anything is logged, read or sent.
+
+Switches outside the program are a signal, a file that appears, and a line of a GPIO chip. A button of a GPIO line is
+wired to ground: the line's own pull-up holds it high, and pressing it closes the latch. With `active-high` a line that
+rises does. Linux only: the chip is `/dev/gpiochipN`, by its character device (kernel 5.10 and later; structures of
+<linux/gpio.h>, version 2). A file or line that is on keeps the latch closed. One that cannot be read counts as on.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import re
+import select
+import signal
+import stat
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final, Literal
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, Final, Literal
 
-from sfms_robot.errors import HaltedError
+from sfms_robot.errors import ConfigError, HaltedError
 from sfms_robot.ports import Bus
 
 Door = Literal["device", "page", "fleet"]
@@ -25,16 +39,28 @@ Door = Literal["device", "page", "fleet"]
 ANSWER_S: Final = 0.1  # ten ticks at 100 Hz
 MOST_CAUSES: Final = 16  # kept by name: clients of a network choose names
 JOIN_S: Final = 1.0  # for a thread whose log is held up
+FILE_PERIOD_S: Final = 0.05
+
+_GET_LINE: Final = 0xC250B407  # _IOWR(0xB4, 0x07, struct gpio_v2_line_request)
+_GET_VALUES: Final = 0xC010B40E  # _IOWR(0xB4, 0x0E, struct gpio_v2_line_values)
+_ACTIVE_LOW, _INPUT, _EDGES, _PULL_UP = 1 << 1, 1 << 2, 3 << 4, 1 << 8  # edges: rising and falling
+# offsets[64], consumer[32], config {flags, num_attrs, padding[5], attrs[10]}, num_lines, buffer size, padding[5], fd
+_REQUEST: Final = struct.Struct("=I252x 32s Q260x4x I4x20x i")
+_VALUES: Final = struct.Struct("=QQ")  # bits, mask
+_EVENT: Final = struct.Struct("=QI36x")  # time stamp, 1: became active, 2: became inactive
+_LINE: Final = re.compile(r"(?P<chip>/dev/gpiochip\d+):(?P<line>\d{1,9})(?P<high>,active-high)?")
+
+Ioctl = Callable[[int, int, bytearray], Any]
 
 log = logging.getLogger(__name__)
 
 
 class HaltLatch:
-    """The causes of an emergency stop. Closed and resumed from any thread, looked at by the loop in every tick.
+    """The causes of an emergency stop. Closed and resumed from any thread, read by the loop in every tick.
 
     Attributes:
-        causes: names of what keeps it closed, oldest first; empty while it is open.
-        switches: by name, whether a switch is on now; read before every resume.
+        causes: names of the causes, oldest first; empty while the latch is open.
+        switches: by name, a function that returns whether the switch is on; called before every resume.
     """
 
     def __init__(self) -> None:
@@ -47,11 +73,11 @@ class HaltLatch:
 
     @property
     def by(self) -> str | None:
-        """All causes in one text; None while it is open."""
+        """All causes in one text; None while the latch is open."""
         return ", ".join(self.causes) or None
 
     def close(self, cause: str, cleared_by: Door = "device") -> None:
-        """Halt. A cause that is there already is renewed: a resume that has begun does not clear it."""
+        """Halt. A cause that is present already is renewed: a resume that has begun does not clear it."""
         key = cause, cleared_by
         with self._changed:
             if key not in self._closed:
@@ -66,7 +92,7 @@ class HaltLatch:
         """Clear the causes that `door` may clear (the device: all); the halt ends when no cause is left.
 
         Raises HaltedError, in one line that names the causes: with nothing cleared while a switch is still on or torque
-        is being taken off; else for those that are left.
+        is being taken off; else for the remaining causes.
         """
         with self._changed:
             before = dict(self._closed)
@@ -90,7 +116,7 @@ class HaltLatch:
             raise HaltedError(f"still halted: {causes}")
 
     def answer(self) -> bool:
-        """Note that the loop has seen it; return whether torque was taken off before that."""
+        """Record the answer of the loop; return whether torque was taken off before it."""
         with self._changed:
             self._answered = True
             self._changed.notify_all()
@@ -110,7 +136,7 @@ class HaltLatch:
             thread.join(JOIN_S)
 
     def _note(self) -> None:
-        """Publish a change of the causes; the lock is held."""
+        """Publish a change of the causes. The caller holds the lock."""
         self.causes = tuple(dict.fromkeys(cause for cause, _ in self._closed))
         self._changed.notify_all()
 
@@ -128,3 +154,170 @@ class HaltLatch:
                 self._late = True
             bus.torque_off("release")
             log.critical("halted, and the loop does not answer: torque off")
+
+
+@contextmanager
+def halt_signals(latch: HaltLatch) -> Iterator[None]:
+    """Close the latch on SIGUSR1 and resume on SIGUSR2, while inside. Main thread only; does nothing on Windows.
+
+    The handlers only wake a thread each, so that neither a lock nor a log that is held up stops the main thread.
+    """
+    if not hasattr(signal, "SIGUSR1"):
+        yield
+        return
+    with (
+        _on_signal(signal.SIGUSR1, lambda: latch.close("signal")),
+        _on_signal(signal.SIGUSR2, partial(resume_here, latch)),
+    ):
+        yield
+
+
+def resume_here(latch: HaltLatch) -> None:
+    """Resume at the device; log a refusal."""
+    try:
+        latch.resume("device")
+    except HaltedError as refusal:
+        log.warning("%s", refusal)
+
+
+@contextmanager
+def _on_signal(number: int, act: Callable[[], None]) -> Iterator[None]:
+    """Call `act` in a thread for every signal, while inside."""
+    came: SimpleQueue[bool] = SimpleQueue()  # reentrant: a handler may interrupt any code
+
+    def work() -> None:
+        while came.get():
+            act()
+
+    threading.Thread(target=work, name="halt signal", daemon=True).start()
+    before = signal.signal(number, lambda *_: came.put(True))
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+        came.put(False)
+
+
+@contextmanager
+def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
+    """Close the latch by `--halt-on FILE` or `--halt-on /dev/gpiochipN:LINE[,active-high]`, while inside.
+
+    A thread waits for it. Raises ConfigError for a place that cannot be watched, and for a switch that is on already.
+    """
+    if (line := _LINE.fullmatch(where)) is not None:
+        with watching_line(open_line(line["chip"], int(line["line"]), line["high"] is None), where, latch):
+            yield
+    else:
+        path = Path(where)
+        if not path.parent.is_dir():
+            raise ConfigError(f"--halt-on {where}: no such folder (FILE, or /dev/gpiochipN:LINE[,active-high])")
+        is_there = partial(_is_there, path)
+        if is_there():
+            raise ConfigError(
+                f"--halt-on {where}: is there already, or its folder cannot be read: the head would be halted"
+            )
+        with _watching(where, latch, is_there, is_there):
+            yield
+
+
+def _is_there(path: Path) -> bool:
+    """Return whether the file exists; a folder that cannot be read counts."""
+    try:
+        path.stat()
+    except FileNotFoundError:
+        return not path.parent.is_dir()
+    except OSError:
+        pass
+    return True
+
+
+@contextmanager
+def watching_line(line: Line, name: str, latch: HaltLatch) -> Iterator[None]:
+    """Close the latch when `line` becomes active, while inside; give the line back at the end."""
+    try:
+        with _watching(name, latch, line.active, line.pressed, line.fd):
+            yield
+    finally:
+        os.close(line.fd)
+
+
+@contextmanager
+def _watching(
+    name: str, latch: HaltLatch, active: Callable[[], bool], pressed: Callable[[], bool], fd: int | None = None
+) -> Iterator[None]:
+    """Close the latch from a thread each time `pressed` returns true: when `fd` has an event, or periodically.
+
+    `active` is called before every resume. A switch that cannot be read closes the latch, and nothing opens it again.
+    """
+    ours, theirs = os.pipe()  # readable once it is over
+    watched, period_s = ([ours], FILE_PERIOD_S) if fd is None else ([ours, fd], None)
+
+    def work() -> None:
+        try:
+            while ours not in select.select(watched, [], [], period_s)[0]:
+                if pressed():
+                    latch.close(name)
+        except OSError as error:
+            latch.switches[name] = lambda: True
+            latch.close(name)
+            log.error("--halt-on %s: cannot be read: %s; end the run and look at the switch", name, error)
+
+    latch.switches[name] = active
+    thread = threading.Thread(target=work, name="halt switch", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        os.close(theirs)
+        thread.join(JOIN_S)
+        os.close(ours)
+        del latch.switches[name]
+
+
+class Line:
+    """A line of a GPIO chip as input; its file descriptor has an event to read at each edge."""
+
+    def __init__(self, fd: int, ioctl: Ioctl) -> None:
+        self.fd, self._ioctl = fd, ioctl
+
+    def active(self) -> bool:
+        """Read its level; a line that cannot be read counts as active."""
+        values = bytearray(_VALUES.pack(0, 1))
+        try:
+            self._ioctl(self.fd, _GET_VALUES, values)
+        except OSError:
+            return True
+        return bool(_VALUES.unpack(values)[0] & 1)
+
+    def pressed(self) -> bool:
+        """Read one edge and the level: whether it became active, however shortly, or is. Raises OSError."""
+        event = os.read(self.fd, _EVENT.size)
+        if len(event) != _EVENT.size:
+            raise OSError("the line has no events any more")
+        return _EVENT.unpack(event)[1] == 1 or self.active()
+
+
+def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None = None) -> Line:
+    """Return a line of a chip as input with its pull-up.
+
+    Raises ConfigError for a chip or line that cannot be used, and for a line that is active already.
+    """
+    if ioctl is None:
+        import fcntl  # Linux only
+
+        ioctl = fcntl.ioctl
+    name = f"--halt-on {chip}:{line}"
+    flags = _INPUT | _EDGES | (_ACTIVE_LOW | _PULL_UP if active_low else 0)
+    request = bytearray(_REQUEST.pack(line, b"sfms-robot halt", flags, 1, 0))
+    try:
+        with open(chip, "rb", buffering=0) as file:
+            if not stat.S_ISCHR(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{name}: {chip} expected a character device (/dev/gpiochipN), got another file")
+            ioctl(file.fileno(), _GET_LINE, request)
+    except OSError as error:
+        raise ConfigError(f"{name}: {error.strerror or error}") from error
+    opened = Line(int(_REQUEST.unpack(request)[-1]), ioctl)
+    if opened.active():
+        os.close(opened.fd)
+        raise ConfigError(f"{name}: is active already, or cannot be read: the head would be halted at once")
+    return opened

@@ -1,7 +1,7 @@
-"""What a run measures of itself. Every figure of the report comes from here or from the parts' own counters.
+"""Measurements of a run. Every figure of the report comes from here or from the parts' own counters.
 
-Days of running fit in memory: of everything that grows only running figures, quantiles in fixed memory and the last
-half minute of three channels are kept.
+Memory is bounded for runs of days: running figures, quantiles in fixed memory and the last half minute of three
+channels.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from sfms_robot.signals.quantiles import Quantiles
 LATE_SHARE: Final = 0.5  # a tick is late when it starts more than this share of a period behind its deadline
 ATTENTIVE: Final = 0.5  # a person with more attention looks at the head
 SPEECH_RMS: Final = 0.01  # a frame louder than this counts as speech when latency is measured
-STATES: Final = 200  # the newest changes of state, for the report
+STATES: Final = 200  # newest changes of state in the report
 _REMEMBERED: Final = 250  # frames of speech and plans that wait to be measured: ten seconds
 _BLOCK_S: Final = 20.0  # counted at once
-_MARGIN_S: Final = 8.0  # looked at on both sides of a block; no nod is longer
+_MARGIN_S: Final = 8.0  # searched on both sides of a block; no nod is longer
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ FindEvents = Callable[[Doubles, float], Sequence[tuple[float, float, float]]]
 
 
 class EventCounter:
-    """Counts events in a signal that never ends, a block at a time.
+    """Counter of events in an endless signal, a block at a time.
 
     Args:
         find: signal (N,) and its rate -> events (start_s, end_s, size) in order, as those of `signals.events`.
@@ -53,22 +53,22 @@ class EventCounter:
         self._before = 0  # values of the block before, at the front
         self._counted = 0
         self._counting: Future[int] | None = None
-        self._looking: Future[None] | None = None
-        self._look_wanted = False
+        self._searching: Future[None] | None = None
+        self._search_wanted = False
         self._so_far = 0
 
     @property
     def so_far(self) -> int:
-        """Events as of the newest look at the unfinished block, and asks for another. From any thread; never blocks."""
-        self._look_wanted = True
+        """Events as of the newest search of the unfinished block; requests another. From any thread; never blocks."""
+        self._search_wanted = True
         return self._so_far
 
     def add(self, value: float) -> None:
         self._values.append(value)
-        if self._look_wanted and (self._looking is None or self._looking.done()):
-            self._look_wanted = False
-            self._looking = self._worker.submit(
-                self._look, self._counted, self._counting, tuple(self._values), self._before
+        if self._search_wanted and (self._searching is None or self._searching.done()):
+            self._search_wanted = False
+            self._searching = self._worker.submit(
+                self._search, self._counted, self._counting, tuple(self._values), self._before
             )
         if len(self._values) >= self._before + self._block + self._margin:
             self._collect()
@@ -77,17 +77,17 @@ class EventCounter:
             self._values, self._before = self._values[last - self._margin :], self._margin
 
     def total(self) -> int:
-        """Events so far, those in the unfinished block included. Blocks for the block that is being counted."""
+        """Return the events so far, with the unfinished block. Blocks for the block that is being counted."""
         self._collect()
         return self._counted + self._starting(self._values, self._before, len(self._values))
 
-    def _look(self, counted: int, counting: Future[int] | None, values: Sequence[float], before: int) -> None:
-        """In the worker, which has counted the block before by then: it does one thing after the other."""
+    def _search(self, counted: int, counting: Future[int] | None, values: Sequence[float], before: int) -> None:
+        """Count the unfinished block, in the worker, which has counted the block before by then."""
         block = 0 if counting is None else counting.result()
         self._so_far = counted + block + self._starting(values, before, len(values))
 
     def _collect(self) -> None:
-        """The block before was given twenty seconds."""
+        """Add the count of the block before, which has had twenty seconds."""
         if self._counting is not None:
             self._counted += self._counting.result()
             self._counting = None
@@ -99,9 +99,9 @@ class EventCounter:
 
 @dataclass
 class RunLog:
-    """Filled by the loop, read at the end; `motion_so_far`, counters and quantiles also by other threads meanwhile.
+    """Figures filled by the loop and read at the end; `motion_so_far`, counters and quantiles also by other threads.
 
-    `period_s` is the tick's.
+    `period_s`: of a tick.
     """
 
     joints: Sequence[str]
@@ -123,7 +123,7 @@ class RunLog:
     max_rad: Doubles | None = None
     travel_rad: Doubles | None = None
     audited: Any = None
-    state: Any = None  # of the loop at its end: timeline and limiter tell what they counted
+    state: Any = None  # of the loop at its end, with the counters of timeline and limiter
     torque_unconfirmed: list[str] = field(default_factory=list)  # joints that came on and are not confirmed off
     detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
     states: deque[tuple[float, RunState]] = field(default_factory=lambda: deque(maxlen=STATES))
@@ -140,11 +140,11 @@ class RunLog:
         self._counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
 
     def start(self, held_rad: Doubles) -> None:
-        """Torque came on at `held_rad` (J,)."""
+        """Start the audit where torque came on, `held_rad` (J,)."""
         self.audited = self.audit.start(held_rad)
 
     def restart(self, joints: NDArray[np.bool_], held_rad: Doubles) -> None:
-        """Some `joints` (J,) were away and hold `held_rad` (J,) now."""
+        """Restart the audit of some `joints` (J,) that were away and hold `held_rad` (J,) now."""
         self.audited = self.audit.restart(joints, held_rad, self.audited)
 
     def heard(self, frame: SpeakerFrame) -> None:
@@ -156,7 +156,7 @@ class RunLog:
             self._speech_s.append(frame.time_s)
 
     def entered(self, state: RunState, now_s: float) -> None:
-        """Note the run's state, or what is said of it, from `now_s` on."""
+        """Record the run's state from `now_s` on."""
         if self.states:
             since_s, before = self.states[-1]
             self.state_s[before.name] = self.state_s.get(before.name, 0.0) + now_s - since_s
@@ -167,12 +167,12 @@ class RunLog:
         logger.log(level, "%s%s", state.name, f": {', '.join(state.why)}" if state.why else "")
 
     def ended(self, now_s: float, error: Exception | None) -> None:
-        """Torque is off."""
+        """Record the last state of the run, after torque went off."""
         before = self.states[-1][1] if self.states else RunState("stopping")
         self.entered(before.ended(now_s, None if error is None else str(error)), now_s)
 
     def state_report(self) -> dict[str, Any]:
-        """`states` of the report: seconds in each, and the newest changes with what was said of them."""
+        """Return `states` of the report: seconds in each, and the newest changes with their reasons."""
         return {
             "seconds": {name: round(seconds, 3) for name, seconds in self.state_s.items()},
             "changes": [
@@ -180,21 +180,18 @@ class RunLog:
             ],
         }
 
-    def refuse(self) -> None:
-        self.refused_plans += 1
-
     def planned(self, plan: Plan) -> None:
         self._waiting.append(plan)
 
     def commanded(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles, motion: Floats) -> None:
-        """What the limiter gave for this tick, sent or not: `goals_rad` (J,) of `asked_rad` (J,), for a face (58,)."""
+        """Record the goals (J,) of the limiter for a reference (J,), sent or not, and the face (58,) behind it."""
         self.listened_s = tick.time_s
         self._tick(tick, goals_rad, asked_rad)
         for name, kind in MOTION_EVENTS.items():
             self._counters[name].add(float(kind.signal(motion)))
 
     def wrote(self, wire_s: float, reach_s: float) -> None:
-        """The command is on the wire at `wire_s`; it played the timeline up to `reach_s`."""
+        """Record a command on the wire at `wire_s`, which played the timeline up to `reach_s`."""
         while self._waiting and self._waiting[0].times_s[0] <= reach_s:
             made_at_s = self._waiting.popleft().made_at_s
             self.frame_to_wire_ms.add(max(0.0, wire_s - made_at_s) * 1e3)
@@ -203,7 +200,7 @@ class RunLog:
                 self.speech_to_wire_ms.add(max(0.0, wire_s - first_sample_s) * 1e3)
 
     def ease(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles) -> None:
-        """One tick of the way to rest."""
+        """Record one tick of the way to rest."""
         self._tick(tick, goals_rad, asked_rad)
         self.eased += 1
 
@@ -223,20 +220,20 @@ class RunLog:
         self._last_rad = goals_rad
 
     def attention_report(self) -> dict[str, float | int | None]:
-        """`attention` of the report: of the frames that tell, the share in which the person looks at the head."""
+        """Return `attention` of the report: share of the judged frames in which the person looks at the head."""
         share = round(self.attentive_frames / self.judged_frames, 4) if self.judged_frames else None
         return {"share": share, "frames": self.judged_frames}
 
     def motion_report(self) -> dict[str, int]:
-        """`motion` of the report."""
+        """Return `motion` of the report."""
         return {f"{name}s": counter.total() for name, counter in self._counters.items()}
 
     def motion_so_far(self) -> dict[str, int]:
-        """The same while it runs, as old as the last time that it was asked for. From any thread."""
+        """Return the same during the run, as of the last call. From any thread."""
         return {f"{name}s": counter.so_far for name, counter in self._counters.items()}
 
     def tick_report(self, target_hz: float, elapsed_s: float | None) -> dict[str, Any]:
-        """`tick` of the report; wall-clock figures are null where there is no wall clock (`elapsed_s` None)."""
+        """Return `tick` of the report; wall-clock figures are null without a wall clock (`elapsed_s` None)."""
         real = elapsed_s is not None
         late_ms = self.late_ms if real else Quantiles()
         return {
@@ -247,7 +244,7 @@ class RunLog:
         }
 
     def joint_report(self) -> dict[str, dict[str, float]]:
-        """`joints` of the report: range and way travelled of every goal stream."""
+        """Return `joints` of the report: range and travelled way of every goal stream."""
         if self.min_rad is None or self.max_rad is None or self.travel_rad is None:
             return {}
         return {

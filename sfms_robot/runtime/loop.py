@@ -36,12 +36,10 @@ from sfms_robot.ports import (
 )
 from sfms_robot.runtime.clock import tick_times
 from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.heat import Heat, HeatGuard, temperatures_C
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
-from sfms_robot.runtime.presence import Fade, Presence
-from sfms_robot.runtime.safety import EASE_S, come_to_rest
-from sfms_robot.runtime.states import RunState, Situation, following
+from sfms_robot.runtime.safety import EASE_S, Heat, HeatGuard, come_to_rest, temperatures_C
+from sfms_robot.runtime.states import Fade, Presence, RunState, Situation, following
 from sfms_robot.signals.minimum_jerk import ease
 
 LOOK_S: Final = 0.1  # between two looks at what is lost
@@ -210,7 +208,7 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
     timeline = state.timeline
     for plan in parts.feed.poll(now_s):
         if not np.isfinite(plan.frames).all():
-            log.refuse()  # a model gone wrong: what was planned before it stays in force
+            log.refused_plans += 1  # a model gone wrong: the plans before it stay in force
             continue
         timeline = parts.timeline.accept(plan, timeline)
         log.planned(plan)

@@ -1,25 +1,41 @@
-"""Those who look on. One that raises is detached and named once: looking on never ends a run."""
+"""Observers of a run: the list that the loop calls, the status document, and systemd.
+
+An observer that raises is detached and named once: observing never ends a run.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
+import os
+import socket
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
-from sfms_robot.frames import Plan, Reading, SpeakerFrame
+from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.states import RunState
 from sfms_robot.signals.audio import energy_db
+
+IDLE_S: Final = 1.0  # period of `ServiceManager.alive` where no watchdog asks for more
+_DIGITS: Final = 4
+_NOTES: Final[Mapping[str, str]] = {
+    "starting": "joints are led into the face",
+    "idle": "no person is seen or heard: the listener's answers are not shown",
+    "halted": "halted: nothing is followed until every cause is cleared",
+    "stopping": "the head comes to rest",
+}
+_MOVING: Final = ("idle", "listening", "speaking", "degraded")
 
 log = logging.getLogger(__name__)
 
 
 class Observers:
-    """Hands what happens to every `ports.Observer`, in order.
+    """The `ports.Observer`s of a run, called in order.
 
     Attributes:
-        detached: name of each that raised, and what.
+        detached: name of each observer that raised, and its error.
     """
 
     def __init__(self, observers: Sequence[Observer]) -> None:
@@ -35,10 +51,10 @@ class Observers:
     def planned(self, plan: Plan) -> None:
         self._each(lambda observer: observer.planned(plan))
 
-    def _each(self, tell: Callable[[Observer], None]) -> None:
+    def _each(self, call: Callable[[Observer], None]) -> None:
         for observer in tuple(self._attached):
             try:
-                tell(observer)
+                call(observer)
             except Exception as error:
                 self._attached.remove(observer)
                 name = type(observer).__name__
@@ -46,28 +62,16 @@ class Observers:
                 log.warning("%s raised and is detached: %s", name, self.detached[name], exc_info=True)
 
 
-# --- Status of a run --------------------------------------------------------------------------------------------------
-#
-# The state of a run at this moment, as one document: for the terminal's panel, `--status` and the page. An observer
-# that keeps the newest of everything; the document is put together on request, in the requesting thread. The loop
-# pays for three assignments a tick.
+class RunStatus(Observer):
+    """The state of a run at this moment as one document, for the terminal's panel, `--status` and the page.
 
-_DIGITS: Final = 4
-_SAID: Final[Mapping[str, str]] = {
-    "starting": "joints are led into the face",
-    "idle": "nobody is seen or heard: the listener's answers are not shown",
-    "halted": "halted: nothing is followed until every cause is cleared",
-    "stopping": "the head comes to rest",
-}
-
-
-class RunStatus:
-    """`ports.Observer`.
+    Keeps the newest of everything; the document is built on request, in the requesting thread, so that the loop pays
+    for three assignments a tick.
 
     Args:
         joints: names, in the order of `Tick.goals_rad`.
-        facts: what never changes, such as head and port.
-        figures: what else the document holds, asked for every time.
+        facts: constant entries, such as head and port.
+        figures: called for further entries of each document.
     """
 
     def __init__(
@@ -76,9 +80,7 @@ class RunStatus:
         facts: Mapping[str, Any],
         figures: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
-        self._joints = tuple(joints)
-        self._facts = dict(facts)
-        self._figures = figures
+        self._joints, self._facts, self._figures = tuple(joints), dict(facts), figures
         self._tick: Tick | None = None
         self._ended: dict[str, Any] = {}
         self._frame: SpeakerFrame | None = None
@@ -97,11 +99,8 @@ class RunStatus:
         """Show the last state of the run from now on: torque is off, or could not be confirmed off."""
         self._ended = {"state": state.name, "why": list(state.why)}
 
-    def close(self) -> None:
-        """Nothing is open."""
-
     def document(self) -> dict[str, Any]:
-        """What `--status` serves. From any thread; JSON has no inf and no NaN: null."""
+        """Return the document that `--status` serves. From any thread. JSON has no inf and no NaN: null."""
         seen, frame = self._tick, self._frame
         document: dict[str, Any] = {
             "version": 1,
@@ -115,23 +114,16 @@ class RunStatus:
             document |= {"state": seen.state, "why": list(seen.why), "time_s": _number(seen.time_s)}
             document |= _servos(seen, self._joints)
         document |= self._ended
-        document["note"] = _note(document["state"], document["why"])
+        why = document["why"]
+        special = {"degraded": f"continues without {', '.join(why)}", "fault": "; ".join(why)}
+        document["note"] = {**_NOTES, **special}.get(document["state"])
         document["person"] = _person(frame)
         document["planned_s"] = self._planned_s
         return document | dict(self._figures() if self._figures else {})
 
 
-def _note(state: str, why: list[str]) -> str | None:
-    """Why something is not followed, in words; None where all is."""
-    if state == "degraded":
-        return f"goes on without {', '.join(why)}"
-    if state == "fault":
-        return "; ".join(why)
-    return _SAID.get(state)
-
-
 def _person(frame: SpeakerFrame | None) -> dict[str, Any]:
-    """What the newest frame holds of the person, and of the robot's own voice."""
+    """Return the content of the newest frame: of the person, and of the robot's own voice."""
     if frame is None:
         return {"voice_db": None, "seen": False, "attention": None, "own_voice_db": None}
     return {
@@ -143,12 +135,13 @@ def _person(frame: SpeakerFrame | None) -> dict[str, Any]:
 
 
 def _servos(seen: Tick, names: Sequence[str]) -> dict[str, Any]:
-    """Joints, faults by name, and the hottest servo."""
-    joints = {
-        joint: _joint(goal_rad, seen.readings[joint])
-        for joint, goal_rad in zip(names, seen.goals_rad.tolist(), strict=True)
-        if joint in seen.readings
-    }
+    """Return joints, faults by name, and the hottest servo."""
+    joints = {}
+    for joint, goal_rad in zip(names, seen.goals_rad.tolist(), strict=True):
+        if (reading := seen.readings.get(joint)) is not None:
+            present = None if reading.position_rad is None else _number(reading.position_rad)
+            joints[joint] = {"goal_rad": _number(goal_rad), "present_rad": present, "age_s": _number(reading.age_s)}
+            joints[joint] |= {name: _number(value) for name, value in reading.extra.items()}
     warmth = {joint: reading.extra.get("temperature_C", math.nan) for joint, reading in seen.readings.items()}
     known = {joint: degrees for joint, degrees in warmth.items() if math.isfinite(degrees)}
     hottest = max(known, key=lambda joint: known[joint], default=None)
@@ -159,11 +152,80 @@ def _servos(seen: Tick, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _joint(goal_rad: float, reading: Reading) -> dict[str, Any]:
-    present = None if reading.position_rad is None else _number(reading.position_rad)
-    extra = {name: _number(value) for name, value in reading.extra.items()}
-    return {"goal_rad": _number(goal_rad), "present_rad": present, "age_s": _number(reading.age_s), **extra}
-
-
 def _number(value: float) -> float | None:
     return round(float(value), _DIGITS) if math.isfinite(value) else None
+
+
+class ServiceManager:
+    """The notifications that a service manager expects: ready, alive, stopping (sd_notify(3), sd_watchdog_enabled(3)).
+
+    Datagrams of lines to the unix socket that NOTIFY_SOCKET names ("@" begins an abstract name); without it nothing is
+    sent. WATCHDOG_USEC is the longest silence allowed; systemd advises half of it as period. Never raises: a run does
+    not end because a datagram is lost.
+
+    Attributes:
+        wanted: a service manager is there.
+        every_s: period at which `alive` is to be called.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        self._address = environment.get("NOTIFY_SOCKET", "")
+        microseconds = environment.get("WATCHDOG_USEC", "")
+        mine = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self.wanted = bool(self._address)
+        self._watched = bool(self._address) and microseconds.isdigit() and int(microseconds) > 0 and mine
+        self.every_s = int(microseconds) / 2e6 if self._watched else IDLE_S
+
+    def ready(self, status: str) -> None:
+        """Report that the start is complete."""
+        self._send(f"READY=1\nSTATUS={status}")
+
+    def alive(self) -> None:
+        """Feed the watchdog. Called every `every_s`, by the code that must not hang."""
+        if self._watched:
+            self._send("WATCHDOG=1")
+
+    def status(self, status: str) -> None:
+        """Set the line of `systemctl status`."""
+        self._send(f"STATUS={status}")
+
+    def stopping(self) -> None:
+        """Report that the program ends on purpose."""
+        self._send("STOPPING=1")
+
+    def _send(self, lines: str) -> None:
+        if not self._address:
+            return
+        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+            sender.setblocking(False)
+            sender.sendto(lines.encode(), address)
+
+
+class NotifyingObserver(Observer):
+    """Observer that reports a run as ready when its joints are led into the face, and as alive while it ticks.
+
+    So the service manager restarts a loop that hangs, whatever else still runs.
+    """
+
+    def __init__(self, manager: ServiceManager) -> None:
+        self._manager = manager
+        self._next_s = 0.0
+        self._ready = False
+        self._shown: tuple[str, tuple[str, ...]] | None = None
+
+    def tick(self, seen: Tick) -> None:
+        """Send at most one datagram in most ticks, without waiting for it."""
+        if (seen.state, seen.why) != self._shown:
+            self._shown = seen.state, seen.why
+            words = ": ".join([seen.state, *([", ".join(seen.why)] if seen.why else [])])
+            if not self._ready and seen.state in _MOVING:
+                self._ready = True
+                self._manager.ready(words)
+            elif seen.state == "stopping":
+                self._manager.stopping()
+            else:
+                self._manager.status(words)
+        if seen.time_s >= self._next_s:
+            self._next_s = seen.time_s + self._manager.every_s
+            self._manager.alive()

@@ -1,9 +1,8 @@
-"""What a listener is about to do: the events it has decided, or nods, blinks and smiles found in its plans.
+"""Events that a listener is about to show: those it has decided, or nods, blinks and smiles found in its plans.
 
-A listener that decides tells each event in a plan, with what spoke for it, before it begins (`frames.Plan.events`). Of
-one that does not, the planned frames, newest over oldest, are one motion at 25 Hz, and the detectors of
-`signals.events` look at its last seconds: a nod or a blink is told when a plan holds it whole, a smile when it has
-lasted 0.4 s; each once.
+A listener with events puts each one into a plan before it begins, with its evidence (`frames.Plan.events`). For others
+the planned frames, newest over oldest, are one motion at 25 Hz, and the detectors of `signals.events` search its last
+seconds: a nod or a blink is reported when a plan holds it whole, a smile when it has lasted 0.4 s; each once.
 """
 
 from __future__ import annotations
@@ -17,33 +16,33 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.errors import InputError
-from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, Doubles, ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, Doubles, ListenerEvent, Plan
+from sfms_robot.ports import Observer
 from sfms_robot.signals.events import MOTION_EVENTS
 
 log = logging.getLogger(__name__)
 
-WINDOW: Final = 8 * FRAME_HZ  # frames that are looked at; no nod is longer
-NEWS: Final = 2 * FRAME_HZ  # what ended longer ago than this many frames is no news: the window's edge made it
+WINDOW: Final = 8 * FRAME_HZ  # frames that are searched; no nod is longer
+NEWS: Final = 2 * FRAME_HZ  # an event that ended more frames ago is not new: the edge of the window made it
 MOST_WAITING: Final = 10 * FRAME_HZ  # plans
 
 
 class PlannedEvents:
-    """Plans in, events out. Remembers `WINDOW` frames."""
+    """Detector of events in plans, with a memory of `WINDOW` frames."""
 
     def __init__(self) -> None:
         self._signals = np.zeros((len(MOTION_EVENTS), 0))
         self._first = 0  # index, in frames of 40 ms, of the first column
-        self._told_until_s: dict[str, float] = {}
+        self._reported_s: dict[str, float] = {}
         self._decided: list[ListenerEvent] | None = None  # None: a listener that decides none
 
     def add(self, plan: Plan) -> list[ListenerEvent]:
-        """Events that this plan completes, in the order in which they begin."""
+        """Return the events that this plan completes, in the order of their beginnings."""
         self.join(plan)
         return self.news()
 
     def news(self) -> list[ListenerEvent]:
-        """Events of the plans so far that were not told yet; ask within `NEWS` frames of each other."""
+        """Return new events of the plans so far; call at least every `NEWS` frames."""
         if self._decided is not None:
             decided, self._decided = self._decided, []
             return decided
@@ -51,18 +50,18 @@ class PlannedEvents:
         return sorted(found, key=lambda event: event.start_s)
 
     def join(self, plan: Plan) -> None:
-        """Take a plan, look at nothing."""
+        """Add a plan without searching it."""
         if plan.hazards_hz or plan.events:
             self._decided = [*(self._decided or ()), *plan.events]
             return
         columns = np.array([kind.signal(plan.frames) for kind in MOTION_EVENTS.values()], np.float64)
         begins = round(float(plan.times_s[0]) * FRAME_HZ)
         known = self._signals.shape[1]
-        if not known or not 0 <= begins - self._first <= known + WINDOW:  # the first plan, or another time altogether
+        if not known or not 0 <= begins - self._first <= known + WINDOW:  # the first plan, or one of another time
             self._signals, self._first, known = columns[:, :0], begins, 0
-            self._told_until_s = dict.fromkeys(MOTION_EVENTS, float("-inf"))
+            self._reported_s = dict.fromkeys(MOTION_EVENTS, float("-inf"))
         at = begins - self._first
-        if at > known:  # nothing was planned meanwhile: the face stays
+        if at > known:  # a gap without plans: the face stays
             self._signals = np.pad(self._signals, ((0, 0), (0, at - known)), mode="edge")
         joined = np.concatenate([self._signals[:, :at], columns], axis=1)
         self._first += max(0, joined.shape[1] - WINDOW)
@@ -74,20 +73,20 @@ class PlannedEvents:
         for start, end, size in kind.find(signal, FRAME_HZ):
             if end < last_s - NEWS / FRAME_HZ or (kind.whole and end > last_s - 0.5 / FRAME_HZ):
                 continue
-            if begins_s + start > self._told_until_s[name]:
+            if begins_s + start > self._reported_s[name]:
                 news.append(ListenerEvent(name, float(begins_s + start), float(end - start), float(size)))
-            self._told_until_s[name] = max(self._told_until_s[name], begins_s + end)
+            self._reported_s[name] = max(self._reported_s[name], begins_s + end)
         return news
 
 
-class EventWatch:
-    """A `ports.Observer` that tells events to callbacks, in a thread of its own: the loop only hands it the plans.
+class EventWatch(Observer):
+    """Observer that calls callbacks with events, in a thread of its own: the loop only hands over the plans.
 
-    Callbacks run one after the other. One that raises is detached and named; plans that a slow one makes wait for
-    longer than ten seconds are left out.
+    Callbacks run one after the other. One that raises is detached and named; plans that wait for a slow one for longer
+    than ten seconds are left out.
 
     Attributes:
-        detached: callbacks that raised, and what.
+        detached: callbacks that raised, and their errors.
     """
 
     def __init__(self) -> None:
@@ -114,20 +113,14 @@ class EventWatch:
                 self._plans.append(plan)
                 self._changed.notify()
 
-    def tick(self, seen: Tick) -> None:
-        """Plans say it earlier."""
-
-    def heard(self, frame: SpeakerFrame) -> None:
-        """Only the listener's own motion counts."""
-
     def close(self) -> None:
-        """What has been planned is still told. Does not wait for it: a callback may be what closes."""
+        """End after the events of the plans so far. Does not wait for them, because a callback may call this."""
         with self._changed:
             self._closing = True
             self._changed.notify()
 
     def join(self, limit_s: float) -> None:
-        """After `close`: wait until everything has been told."""
+        """Wait until all events have been reported, after `close`."""
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(limit_s)
 
@@ -140,9 +133,9 @@ class EventWatch:
                     return
                 plan = self._plans.popleft()
             for event in events.add(plan):
-                self._tell(event)
+                self._call(event)
 
-    def _tell(self, event: ListenerEvent) -> None:
+    def _call(self, event: ListenerEvent) -> None:
         for entry in tuple(self._callbacks):
             kind, callback = entry
             if kind != event.kind:

@@ -1,14 +1,14 @@
-"""The run as a file: an observer that writes DIR/run.mcap, which `replay` and Foxglove open.
+"""Recording of a run: an observer that writes DIR/run.mcap, which `replay` and Foxglove open.
 
 The loop only drops a value into a bounded queue; a thread of its own encodes and writes. When the queue is full a
 value is dropped and counted, never waited for - except in virtual time, where waiting costs nothing and the file must
-be whole. Chunks are small, so that what a killed run leaves behind can be read up to its last second. A run of hours
+be whole. Chunks are small, so that the file of a killed run can be read up to its last second. A run of hours
 continues in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
 
-Topics: /speaker (25 Hz: sound, level, face, attention, place, and what the robot says next), /plan (per plan), /event
-(what was decided, and why; of a listener that decides nothing, nods, blinks and smiles found in its plans), /face (per
-tick: the 58 channels asked for), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: what
-else they tell), /state (when it changes).
+Topics: /speaker (25 Hz: sound, level, face, attention, place, and the robot's own voice), /plan (per plan), /event
+(decisions with their evidence; of a listener without events, nods, blinks and smiles found in its plans), /face (per
+tick: the 58 requested channels), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: their
+other values), /state (when it changes).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals.audio import energy_db
 
@@ -101,11 +101,11 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
 }
 
 
-class Recorder:
-    """`ports.Observer` that writes a run to a folder.
+class Recorder(Observer):
+    """Observer that writes a run to a folder.
 
     joints: names, in the order of `Tick.goals_rad`. when_full: "drop" beside a real clock, "wait" in virtual time.
-    about: what else to keep in the file, text by text. Raises ConfigError when the folder cannot be written to.
+    about: further texts to keep in the file. Raises ConfigError when the folder cannot be written to.
     """
 
     def __init__(
@@ -124,26 +124,30 @@ class Recorder:
         self._trouble: str | None = None
         self._closed = False
         self._folder = folder
-        self._about = {**(about or {}), "joints": json.dumps(self._joints), "started_utc": _now_utc()}
+        self._about = {
+            **(about or {}),
+            "joints": json.dumps(self._joints),
+            "started_utc": datetime.now(UTC).isoformat(),
+        }
         self._parts = 0
         self._in_part = 0
         self._events = PlannedEvents()
         self._state: tuple[str, tuple[str, ...]] | None = None
-        self._servos_s = self._looked_s = -math.inf
+        self._servos_s = self._searched_s = -math.inf
         self._begin()
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
     def tick(self, seen: Tick) -> None:
-        """One turn of the loop. The readings are copied: the bus may go on changing its own."""
+        """Queue a tick. The readings are copied, because the bus may change its own later."""
         self._put(replace(seen, readings=dict(seen.readings)))
 
     def heard(self, frame: SpeakerFrame) -> None:
-        """What the person did."""
+        """Queue a frame of the person."""
         self._put(frame)
 
     def planned(self, plan: Plan) -> None:
-        """What the listener answered."""
+        """Queue a plan of the listener."""
         self._put(plan)
 
     def close(self) -> None:
@@ -160,7 +164,7 @@ class Recorder:
             _log.warning("the recording lacks %d values: the disk was too slow", self._dropped)
 
     def statistics(self) -> dict[str, Any]:
-        """Return for the report: messages written, values dropped, bytes on disk, and what went wrong with the file."""
+        """Return figures for the report: messages written, values dropped, bytes on disk, and trouble with the file."""
         size = sum(part.stat().st_size for part in parts_of(self._folder))
         return {"messages": self._written, "dropped": self._dropped, "bytes": size, "trouble": self._trouble}
 
@@ -195,15 +199,15 @@ class Recorder:
         self._attempt(self._file.close)
 
     def _work(self) -> None:
-        """The thread: runs till close. After trouble with the file it goes on emptying the queue."""
+        """Write until `close`, in the thread. After trouble with the file only empty the queue."""
         while (value := self._queue.get()) is not None:
             if self._trouble is None:
-                self._attempt(partial(self._take, value))
+                self._attempt(partial(self._write, value))
         if self._trouble is None:
-            self._attempt(lambda: self._write(self._news(math.inf)))
+            self._attempt(partial(self._write, None))
 
     def _attempt(self, action: Callable[[], Any]) -> None:
-        """Do it; any failure of the file ends the recording, not the run, and is in the report."""
+        """Call `action`; any failure of the file ends the recording, not the run, and is in the report."""
         try:
             with _naming(self._folder):
                 action()
@@ -212,11 +216,9 @@ class Recorder:
             self._trouble = self._trouble or f"{kind}{error}"
             _log.error("the recording ends here: %s", self._trouble)
 
-    def _take(self, value: Tick | SpeakerFrame | Plan) -> None:
-        self._write(self._messages(value))
-
-    def _write(self, messages: Sequence[Message]) -> None:
-        for topic, time_s, body in messages:
+    def _write(self, value: Tick | SpeakerFrame | Plan | None) -> None:
+        """Write the messages of a value; None: the last events."""
+        for topic, time_s, body in self._news(math.inf) if value is None else self._messages(value):
             time_ns = max(0, round(time_s * 1e9))
             self._writer.add_message(self._channels[topic], time_ns, orjson.dumps(body), time_ns)
             self._written += 1
@@ -226,7 +228,7 @@ class Recorder:
             self._begin()
 
     def _messages(self, value: Tick | SpeakerFrame | Plan) -> list[Message]:
-        """What one value becomes in the file: topic, time, body."""
+        """Return the messages of one value: topic, time, body."""
         if isinstance(value, SpeakerFrame):
             return [("/speaker", value.time_s, _speaker_body(value))]
         if isinstance(value, Plan):
@@ -246,10 +248,10 @@ class Recorder:
         return messages
 
     def _news(self, now_s: float) -> list[Message]:
-        """What plans hold, once a second: looking takes a millisecond that the loop's thread may have to wait for."""
-        if 0 <= now_s - self._looked_s < EVENTS_S:
+        """Return the events of plans, once a second: a search takes a millisecond that may delay the loop's thread."""
+        if 0 <= now_s - self._searched_s < EVENTS_S:
             return []
-        self._looked_s = now_s
+        self._searched_s = now_s
         return [("/event", event.start_s, asdict(event)) for event in self._events.news()]
 
 
@@ -262,7 +264,7 @@ def check_folder(folder: Path, overwrite: bool = False) -> None:
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
-    """Write DIR/report.json, whole or not at all. An error is logged: the report is printed all the same."""
+    """Write DIR/report.json, whole or not at all. An error is logged: the report is printed in any case."""
     part = folder / (REPORT_FILE + ".part")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -275,12 +277,12 @@ def write_report(folder: Path, report: Mapping[str, Any]) -> None:
 
 
 def part_name(part: int) -> str:
-    """File name of a recording's first, second ... part."""
+    """Return the file name of a recording's first, second ... part."""
     return RUN_FILE if part == 1 else f"run-{part:04d}.mcap"
 
 
 def parts_of(folder: Path) -> list[Path]:
-    """The files of a recording, in order; none where there is none."""
+    """Return the files of a recording, in order; empty without one."""
     first = folder / RUN_FILE
     return [first, *sorted(folder.glob("run-[0-9][0-9][0-9][0-9].mcap"))] if first.is_file() else []
 
@@ -300,10 +302,6 @@ def _open(folder: Path, name: str) -> BinaryIO:
         for old in parts_of(folder):  # of a recording that may be replaced, see `check_folder`
             old.unlink()
     return (folder / name).open("wb")
-
-
-def _now_utc() -> str:
-    return datetime.now(UTC).isoformat()
 
 
 def _plan_body(plan: Plan) -> dict[str, Any]:
@@ -363,7 +361,7 @@ def _by_channel(motion: Floats) -> dict[str, float]:
 
 
 def _number(value: float) -> float:
-    """What is not finite becomes null on disk: JSON has no inf and no NaN."""
+    """Round a number. Values that are not finite become null on disk: JSON has no inf and no NaN."""
     return round(float(value), _DIGITS)
 
 

@@ -1,4 +1,11 @@
-"""What keeps a run safe from the outside: the way to rest, and signals turned into a request to end."""
+"""Protection of a run: the way to rest, servos that get warm, and signals turned into a request to end.
+
+A warm servo moves less, and so slower; a hot one goes to rest and stays there until it has cooled. Every joint has a
+share: 1 shows the requested angle, 0 is its rest angle. The share is `WARM_SHARE` while the servo is warm and 0 while
+it is hot, changes over seconds, and comes back `COOLER_C` below the threshold that it left at. Joints that show one
+pose together (a neck) use the smallest of their shares. A servo without a temperature counts as cool; at its own limit
+its own protection acts, and `on_fault` of the joint.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +13,7 @@ import logging
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from types import FrameType
 from typing import Any, Final
 
@@ -18,11 +26,14 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.signals.minimum_jerk import ease
 
 EASE_S: Final = 1.0  # torque-on pose -> live face, and live face -> rest
-REST_LIMIT_S: Final = 60.0  # of the whole way to rest; twice what the slowest joint of a shipped head may need
+REST_LIMIT_S: Final = 60.0  # of the whole way to rest; twice the need of the slowest joint of a shipped head
 ARRIVED_RAD: Final = 1e-4  # of a goal
 STANDS_RAD: Final = 0.01  # of a servo: its gear and its load leave it a little short
 FOLLOW_S: Final = 0.3  # that servos are given after their goals have arrived
 FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
+WARM_SHARE: Final = 0.5
+COOLER_C: Final = 3.0
+PER_S: Final = 0.5  # of the share: from moving to rest in two seconds
 
 Seen = Callable[[float, float, Doubles, Mapping[str, Reading]], None]  # time, share of the way ahead, goals, readings
 logger = logging.getLogger(__name__)
@@ -43,7 +54,7 @@ def come_to_rest(
     Takes as long as the limiter needs to bring its goals there, so that no joint loses its torque on the way. It needs
     time of its own ticks, so a computer that is late for some takes longer. Once the goals have arrived, servos have
     `FOLLOW_S` to follow, whether they move or not. A tick that raises (a bus that fails, a goal that is refused) is
-    said once and left out; after `FAILURES` in a row it gives up. `seen` is told of every other one. Never raises an
+    logged and left out; after `FAILURES` in a row it gives up. `seen` is called after every other one. Never raises an
     Exception.
     """
     span = rest_rad - from_rad
@@ -65,29 +76,78 @@ def come_to_rest(
             seen(tick.time_s, 1.0 - angle, goals_rad, readings)
             if bool(np.all(np.abs(goals_rad - rest_rad) < ARRIVED_RAD)):
                 arrived_s = tick.time_s if arrived_s is None else arrived_s
-                stand = _stand(bus.joints, readings, rest_rad)
+                places = [readings[joint].position_rad if joint in readings else None for joint in bus.joints]
+                stand = all(at is None or abs(at - r) < STANDS_RAD for at, r in zip(places, rest_rad, strict=True))
                 arrived = stand or tick.time_s - arrived_s >= FOLLOW_S
-        except Exception as error:  # whatever it is, the other buses are still to be eased
+        except Exception as error:  # of any kind: the other buses are still to be eased
             failed += 1
             logger.error("on the way to rest: %s", error)
         if failed >= FAILURES or (arrived and since_s >= EASE_S) or since_s >= REST_LIMIT_S:
             return
 
 
-def _stand(joints: Sequence[str], readings: Mapping[str, Reading], rest_rad: Doubles) -> bool:
-    """Whether every servo that tells its position is at rest."""
-    stands = [readings[joint].position_rad if joint in readings else None for joint in joints]
-    return all(at is None or abs(at - rest) < STANDS_RAD for at, rest in zip(stands, rest_rad, strict=True))
+@dataclass(frozen=True)
+class Heat:
+    """Derating of the joints, (J,) each.
+
+    Attributes:
+        share: of the requested angle that a joint shows.
+        wanted: the share that it moves toward.
+    """
+
+    share: Doubles
+    wanted: Doubles
+
+    @classmethod
+    def cool(cls, joints: int) -> Heat:
+        return cls(np.ones(joints), np.ones(joints))
+
+    @property
+    def none(self) -> bool:
+        """True if every joint shows the requested angle."""
+        return bool((self.share == 1.0).all())
+
+
+class HeatGuard:
+    """Temperature derating. warm_C, hot_C: (J,). together: columns of joints that show one pose."""
+
+    def __init__(self, warm_C: Doubles, hot_C: Doubles, together: Sequence[int] = ()) -> None:
+        self._warm_C, self._hot_C, self._together = warm_C, hot_C, list(together)
+
+    def judge(self, temperatures_C: Doubles, heat: Heat) -> Heat:
+        """Return the shares to move toward for temperatures (J,), NaN where not known."""
+        left_hot = np.where(heat.wanted < WARM_SHARE, COOLER_C, 0.0)
+        left_warm = np.where(heat.wanted < 1.0, COOLER_C, 0.0)
+        with np.errstate(invalid="ignore"):  # NaN is not hot
+            hot = temperatures_C >= self._hot_C - left_hot
+            warm = temperatures_C >= self._warm_C - left_warm
+        wanted = np.where(hot, 0.0, np.where(warm, WARM_SHARE, 1.0))
+        if self._together:
+            wanted[self._together] = wanted[self._together].min()
+        return replace(heat, wanted=wanted)
+
+    def after(self, heat: Heat, dt_s: float) -> Heat:
+        """Return the shares `dt_s` later."""
+        if (heat.share == heat.wanted).all():
+            return heat
+        step = np.clip(heat.wanted - heat.share, -PER_S * dt_s, PER_S * dt_s)
+        return replace(heat, share=heat.share + step)
+
+
+def temperatures_C(joints: Sequence[str], readings: Mapping[str, Reading]) -> Doubles:
+    """Return the temperatures (J,) of the freshest readings, NaN for a servo without one."""
+    known = (readings[joint].extra.get("temperature_C") if joint in readings else None for joint in joints)
+    return np.array([np.nan if each is None else each for each in known])
 
 
 class Released(KeyboardInterrupt):
-    """Asked to end for the second time: torque is off."""
+    """The second request to end: torque is off."""
 
 
 class Interrupt:
-    """Somebody asks a run to end: once, and the head comes to rest; twice, and torque is off at once.
+    """Requests to end a run: after the first the head comes to rest, after the second torque is off at once.
 
-    Before `arm` nothing moves, so the first request ends whatever goes on by KeyboardInterrupt.
+    Before `arm` nothing moves, so the first request ends the program by KeyboardInterrupt.
     """
 
     def __init__(self) -> None:
@@ -95,24 +155,24 @@ class Interrupt:
         self._bus: Bus | None = None
 
     def arm(self, bus: Bus) -> None:
-        """Torque comes on from here on; `bus` is what a second request releases."""
+        """Note that torque comes on; a second request releases `bus`."""
         self._bus = bus
 
     def __call__(self) -> bool:
-        """Whether somebody asked."""
+        """Return whether there was a request."""
         return self._asked > 0
 
     def ask(self) -> None:
-        """A request from any thread: counts, and releases at the second. Raises nothing."""
+        """Count a request from any thread, and release at the second. Raises nothing."""
         self._asked += 1
         if self._asked > 1 and self._bus is not None:
             self._bus.torque_off("release")
 
     def on_signal(self, number: int, frame: FrameType | None) -> None:
-        """A request from the main thread's signal handler. Ctrl-\\ asks for release at once, as a second Ctrl-C does.
+        """Count a request in the main thread's signal handler. Ctrl-\\ releases at once, as a second Ctrl-C does.
 
-        Raises KeyboardInterrupt before torque, `Released` at the second request: what blocks then is cut short. Those
-        after it send torque-off again and raise nothing, so that the cleaning up goes on.
+        Raises KeyboardInterrupt before torque, `Released` at the second request, which interrupts a call that blocks.
+        Later ones send torque-off again and raise nothing, so that the cleaning up continues.
         """
         before = self._asked
         if number == getattr(signal, "SIGQUIT", None):
@@ -124,21 +184,18 @@ class Interrupt:
             raise Released
 
 
-# Ctrl-C, kill, a terminal or connection that closes, Ctrl-\; the last two do not exist on Windows.
-_ENDINGS: Final = [
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name)
-]
-
-
 @contextmanager
 def signals_to(interrupt: Interrupt) -> Iterator[None]:
-    """SIGINT, SIGTERM, SIGHUP and SIGQUIT ask `interrupt`, so that no write is cut in half. Restored on exit.
+    """Turn SIGINT, SIGTERM, SIGHUP and SIGQUIT into requests, so that no write is cut in half. Restored on exit.
 
-    SIGHUP only where it is not ignored: under nohup a lost terminal ends nothing. Only in the main thread: Python
-    gives signals to no other.
+    Ctrl-C, kill, a terminal or connection that closes, Ctrl-\\; the last two do not exist on Windows. SIGHUP only where
+    it is not ignored: under nohup a lost terminal ends nothing. Only in the main thread: Python gives signals to no
+    other.
     """
+    names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     hangup = getattr(signal, "SIGHUP", None)
-    heeded = [each for each in _ENDINGS if each != hangup or signal.getsignal(each) is not signal.SIG_IGN]
+    heeded = [each for each in numbers if each != hangup or signal.getsignal(each) is not signal.SIG_IGN]
     previous = {number: signal.signal(number, interrupt.on_signal) for number in heeded}
     try:
         yield

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Generic, Protocol, TypeVar
 
-from sfms_robot.config import Bus as BusConfig
+from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, PacketError, PortError, RobotError, ServoError
 from sfms_robot.frames import Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion

@@ -13,7 +13,7 @@ from functools import cache
 from importlib.metadata import EntryPoint
 from typing import Any, Final
 
-from sfms_robot.config.named_bus import BUS_GROUP
+from sfms_robot.config.joint import BUS_GROUP
 from sfms_robot.errors import ConfigError
 from sfms_robot.plugins import plug_in, plugin_error, plugins
 

@@ -1,13 +1,13 @@
-"""Does a person look at the head? From the direction of their eyes and head, relative to their neutral.
+"""Attention of a person to the head, from the direction of their eyes and head, relative to their neutral.
 
-Gaze is head plus eyes. Somebody who looks at the camera from the side turns to it, so where the place of their eyes is
-known the direction to the camera is taken off first. What is left has a neutral of its own: a phone that stands aside,
-a tracker's offset, a camera beside the head. It is learnt as a running median (every look moves it by the same small
-step, however far it goes), quickly in the first seconds of a face and slowly after, so that a person may look aside
-for less than half of the time without becoming somebody who looks at the head from there.
+Gaze is head plus eyes. A person who looks at the camera from the side turns to it, so where the place of their eyes is
+known the direction to the camera is subtracted first. The rest has a neutral: a phone that stands aside, a tracker's
+offset, a camera beside the head. It is learnt as a running median (every look moves it by the same small step, however
+far it goes), quickly in the first seconds of a face and slowly after, so that looks aside for less than half of the
+time do not become the neutral.
 
 Laws: a blink changes nothing; 30 degrees aside is under 0.2 within 0.3 s; never more attention for a larger angle; no
-face, no number, nor from one that has neither shown a head nor eyes that turn (a tracker of the mouth alone).
+number without a face, nor from a face that has shown neither a head nor eyes that turn (a tracker of the mouth alone).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import BLINKS, YAW_PITCH, Doubles, FaceFrame, Floats
-from sfms_robot.signals.eye_angles import direction_to, directions
+from sfms_robot.signals.gaze_kinematics import EYE_PAN_RAD, EYE_TILT_RAD, direction_to, directions
 
 HALF_RAD: Final = math.radians(10.0)  # attention 0.5: about twice what a gaze from a face tracker scatters
 SLOPE_RAD: Final = math.radians(2.0)
@@ -29,20 +29,20 @@ BLINK_S: Final = 0.5  # closed for longer, eyes look at nothing
 NEUTRAL_START_RAD_S: Final = math.radians(6.0)
 NEUTRAL_RAD_S: Final = math.radians(0.3)
 SETTLE_S: Final = 4.0
-FORGET_S: Final = 10.0  # whoever comes after so long is somebody else
-_FULL_RAD: Final = np.radians([30.0, 20.0])  # an eye's yaw and pitch for a channel of 1
+FORGET_S: Final = 10.0  # a face after so long is another person
+_FULL_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
 
 
 @dataclass(frozen=True)
 class AttentionState:
-    """What is remembered of a face.
+    """Memory of a face.
 
     Attributes:
-        time_s: of the last one; None before the first.
-        seen_s: for how long it has been seen with open eyes.
-        neutral_rad: (2,) yaw and pitch of the gaze that is at the head.
-        eyes_rad: (2,) of the last open eyes; `open_s` is when.
-        attention: the last one.
+        time_s: of the last face; None before the first.
+        seen_s: total time with open eyes.
+        neutral_rad: (2,) yaw and pitch of a gaze at the head.
+        eyes_rad: (2,) of the last open eyes, at `open_s`.
+        attention: of the last face.
         turns: head or eyes have been anywhere but at zero.
     """
 
@@ -58,7 +58,7 @@ class AttentionState:
 def attend(
     face: FaceFrame | None, place_m: Floats | None, state: AttentionState
 ) -> tuple[float | None, AttentionState]:
-    """The attention (0..1) of a face, and the state after it; None where that cannot be told.
+    """Return the attention (0..1) of a face, None if unknown, and the state after it.
 
     `place_m` (3,): see `frames.Sighting`. A face that is not newer than the last one changes nothing.
     """
@@ -95,7 +95,7 @@ def _to_camera(place_m: Floats | None) -> Doubles:
 
 
 def _learnt(neutral_rad: Doubles, gaze_rad: Doubles, dt_s: float, seen_s: float) -> Doubles:
-    """The neutral, nearer to this look by one step of a running median."""
+    """Return the neutral, nearer to this look by one step of a running median."""
     speed_rad_s = NEUTRAL_RAD_S + (NEUTRAL_START_RAD_S - NEUTRAL_RAD_S) * math.exp(-seen_s / SETTLE_S)
     off_rad = gaze_rad - neutral_rad
     far_rad = float(np.hypot(*off_rad))
@@ -104,5 +104,5 @@ def _learnt(neutral_rad: Doubles, gaze_rad: Doubles, dt_s: float, seen_s: float)
 
 
 def _at(angle_rad: float) -> float:
-    """Attention of a gaze that is `angle_rad` away from the head, falling."""
+    """Return the attention of a gaze that is `angle_rad` away from the head, falling with the angle."""
     return 1.0 / (1.0 + math.exp((angle_rad - HALF_RAD) / SLOPE_RAD))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.frames import AUDIO_HZ, Doubles, Floats
 
 if TYPE_CHECKING:
     import soundfile
@@ -28,7 +28,7 @@ _NONE: Final = np.zeros(0, dtype=np.float32)
 
 
 class Resampler:
-    """Pieces of sound at one rate -> pieces at 16 kHz; put together they are the whole resampled at once."""
+    """A stream from one rate to 16 kHz; its pieces, put together, equal the whole resampled at once."""
 
     def __init__(self, rate_hz: float) -> None:
         self._stream: Any = None
@@ -38,7 +38,7 @@ class Resampler:
             self._stream = soxr.ResampleStream(rate_hz, AUDIO_HZ, 1, dtype="float32", quality="HQ")
 
     def push(self, samples: NDArray[np.float32], last: bool = False) -> Floats:
-        """(n,) or (n, channels) -> (m,) mono, clipped to -1..1; some samples come out later, the rest with `last`."""
+        """Return (m,) mono, -1..1, of samples (n,) or (n, channels); some come out later, the rest with `last`."""
         mixed = samples.mean(axis=1, dtype=np.float64).astype(np.float32) if samples.ndim > 1 else samples
         if self._stream is not None:
             mixed = self._stream.resample_chunk(np.ascontiguousarray(mixed), last=last)
@@ -70,7 +70,7 @@ class AudioFile:
         self._over = False
 
     def read(self, n: int) -> Floats:
-        """The next `n` samples, fewer at the end."""
+        """Return the next `n` samples, fewer at the end."""
         pieces, have = [self._ready], len(self._ready)
         while have < n and not self._over:
             pieces.append(self._piece())
@@ -95,7 +95,7 @@ class AudioFile:
 
 
 def read_audio(path: Path | str) -> Floats:
-    """A whole sound file as (n,) mono 16 kHz, -1..1, as `AudioFile` reads it. Raises what it raises."""
+    """Return a whole sound file as (n,) mono 16 kHz, -1..1. Raises ConfigError as `AudioFile`."""
     file = AudioFile(path)
     try:
         return file.read(file.length + _BLOCK)
@@ -111,8 +111,7 @@ def _open(path: Path) -> soundfile.SoundFile:
     try:
         file = soundfile.SoundFile(str(path))
     except (soundfile.LibsndfileError, OSError, TypeError) as error:
-        formats = ", ".join(("WAV", "FLAC", "OGG", "MP3", "AIFF"))
-        raise ConfigError(f"{path}: not a sound file that can be read ({formats})") from error
+        raise ConfigError(f"{path}: not a sound file that can be read (WAV, FLAC, OGG, MP3, AIFF)") from error
     try:
         _check(file, path)
     except BaseException:
@@ -122,38 +121,65 @@ def _open(path: Path) -> soundfile.SoundFile:
 
 
 def _check(file: soundfile.SoundFile, path: Path) -> None:
-    """Before anything moves: what is in the header, and of formats that can hold anything every sample."""
+    """Check the header, and every sample of formats that may hold any value. Raises ConfigError."""
     if not file.frames:
         raise ConfigError(f"{path}: holds no samples")
     if not LOWEST_RATE_HZ <= file.samplerate <= HIGHEST_RATE_HZ:
         allowed = f"{LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ}"
-        raise ConfigError(f"{path}: {file.samplerate} samples a second is no rate for speech ({allowed})")
+        raise ConfigError(f"{path}: {file.samplerate} samples a second is not a rate of speech ({allowed})")
     if "should be" in file.extra_info:  # libsndfile's log: a chunk is longer than what is there
         logger.warning("%s: is cut off, its header promises more than the %d samples there are", path, file.frames)
-    for block in _blocks(file) if file.subtype in _UNBOUNDED else ():
+    for _ in range(math.ceil(file.frames / _BLOCK)) if file.subtype in _UNBOUNDED else ():
+        block = file.read(_BLOCK, dtype="float32", always_2d=True)
         if not np.isfinite(block).all():
             raise ConfigError(f"{path}: holds samples that are not finite")
         if (peak := float(np.abs(block).max(initial=0.0))) > LOUDEST:
             raise ConfigError(f"{path}: holds samples up to {peak:g}, full scale is 1: divide them")
 
 
-def _blocks(file: soundfile.SoundFile) -> Iterator[NDArray[np.float32]]:
-    for _ in range(math.ceil(file.frames / _BLOCK)):
-        yield file.read(_BLOCK, dtype="float32", always_2d=True)
-
-
 def energy_db(samples: Floats) -> float:
-    """Mean level of some samples in dB of full scale; -100 for silence and for none."""
+    """Return the mean level of samples in dB of full scale; -100 for silence and for no samples."""
     if not len(samples):
         return -100.0
     return _db(float(np.add.reduce(np.square(samples, dtype=np.float64))), len(samples))
 
 
 def energies_db(pieces: Floats) -> list[float]:
-    """`energy_db` of each of (N, n) samples."""
+    """Return `energy_db` of each row of samples (N, n)."""
     sums: list[float] = np.add.reduce(np.square(pieces, dtype=np.float64), axis=1).tolist()
     return [_db(each, pieces.shape[1]) for each in sums]
 
 
 def _db(energy: float, samples: int) -> float:
     return 10 * math.log10(max(energy / samples, 1e-10))
+
+
+# --- A sampled signal between its samples, by a windowed sinc: for odd rates, and rates that change -------------------
+
+_TAPS: Final = 32
+_PHASES: Final = 4096  # of one sample: the nearest is taken, which is 70 dB exact
+_BETA: Final = 8.0  # of the Kaiser window
+_AROUND: Final = np.arange(1 - _TAPS // 2, 1 + _TAPS // 2)
+
+
+@lru_cache(maxsize=1)
+def _kernels() -> Floats:
+    """Return (phases + 1, taps): weights of the samples around an instant, by its distance behind the one before."""
+    behind = np.arange(_PHASES + 1)[:, None] / _PHASES - _AROUND
+    inside = np.clip(1.0 - (2.0 * behind / _TAPS) ** 2, 0.0, 1.0)
+    kernels = np.sinc(behind) * np.i0(_BETA * np.sqrt(inside)) / np.i0(_BETA)
+    return np.asarray(kernels / kernels.sum(axis=1, keepdims=True), dtype=np.float32)
+
+
+def at_positions(samples: Floats, positions: Doubles) -> Floats:
+    """Return the signal (n,), n > 0, at `positions` (m,) in samples, whole or not; outside its samples it is 0.
+
+    Exact at whole positions; elsewhere within -60 dB up to 0.8 of half its rate.
+    """
+    before = np.floor(positions)
+    phases = np.rint((positions - before) * _PHASES).astype(np.intp)
+    around: NDArray[np.intp] = before.astype(np.intp)[:, None] + _AROUND
+    known = (around >= 0) & (around < len(samples))
+    taken = np.where(known, samples[np.clip(around, 0, len(samples) - 1)], np.float32(0))
+    signal: Floats = np.einsum("mt,mt->m", _kernels()[phases], taken)
+    return signal

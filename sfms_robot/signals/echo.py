@@ -1,9 +1,9 @@
-"""Echo cancellation: a microphone without what the robot's own loudspeaker says.
+"""Echo cancellation: a microphone signal without the robot's own loudspeaker.
 
-An adaptive filter takes away the linear echo, WebRTC's AEC3 (`pywebrtc-audio`) what is left of it. AEC3 alone mutes a
-person who talks over a loudspeaker as loud as he is; behind the filter it has little to mute. While nothing was said
-for half a second its output is not used at all: its high-pass costs speech detection a lot in low noise of motors.
-Who wants to know whether somebody talks over the loudspeaker asks the filter, which mutes nobody.
+An adaptive filter removes the linear echo, WebRTC's AEC3 (`pywebrtc-audio`) the rest. AEC3 alone mutes a person who
+talks over an equally loud loudspeaker; behind the filter it has little to mute. After half a second without own voice
+its output is not used at all: its high-pass costs speech detection a lot in low noise of motors. Speech over the
+loudspeaker is detected in the output of the filter, which mutes no voice.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class EchoFilter:
 
     A partitioned-block Kalman filter in the frequency domain (Enzner and Vary 2006, Kuech et al. 2014).
 
-    Its step size follows from its own uncertainty and from what the echo does not explain: when a person talks over the
-    loudspeaker it adapts slowly by itself, so nothing has to detect double talk. Memory is fixed; no latency.
+    Its step size follows from its own uncertainty and the power that the echo does not explain: when a person talks
+    over the loudspeaker it adapts slowly, so that double talk needs no detector. Memory is fixed; no latency.
 
     Attributes:
-        residual_power: (161,) of the echo that it expects to have left in the last block.
+        residual_power: (161,) of the echo that it expects in its last block.
     """
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class EchoFilter:
         self.residual_power: Doubles = np.zeros(BLOCK + 1)
 
     def push(self, mic: Doubles, reference: Doubles) -> Doubles:
-        """One block (160,) of each -> (160,) the microphone without the echo that the filter knows."""
+        """Return one block (160,) of the microphone without the echo that the filter knows of the reference (160,)."""
         self._reference = np.concatenate([self._reference[BLOCK:], reference])
         self._spectra = np.roll(self._spectra, 1, axis=0)
         self._spectra[0] = np.fft.rfft(self._reference)
@@ -65,7 +65,7 @@ class EchoFilter:
         return left
 
     def _adapt(self, error: Spectrum) -> None:
-        """Kalman update of weights and variance; the gradient keeps its causal half (overlap-save)."""
+        """Update weights and variance (Kalman); the gradient keeps its causal half (overlap-save)."""
         self._noise = _NOISE_MEMORY * self._noise + (1 - _NOISE_MEMORY) * np.abs(error) ** 2
         power = np.abs(self._spectra) ** 2
         unknown = (power * self._variance).sum(axis=0)
@@ -80,11 +80,11 @@ class EchoFilter:
 
 @dataclass(frozen=True)
 class Cancelled:
-    """Whole blocks of 10 ms.
+    """Whole blocks of 10 ms after echo cancellation.
 
     Attributes:
         audio: (b * 160,) without echo, `ECHO_LATENCY_SAMPLES` late.
-        linear: (b * 160,) what the filter alone leaves, not late.
+        linear: (b * 160,) output of the filter alone, not late.
         residual_power: (b, 161) of the echo in each block of `linear`, as the filter expects it (`EchoFilter`).
     """
 
@@ -94,10 +94,10 @@ class Cancelled:
 
 
 class EchoCanceller:
-    """Streams of any block size; what comes out does not depend on how they were cut.
+    """Echo canceller for blocks of any size, on which its output does not depend.
 
     Causal; the output is `ECHO_LATENCY_SAMPLES` late and holds whole blocks of 10 ms. Memory is fixed. AEC3 finds a
-    loudspeaker's delay by itself, up to half a second; the filter covers the first 250 ms. Without a reference the
+    loudspeaker's delay up to half a second; the filter covers the first 250 ms. Without a reference the
     microphone passes unchanged but for the delay.
     """
 
@@ -112,7 +112,7 @@ class EchoCanceller:
         self._share = 0.0  # of AEC3 in the output
 
     def push(self, mic: Floats, reference: Floats) -> Cancelled:
-        """(n,) heard and (n,) said at the same instants, 16 kHz, -1..1 -> the blocks that they complete.
+        """Return the blocks completed by (n,) samples of microphone and reference at the same instants, 16 kHz, -1..1.
 
         `reference` must not be later than its echo. Raises InputError when the two differ in length.
         """

@@ -1,7 +1,6 @@
-"""When a listener nods, blinks and smiles, and how that sits on the other person's speech.
+"""Nods, blinks and smiles in a motion.
 
-Pure functions on arrays sampled at `rate_hz` (25 in this project). An event is (start_s, end_s, size). The phrase-end
-ratio compares two windows after the same phrase ends, so a listener who nods at random gets 1.
+Pure functions on arrays sampled at `rate_hz` (25 in this project). An event is (start_s, end_s, size).
 """
 
 from __future__ import annotations
@@ -13,23 +12,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS
-from sfms_robot.signals.peaks import band_pass, find_peaks, half_widths
+from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS, Doubles
 
 Event = tuple[float, float, float]
 Bools = NDArray[np.bool_]
 
-AFTER_S: Final = (0.0, 0.8)  # right after a phrase end
-LATER_S: Final = (1.5, 3.0)  # what it is compared with
-QUIET_DB: Final = -66.0  # of full scale: nothing below is speech
-LISTENING_S: Final = 2.0  # somebody else spoke this recently
-
 
 def find_nods(pitch_rad: ArrayLike, rate_hz: float, least_rad: float = np.deg2rad(1.6)) -> list[Event]:
-    """Nods in a head pitch (N,): swings down and back (or back and down) of `least_rad` peak to peak or more.
+    """Find nods in a head pitch (N,): swings down and back (or back and down) of `least_rad` peak to peak or more.
 
-    Returns (start_s, end_s, peak-to-peak rad) in order. Only what swings faster than about 0.8 Hz counts, and only
-    swings that come back: a gaze shift goes one way, a drift is slow. Swings less than 0.3 s apart are one nod.
+    Returns (start_s, end_s, peak-to-peak rad) in order. Only swings faster than about 0.8 Hz count, and only
+    those that come back: a gaze shift goes one way, a drift is slow. Swings less than 0.3 s apart are one nod.
     """
     pitch = np.asarray(pitch_rad, np.float64)
     if len(pitch) < int(rate_hz):
@@ -54,14 +47,14 @@ def find_nods(pitch_rad: ArrayLike, rate_hz: float, least_rad: float = np.deg2ra
 
 
 def _turns(values: NDArray[np.float64], least: float) -> list[int]:
-    """Alternating highs and lows that stand out by `least`, with both ends."""
+    """Return alternating highs and lows that stand out by `least`, with both ends."""
     highs, _ = find_peaks(values, least)
     lows, _ = find_peaks(-values, least)
     return sorted({0, len(values) - 1, *highs.tolist(), *lows.tolist()})
 
 
 def find_blinks(blink: ArrayLike, rate_hz: float, least: float = 0.35) -> list[Event]:
-    """Blinks in a lid closure (N,) 0..1: rises by `least` that are over within 0.6 s. One frame is enough.
+    """Find blinks in a lid closure (N,) 0..1: rises by `least` that are over within 0.6 s. One frame is enough.
 
     Returns (start_s, end_s, height), counted against the closure around it, so lids that rest half closed are fine.
     """
@@ -77,7 +70,7 @@ def find_blinks(blink: ArrayLike, rate_hz: float, least: float = 0.35) -> list[E
 
 
 def find_smiles(smile: ArrayLike, rate_hz: float, least: float = 0.2) -> list[Event]:
-    """Smiles in a mouthSmile (N,): above `least` for 0.4 s or more; ends where it falls below half of that.
+    """Find smiles in a mouthSmile (N,): above `least` for 0.4 s or more; ends where it falls below half of that.
 
     Returns (start_s, end_s, peak).
     """
@@ -92,12 +85,12 @@ def find_smiles(smile: ArrayLike, rate_hz: float, least: float = 0.2) -> list[Ev
 
 @dataclass(frozen=True)
 class EventKind:
-    """How an event shows in motion.
+    """Detector of one kind of event in motion.
 
     Attributes:
-        signal: motion (..., 58) -> the signal (...,) it shows in.
+        signal: motion (..., 58) -> the signal (...,) that shows the event.
         find: signal (N,) and its rate -> events in order.
-        whole: it has to be over to be told.
+        whole: the event is reported only when it is over.
     """
 
     signal: Callable[[NDArray[np.floating]], NDArray[np.floating]]
@@ -107,7 +100,7 @@ class EventKind:
 
 _CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
 
-# What counts as a nod, a blink, a smile of a face: for the report, for callbacks, for whoever asks.
+# Definitions of a nod, a blink and a smile of a face, for the report, callbacks and evaluation.
 MOTION_EVENTS: Final[Mapping[str, EventKind]] = {
     "nod": EventKind(lambda motion: motion[..., CHANNEL_INDEX["pitch"]], find_nods, whole=True),
     "blink": EventKind(lambda motion: motion[..., BLINKS].max(axis=-1), find_blinks, whole=True),
@@ -115,152 +108,120 @@ MOTION_EVENTS: Final[Mapping[str, EventKind]] = {
 }
 
 
-def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.04) -> Bools:
-    """Speech per frame of `audio` (n,) by energy over an adaptive floor; last part frame left out.
-
-    The floor is the quietest twentieth of the 8 s around; the threshold lies 8 dB above it, but always 16 to 34 dB
-    below the loud parts, so that neither hum, nor gain, nor talk without a pause confuses it. Offline: it looks ahead.
-    """
-    from scipy import ndimage
-
-    samples = np.asarray(audio, np.float64)
-    size = int(round(rate_hz * frame_s))
-    frames = len(samples) // size
-    if not frames:
-        return np.zeros(0, bool)
-    power = (samples[: frames * size].reshape(frames, size) ** 2).mean(axis=1)
-    level_db = 10 * np.log10(power + 1e-10)
-    loud_db = np.percentile(level_db, 97)
-    floor_db = ndimage.percentile_filter(level_db, 5, size=max(3, int(8 / frame_s)), mode="nearest")
-    threshold_db = np.clip(floor_db + 8, loud_db - 34, loud_db - 16)
-    active = (level_db > threshold_db) & (level_db > QUIET_DB)
-    return _without_short(active, True, 2)
-
-
-def _without_short(active: Bools, value: bool, frames: int) -> Bools:
-    out = active.copy()
-    for start, end in runs(active == value):
-        if end - start < frames:
-            out[start:end] = not value
-    return out
-
-
 def runs(mask: ArrayLike) -> list[tuple[int, int]]:
-    """Half-open [start, end) of every run of True in (N,)."""
+    """Return half-open [start, end) of every run of True in (N,)."""
     bounds = np.flatnonzero(np.diff(np.r_[0, np.asarray(mask, np.int8), 0]))
     return list(zip(bounds[::2].tolist(), bounds[1::2].tolist(), strict=True))
 
 
-def phrase_ends(voice_active: ArrayLike, rate_hz: float, silence_s: float = 0.2) -> NDArray[np.float64]:
-    """Seconds at which speech ends and at least `silence_s` of silence follows."""
-    active = np.asarray(voice_active, bool)
-    need = int(np.ceil(silence_s * rate_hz - 1e-9))
-    silences = runs(~active)
-    return np.array([start / rate_hz for start, end in silences if start > 0 and end - start >= need])
+# --- Peaks and a zero-phase band-pass: numpy versions of scipy.signal -------------------------------------------------
+#
+# scipy takes 1.5 s and 60 MB to load, in a process that drives servos a hundred times a second. These functions give
+# the same numbers (tests compare them).
+
+Indices = NDArray[np.intp]
+
+_SETTLED: Final = 1e-12  # of what is left of a step when the filter counts as settled
+_EDGE: Final = 15  # samples mirrored at both ends, as scipy.signal.sosfiltfilt does for this order
 
 
-def listening_mask(voice_active: ArrayLike, rate_hz: float, own_voice: ArrayLike | None = None) -> Bools:
-    """True where the other spoke in the last 2 s (this instant included) and the listener is silent."""
-    active = np.asarray(voice_active, bool)
-    last = np.maximum.accumulate(np.where(active, np.arange(len(active)), -(10**9)))
-    recent = np.arange(len(active)) - last <= LISTENING_S * rate_hz
-    return recent if own_voice is None else recent & ~np.asarray(own_voice, bool)
+def find_peaks(values: Doubles, prominence: float, distance: int = 1) -> tuple[Indices, Doubles]:
+    """Find local maxima of (N,) that stand out by `prominence`, at least `distance` samples apart, and by how much.
 
-
-def nods_per_minute(onsets_s: Sequence[float] | NDArray[np.float64], listening: ArrayLike, rate_hz: float) -> float:
-    """Onsets inside listening time per minute of it; NaN when there is none."""
-    inside, minutes = _inside(onsets_s, np.asarray(listening, bool), rate_hz)
-    return inside / minutes if minutes else float("nan")
-
-
-def _inside(onsets_s: Sequence[float] | NDArray[np.float64], mask: Bools, rate_hz: float) -> tuple[int, float]:
-    index = np.round(np.asarray(onsets_s, np.float64) * rate_hz).astype(int)
-    index = index[(index >= 0) & (index < len(mask))]
-    return int(mask[index].sum()), float(mask.sum()) / rate_hz / 60
-
-
-def phrase_end_counts(
-    onsets_s: Sequence[float] | NDArray[np.float64],
-    ends_s: Sequence[float] | NDArray[np.float64],
-    listening: ArrayLike,
-    rate_hz: float,
-) -> tuple[int, float, int, float]:
-    """Onsets and minutes in the two windows after phrase ends, both within listening time.
-
-    Returns (onsets after, minutes after, onsets later, minutes later): add them up over people, then divide.
-    An instant that lies in both (of two phrase ends) counts in both; within one window it counts once.
+    The middle of a plateau is its peak. Of two that are too close the higher one stays, of equal ones the later.
     """
-    listened = np.asarray(listening, bool)
-    after = window_after(ends_s, AFTER_S, len(listened), rate_hz) & listened
-    later = window_after(ends_s, LATER_S, len(listened), rate_hz) & listened
-    return (*_inside(onsets_s, after, rate_hz), *_inside(onsets_s, later, rate_hz))
+    peaks = _maxima(values)
+    peaks = peaks[_far_apart(peaks, values[peaks], distance)]
+    prominences = _prominences(values, peaks)
+    keep = prominences >= prominence
+    return peaks[keep], prominences[keep]
 
 
-def window_after(
-    ends_s: Sequence[float] | NDArray[np.float64], span_s: tuple[float, float], size: int, rate: float
-) -> Bools:
-    """(size,) True in the window `span_s` after each instant of `ends_s`."""
-    mask = np.zeros(size, bool)
-    for end in ends_s:
-        mask[max(0, int(round((end + span_s[0]) * rate))) : max(0, int(round((end + span_s[1]) * rate)))] = True
-    return mask
+def half_widths(values: Doubles, peaks: Indices, prominences: Doubles) -> tuple[Doubles, Doubles]:
+    """Return where (N,) crosses half of each peak's prominence, left and right of it, linear between samples."""
+    left, right = np.zeros(len(peaks)), np.zeros(len(peaks))
+    for row, (peak, height) in enumerate(zip(peaks, values[peaks] - prominences / 2, strict=True)):
+        a = b = int(peak)
+        while values[a] > height:
+            a -= 1
+        while values[b] > height:
+            b += 1
+        left[row] = a + (height - values[a]) / (values[a + 1] - values[a]) if values[a] < height else a
+        right[row] = b - (height - values[b]) / (values[b - 1] - values[b]) if values[b] < height else b
+    return left, right
 
 
-def phrase_end_ratio(
-    onsets_s: Sequence[float] | NDArray[np.float64],
-    ends_s: Sequence[float] | NDArray[np.float64],
-    listening: ArrayLike,
-    rate_hz: float,
-) -> float:
-    """Nod onsets per minute 0 to 0.8 s after a phrase end over those 1.5 to 3 s after it; NaN if undefined."""
-    return ratio_of(phrase_end_counts(onsets_s, ends_s, listening, rate_hz))
+def band_pass(values: Doubles, low_hz: float, high_hz: float, rate_hz: float) -> Doubles:
+    """Filter (N,), N > 15, by a Butterworth band-pass of second order forwards and backwards, so that nothing is late.
 
-
-def ratio_of(counts: Sequence[float]) -> float:
-    """(onsets after, minutes after, onsets later, minutes later), summed over people, as a ratio of rates."""
-    after, after_min, later, later_min = counts
-    if not later or not after_min or not later_min:
-        return float("nan")
-    return (after / after_min) / (later / later_min)
-
-
-def near(spans_s: ArrayLike, frames: int, rate_hz: float, within_s: float) -> Bools:
-    """(frames,) True at instants that are at most `within_s` away from one of the spans (K, 2)."""
-    mask = np.zeros(frames, bool)
-    for start, end in np.asarray(spans_s, np.float64).reshape(-1, 2):
-        first, last = np.ceil((start - within_s) * rate_hz - 1e-6), np.floor((end + within_s) * rate_hz + 1e-6)
-        mask[max(0, int(first)) : max(0, int(last) + 1)] = True
-    return mask
-
-
-def rank_auc(scores: ArrayLike, positive: ArrayLike, negative: ArrayLike) -> float:
-    """Chance that a positive instant scores higher than a negative one, ties half; NaN when either kind is missing.
-
-    scores (N,); positive and negative are (N,) masks or indices.
+    As in scipy.signal.sosfiltfilt, both ends are mirrored through their last value, and before and after that the
+    signal counts as constant, of which a band-pass lets nothing through. So both passes begin at rest.
     """
-    from scipy import stats
-
-    values = np.asarray(scores, np.float64)
-    high, low = values[np.asarray(positive)], values[np.asarray(negative)]
-    if not len(high) or not len(low):
-        return float("nan")
-    ranks = stats.rankdata(np.concatenate([high, low]))[: len(high)]
-    return float((ranks.sum() - len(high) * (len(high) + 1) / 2) / (len(high) * len(low)))
+    start, end = 2 * values[0] - values[_EDGE:0:-1], 2 * values[-1] - values[-2 : -_EDGE - 2 : -1]
+    mirrored = np.concatenate([start, values, end])
+    for _ in range(2):
+        mirrored = _once(mirrored, low_hz, high_hz, rate_hz)[::-1]
+    return mirrored[_EDGE:-_EDGE]
 
 
-def find_gaze_shifts(yaw_rad: ArrayLike, pitch_rad: ArrayLike, rate_hz: float, least_rad: float = 0.14) -> list[float]:
-    """Seconds at which the direction of gaze (head and eyes together), (N,) each, jumps by 8 degrees or more.
+def _once(values: Doubles, low_hz: float, high_hz: float, rate_hz: float) -> Doubles:
+    """Filter once, causally, by the spectrum; padded until the filter has settled, so that nothing wraps around."""
+    low, high = (np.tan(np.pi * edge_hz / rate_hz) for edge_hz in (low_hz, high_hz))  # prewarped for the bilinear map
+    settled = int(-np.log(_SETTLED) / min(low, high - low)) + 1
+    size = 1 << int(len(values) + settled - 1).bit_length()
+    s = 1j * np.tan(np.pi * np.arange(size // 2 + 1) / size)  # on the unit circle; infinite at half the rate
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        p = (s * s + low * high) / ((high - low) * s)  # low-pass prototype -> band-pass
+        response = 1.0 / (p * p + np.sqrt(2) * p + 1.0)
+    response[[0, -1]] = 0.0
+    passed: Doubles = np.fft.irfft(np.fft.rfft(values - values[0], size) * response, size)[: len(values)]
+    return passed
 
-    A jump is a change within 0.2 s from one quarter second of rest to the next; those closer than 0.3 s are one.
+
+def _maxima(values: Doubles) -> Indices:
+    """Return samples higher than both neighbours; the middle of a plateau, the lower of two middles."""
+    if len(values) < 3:
+        return np.zeros(0, dtype=np.intp)
+    starts = np.flatnonzero(np.r_[True, np.diff(values) != 0])  # of stretches of equal values
+    ends = np.r_[starts[1:], len(values)] - 1
+    level = values[starts]
+    inner = np.arange(1, len(level) - 1)
+    top = inner[(level[inner] > level[inner - 1]) & (level[inner] > level[inner + 1])]
+    middles: Indices = (starts[top] + ends[top]) // 2
+    return middles
+
+
+def _far_apart(peaks: Indices, heights: Doubles, distance: int) -> NDArray[np.bool_]:
+    keep = np.ones(len(peaks), dtype=np.bool_)
+    for best in np.argsort(heights)[::-1]:
+        if keep[best]:
+            near = np.abs(peaks - peaks[best]) < distance
+            near[best] = False
+            keep[near] = False
+    return keep
+
+
+def _prominences(values: Doubles, peaks: Indices) -> Doubles:
+    """Return the depth that separates each peak from the next higher one, on the side where it is smaller.
+
+    Only turning points are walked: a tick of the loop may wait for it.
     """
-    from scipy import signal
+    turns = np.unique(np.r_[0, _maxima(values), _maxima(-values), len(values) - 1])
+    levels = values[turns].tolist()
+    before, after = _lowest_since_higher(levels), _lowest_since_higher(levels[::-1])[::-1]
+    at = np.searchsorted(turns, peaks)
+    prominences: Doubles = values[peaks] - np.maximum(np.array(before)[at], np.array(after)[at])
+    return prominences
 
-    gaze = np.stack([np.asarray(yaw_rad, np.float64), np.asarray(pitch_rad, np.float64)], axis=1)
-    rest, jump = max(1, round(0.24 * rate_hz)), max(1, round(0.2 * rate_hz))
-    if len(gaze) < 2 * rest + jump:
-        return []
-    windows = np.lib.stride_tricks.sliding_window_view(gaze, rest, axis=0)
-    settled = np.median(windows, axis=-1)  # [i]: frames i to i + rest
-    size = np.hypot(*(settled[rest + jump :] - settled[: -rest - jump]).T)
-    peaks, _ = signal.find_peaks(np.r_[0.0, size, 0.0], height=least_rad, distance=max(1, round(0.3 * rate_hz)))
-    return [float((peak - 1 + rest + jump / 2) / rate_hz) for peak in peaks]
+
+def _lowest_since_higher(levels: Sequence[float]) -> list[float]:
+    """Return for each level the lowest one since a higher one came, its own included."""
+    lowest: list[float] = []
+    falling: list[tuple[float, float]] = []  # levels that are still in sight, each with its lowest
+    for level in levels:
+        low = level
+        while falling and falling[-1][0] <= level:
+            low = min(low, falling.pop()[1])
+        falling.append((level, low))
+        lowest.append(low)
+    return lowest

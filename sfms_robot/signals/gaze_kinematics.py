@@ -1,15 +1,15 @@
-"""How eyes and head go to where somebody looks: from gaze targets to motion, one 40 ms frame at a time.
+"""Motion of eyes and head from gaze targets, one 40 ms frame at a time, and eye channels as angles.
 
-The eyes leave first and are there 40 to 120 ms later (the main sequence of saccades). The head follows with its share,
-which hardly exists below 8 degrees and grows with how far aside the target is, on the way of least jerk (bell-shaped
-speed), and ends later. All the while the eyes make up for the head (vestibulo-ocular reflex): eye in head is gaze less
+The eyes leave first and arrive 40 to 120 ms later (the main sequence of saccades). The head follows with its share,
+which is near 0 below 8 degrees and grows with the angle of the target, on a minimum-jerk path (bell-shaped speed), and
+ends later. All the while the eyes make up for the head (vestibulo-ocular reflex): eye in head is gaze less
 head, also while the head nods or sways. On a target, the eyes wander over it in fixations of 228 ms (median) whose
-steps have 0.9 degrees (median), as people's do while they listen; what is larger is a gaze shift, decided elsewhere.
+steps have 0.9 degrees (median), as people's do while they listen; a larger step is a gaze shift, decided elsewhere.
 
 Laws: N frames at once are the N frames one by one. Gaze (head and eyes together) is within 3 degrees of the target
 200 ms after a shift of up to 30 degrees between targets that eyes can reach, and within 1.5 degrees during a nod of 8.
 The head's angle never jumps, and neither does its speed; on a still target its part stays where it is. Mirrored targets
-give a mirrored head, and mirrored eyes where they do not wander. What is not finite is refused.
+give a mirrored head, and mirrored eyes where they do not wander. Values that are not finite are refused.
 
 Lids are not moved here: heads couple them with eyeLookUp and eyeLookDown.
 """
@@ -24,8 +24,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, POSE, Floats, changed
-from sfms_robot.signals.minimum_jerk import minimum_jerk
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, POSE, Doubles, Floats, changed
+from sfms_robot.signals.minimum_jerk import ease, minimum_jerk
 
 EYE_PAN_RAD: Final = math.radians(30)  # of an eyeLook channel of 1, sideways
 EYE_TILT_RAD: Final = math.radians(20)
@@ -51,7 +51,7 @@ Axis = tuple[float, float, float]  # angle, speed, acceleration
 
 @dataclass(frozen=True)
 class GazeFrame:
-    """One frame of a look.
+    """Gaze in one frame.
 
     Attributes:
         head_rad: (3,) roll, pitch, yaw that the look adds to the head.
@@ -64,17 +64,17 @@ class GazeFrame:
 
 @dataclass(frozen=True)
 class GazeState:
-    """Where eyes and head are between two frames. Angles are in space; all is (yaw, pitch).
+    """State of eyes and head between two frames. Angles are in space, (yaw, pitch).
 
     Attributes:
         seed: of the fixations.
-        wanders: eyes move over what they look at.
-        share: the head's, of what is not left to the eyes.
+        wanders: eyes move over their target.
+        share: of the head, in the angle that is not left to the eyes.
         target_rad: the last one.
-        gaze_rad: where head and eyes together point.
-        from_rad, shift_s, since_s: where the shift in progress began, how long it takes, how long it has gone on.
-        number, spot_rad, drift_rad_s, left_s: the fixation: which, where from the target, its drift, how long it lasts.
-        head: the head's part, yaw and pitch; `head_left_s` until it is there.
+        gaze_rad: direction of head and eyes together.
+        from_rad, shift_s, since_s: start, duration and elapsed time of the shift in progress.
+        number, spot_rad, drift_rad_s, left_s: of the fixation: its number, offset from the target, drift, time left.
+        head: the head's part, yaw and pitch; `head_left_s` until it arrives.
     """
 
     seed: int
@@ -94,18 +94,18 @@ class GazeState:
 
 
 def start(seed: int, wanders: bool = True) -> GazeState:
-    """Somebody who looks straight ahead; how much of a look is the head's is drawn by `seed`."""
+    """Return the state of a look straight ahead; the head's share of a look is drawn from `seed`."""
     return GazeState(seed, wanders, float(np.random.default_rng(seed).uniform(*_SHARES)))
 
 
 def step(target_rad: ArrayLike, pose: ArrayLike, state: GazeState) -> tuple[GazeFrame, GazeState]:
-    """The look at the end of the next 40 ms.
+    """Return the gaze at the end of the next 40 ms, and the state after it.
 
     Args:
         target_rad: (2,) yaw and pitch in space, (0, 0) at the person; from the beginning of the frame on.
         pose: (6,) of the head without its part of the look, at the end of the frame.
 
-    Raises ValueError for what is not finite.
+    Raises ValueError for a value that is not finite.
     """
     yaw, pitch = (float(value) for value in np.asarray(target_rad, np.float64))
     _, tilted, turned, *_ = (float(value) for value in np.asarray(pose, np.float64))
@@ -116,7 +116,7 @@ def step(target_rad: ArrayLike, pose: ArrayLike, state: GazeState) -> tuple[Gaze
 
 
 def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, list[GazeState]]:
-    """`step` over targets (N, 2) and poses (N, 6): the head's part (N, 3), the eyes (N, 8), the state after each."""
+    """Run `step` over targets (N, 2) and poses (N, 6): the head's part (N, 3), the eyes (N, 8), all states."""
     targets, heads = np.asarray(targets_rad, np.float64), np.asarray(poses, np.float64)[:, POSE]
     if not (np.isfinite(targets).all() and np.isfinite(heads[:, 1:3]).all()):
         raise ValueError("gaze targets or head poses are not finite")
@@ -133,9 +133,9 @@ def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[
 
 
 def head_part(gaze_rad: ArrayLike) -> Floats:
-    """Directions of gaze (N, 2), yaw and pitch -> what looking there makes the head do (N, 3), of somebody usual.
+    """Return the head's part (N, 3) of looking in directions (N, 2), yaw and pitch, for an average person.
 
-    It tells looks from what the head does besides. What is not finite counts as straight ahead.
+    It separates looks from other motion of the head. A direction that is not finite counts as straight ahead.
     """
     gaze = np.nan_to_num(np.asarray(gaze_rad, np.float64), posinf=0.0, neginf=0.0)
     if not len(gaze):
@@ -147,7 +147,7 @@ def head_part(gaze_rad: ArrayLike) -> Floats:
 
 
 def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...], tuple[float, ...], GazeState]:
-    """The head's part, the eyes, as in a `GazeFrame`, and the state after them."""
+    """Return the head's part and the eyes, as in a `GazeFrame`, and the state after them."""
     state = _aimed(target, state)
     since_s, left_s = state.since_s + FRAME_S, max(0.0, state.left_s - FRAME_S)
     part = minimum_jerk(min(1.0, since_s / state.shift_s))
@@ -171,7 +171,7 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...]
 
 
 def _aimed(target: Pair, state: GazeState) -> GazeState:
-    """The state with the shift that begins now, if one does: to another target, or to the next spot on this one."""
+    """Return the state with the shift that begins now, if any: to another target, or to the next spot on this one."""
     moved = 0.0 if target == state.target_rad else math.dist(target, state.target_rad)
     if moved > 0:
         turn_rad = math.dist(head_share(target, state.share), (state.head[0][0], state.head[1][0]))
@@ -187,7 +187,7 @@ def _aimed(target: Pair, state: GazeState) -> GazeState:
 
 
 def _fixated(state: GazeState) -> GazeState:
-    """The next fixation: its spot, its drift and its length hang on the seed and its number alone."""
+    """Return the state with the next fixation, whose spot, drift and length depend on the seed and its number alone."""
     spread, most = _SPOT_RAD
     x, y, drift_x, drift_y, long = _drawn(state.seed, state.number)
     narrow = spread * min(1.0, most / max(spread * math.hypot(x, y), 1e-9))
@@ -196,19 +196,19 @@ def _fixated(state: GazeState) -> GazeState:
     spot, drift = (narrow * x, narrow * y), (_DRIFT_RAD_S * drift_x, _DRIFT_RAD_S * drift_y)
     last = (spot[0] + drift[0] * left_s, spot[1] + drift[1] * left_s)
     far = math.hypot(*last)
-    if far > most:  # what begins and ends no further off is no further off between
+    if far > most:  # a straight drift between two points within the limit stays within it
         drift = ((last[0] * most / far - spot[0]) / left_s, (last[1] * most / far - spot[1]) / left_s)
     return changed(state, number=state.number + 1, spot_rad=spot, drift_rad_s=drift, left_s=left_s)
 
 
-@lru_cache(maxsize=1024)  # plans overlap: most fixations are asked for by several
+@lru_cache(maxsize=1024)  # plans overlap: most fixations are needed by several
 def _drawn(seed: int, number: int) -> tuple[float, ...]:
-    """What one fixation of a stream hangs on."""
+    """Return the random numbers of one fixation."""
     return tuple(np.random.default_rng((seed, number)).standard_normal(5).tolist())
 
 
 def head_share(target_rad: Pair, share: float) -> Pair:
-    """The head's part (yaw, pitch) of a look that rests on the target: next to none near the middle, then `share`."""
+    """Return the head's part (yaw, pitch) of a look at the target: near 0 in the middle, then `share`."""
     far = math.hypot(*target_rad)
     if far < 1e-9:
         return 0.0, 0.0
@@ -217,7 +217,7 @@ def head_share(target_rad: Pair, share: float) -> Pair:
 
 
 def _towards(axis: Axis, goal: float, left_s: float, dt_s: float) -> Axis:
-    """Angle, speed and acceleration `dt_s` further on the way of least jerk that rests at `goal` in `left_s`."""
+    """Return angle, speed and acceleration `dt_s` later on the minimum-jerk path that rests at `goal` in `left_s`."""
     if left_s <= dt_s + 1e-9:
         return goal, 0.0, 0.0
     x, v, a = axis
@@ -235,3 +235,59 @@ def _eyes(pan: float, tilt: float) -> tuple[float, ...]:
     left, right = max(0.0, pan) / EYE_PAN_RAD, max(0.0, -pan) / EYE_PAN_RAD
     down, up = max(0.0, tilt) / EYE_TILT_RAD, max(0.0, -tilt) / EYE_TILT_RAD
     return down, right, left, up, down, left, right, up
+
+
+# --- Eye channels as angles and back: (yaw, pitch), yaw + to the head's left, pitch + down ----------------------------
+
+_LEFT = tuple(CHANNEL_INDEX[f"eyeLook{way}Left"] for way in ("Out", "In", "Down", "Up"))
+_RIGHT = tuple(CHANNEL_INDEX[f"eyeLook{way}Right"] for way in ("In", "Out", "Down", "Up"))
+_PLUS = np.array([_LEFT[0], _LEFT[2], _RIGHT[0], _RIGHT[2]])
+_MINUS = np.array([_LEFT[1], _LEFT[3], _RIGHT[1], _RIGHT[3]])
+
+
+def directions(motion: Floats, full_rad: Doubles) -> Doubles:
+    """Return the directions (..., 2, 2) of motion (..., 58): left and right eye, yaw and pitch [rad].
+
+    `full_rad` (2,): angles for a channel of 1.
+    """
+    turned = motion.take(_PLUS, axis=-1).astype(np.float64) - motion.take(_MINUS, axis=-1)
+    return turned.reshape(*motion.shape[:-1], 2, 2) * full_rad
+
+
+def turn(motion: Floats, directions_rad: Doubles, full_rad: Doubles) -> None:
+    """Write directions (..., 2, 2) into `motion` (..., 58), as far as the channels go."""
+    share = (directions_rad / full_rad).reshape(*motion.shape[:-1], 4)
+    motion[..., _PLUS] = np.minimum(np.maximum(share, 0.0), 1.0)
+    motion[..., _MINUS] = np.minimum(np.maximum(-share, 0.0), 1.0)
+
+
+def direction_to(place_m: Doubles) -> Doubles:
+    """Return yaw and pitch (..., 2) [rad] of a look from the origin to the place (..., 3)."""
+    x, y, z = np.moveaxis(place_m, -1, 0)
+    return np.stack([np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y))], axis=-1)
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A saccade: directions (2,) [rad] at its start and end, and its time."""
+
+    start_rad: Doubles
+    end_rad: Doubles
+    began_s: float
+    duration_s: float
+
+    @classmethod
+    def between(cls, start_rad: Doubles, end_rad: Doubles, began_s: float) -> Jump:
+        """Return a jump of human duration: 25 ms and 2.35 ms per degree ("Eyes Alive", Lee et al. 2002)."""
+        size_deg = math.degrees(float(np.hypot(*(end_rad - start_rad))))
+        return cls(start_rad, end_rad, began_s, 0.025 + 0.00235 * size_deg)
+
+    @property
+    def end_s(self) -> float:
+        return self.began_s + self.duration_s
+
+    def at(self, times_s: Doubles) -> Doubles:
+        """Return directions (N, 2) at (N,) instants."""
+        share = ease((times_s - self.began_s) / self.duration_s)[:, None]
+        direction: Doubles = self.start_rad + share * (self.end_rad - self.start_rad)
+        return direction

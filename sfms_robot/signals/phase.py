@@ -1,10 +1,11 @@
-"""Where the other person is in a phrase: how long it has lasted, how long it is silent, how long the last one was.
+"""Place of the other person in a phrase: its length so far, the length of the silence, and that of the last phrase.
 
-This is what nods depend on, and it reaches back further than the 1.6 s that a predictor sees. `step` takes the samples
-of one frame and gives features for a predictor; the three times alone serve the table of nod rates (`evaluation`).
+Nods depend on these times, which reach back further than the 1.6 s that a predictor sees. `step` turns the samples of
+one frame into features for a predictor; the three times alone serve the table of nod rates (`evaluation`).
 
-A phrase goes on across silences under 0.2 s. Features are hat functions of each time on a logarithmic grid, so that a
-linear layer can already draw any curve over it, and are all 0 for a phase that has not been yet.
+A phrase continues across silences under 0.2 s. Features are a piecewise linear basis of each time on a grid that is
+logarithmic from 0.2 s up, so that a linear layer can already draw any curve over it: the weights of the two
+neighbouring knots. They are all 0 for a phase that has not been yet.
 """
 
 from __future__ import annotations
@@ -15,12 +16,11 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
-from sfms_robot.signals.hats import hats
 from sfms_robot.signals.voice_activity import Ear
 
 GAP_FRAMES: Final = 5  # this many silent frames, 0.2 s, end a phrase
@@ -35,6 +35,25 @@ _OF_SPEECH: Final = slice(0, len(SPEECH_KNOTS_S))
 _OF_SILENCE: Final = slice(_OF_SPEECH.stop, _OF_SPEECH.stop + len(SILENCE_KNOTS_S))
 _OF_LAST: Final = slice(_OF_SILENCE.stop, FEATURES)
 
+SOFT_S: Final = 0.2
+
+
+def log_time(seconds: ArrayLike) -> Doubles:
+    """Return times on the scale of the knots, logarithmic from `SOFT_S` up."""
+    return np.asarray(np.log1p(np.asarray(seconds, np.float64) / SOFT_S), np.float64)
+
+
+def piecewise_linear_basis(seconds: Doubles, knots_s: Sequence[float]) -> Doubles:
+    """Return the weights (N, K) of the two neighbouring knots of each time (N,), adding up to 1.
+
+    Beyond the last knot that one alone counts, so `math.inf` is "long ago"; NaN has all weights 0.
+    """
+    knots = log_time(knots_s)
+    at = log_time(np.minimum(seconds, knots_s[-1]))
+    place = np.interp(at, knots, np.arange(len(knots)))
+    weights = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(len(knots))))
+    return np.asarray(np.where(np.isnan(seconds)[:, None], 0.0, weights), np.float64)
+
 
 @dataclass(frozen=True)
 class SpeechPhase:
@@ -42,7 +61,7 @@ class SpeechPhase:
 
     Attributes:
         speech: of the phrase in progress, short gaps included; 0 when there is none.
-        silence: since somebody last spoke; 0 while he does; counts from the start of a stream.
+        silence: since the last speech; 0 while the person speaks; counts from the start of a stream.
         last: of the last whole phrase; 0 before the first one has ended.
     """
 
@@ -51,7 +70,7 @@ class SpeechPhase:
     last: int = 0
 
     def after(self, active: bool) -> SpeechPhase:
-        """One frame later."""
+        """Return the phase one frame later."""
         if active:
             return SpeechPhase(self.speech + 1, 0, self.last)
         silence = self.silence + 1
@@ -69,26 +88,27 @@ class SpeechPhase:
 
 @dataclass(frozen=True)
 class State:
-    """What a stream remembers of the other's voice."""
+    """Memory of a stream."""
 
     ear: Ear
     phase: SpeechPhase
 
 
 def start() -> State:
-    """Nobody has spoken yet."""
+    """Return the memory of a new stream."""
     return State(voice_activity.start(), SpeechPhase())
 
 
 def step(samples: Floats, state: State) -> tuple[Floats, State]:
-    """Samples of one frame (640,), or none when there is no microphone -> features (21,), and the next state."""
+    """Return the features (21,) of one frame (640,), or of none without a microphone, and the next state."""
     rows, (after,) = step_each([[energy_db(samples)]], [state])
     return rows[0], after
 
 
 def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[State]) -> tuple[Floats, list[State]]:
-    """Levels of the frames of several streams, any number each -> features (N, 21) of all N frames, one stream behind
-    the other, and the state of each.
+    """Return the features (N, 21) of all N frames of several streams, one stream after the other, and their states.
+
+    `levels_db`: of any number of frames per stream.
     """
     counts: list[tuple[int, int, int]] = []
     after = []
@@ -103,7 +123,7 @@ def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[State]) -> 
 
 
 def _features_of(counts: Sequence[tuple[int, int, int]]) -> Floats:
-    """`features` (N, 21) of counts of frames up to `LONGEST`."""
+    """Return `features` (N, 21) of counts of frames up to `LONGEST`."""
     rows, places = _every_row(), np.array(counts, np.intp).reshape(-1, 3)
     parts = zip(places.T, (_OF_SPEECH, _OF_SILENCE, _OF_LAST), strict=True)
     return np.concatenate([rows[place, columns] for place, columns in parts], axis=1)
@@ -111,22 +131,22 @@ def _features_of(counts: Sequence[tuple[int, int, int]]) -> Floats:
 
 @lru_cache(maxsize=1)
 def _every_row() -> Floats:
-    """(LONGEST + 1, 21): `features` of each count, of all three times alike."""
+    """Return `features` (LONGEST + 1, 21) of each count, the same for all three times."""
     return features(FRAME_S * np.repeat(np.arange(LONGEST + 1.0)[:, None], 3, axis=1))
 
 
 def of_audio(audio: Floats) -> Floats:
-    """(N * 640,) samples -> features (N, 21), frame by frame what `step` gives; samples left over are not used."""
+    """Return the features (N, 21) of samples (N * 640,), equal to those of `step`; samples left over are not used."""
     return features(times(hear(voice_activity.levels_db(audio))))
 
 
 def of_mel(rows: Floats) -> Floats:
-    """(N, 4, 128) natural log-mel -> features (N, 21), for data that comes without samples."""
+    """Return the features (N, 21) of natural log-mel (N, 4, 128), for data without samples."""
     return features(times(hear(voice_activity.mel_levels_db(rows))))
 
 
 def hear(levels_db: Doubles) -> list[bool]:
-    """Levels (N,) from the start of a stream -> is this frame speech."""
+    """Return whether each frame is speech, from levels (N,) from the start of a stream."""
     ear, heard = voice_activity.start(), []
     for level in levels_db.tolist():
         ear = voice_activity.step(level, ear)
@@ -135,7 +155,7 @@ def hear(levels_db: Doubles) -> list[bool]:
 
 
 def times(active: Sequence[bool] | NDArray[np.bool_]) -> Doubles:
-    """Speech (N,) -> seconds (N, 3): speech so far, silence so far, length of the last phrase, as `after` counts."""
+    """Return seconds (N, 3) of speech so far, silence so far and the last phrase, of frames of speech (N,)."""
     heard = np.asarray(active, bool)
     index = np.arange(len(heard))
     newest = np.maximum.accumulate(np.where(heard, index, -1))
@@ -149,11 +169,11 @@ def times(active: Sequence[bool] | NDArray[np.bool_]) -> Doubles:
 
 
 def features(times_s: Doubles) -> Floats:
-    """Seconds (N, 3) -> (N, 21): hats of speech (none in silence), silence, last phrase (none before it)."""
+    """Return features (N, 21) of seconds (N, 3): speech (0 in silence), silence, last phrase (0 before it)."""
     speech, silence, last = times_s.T
     parts = [
-        hats(speech, SPEECH_KNOTS_S) * (speech > 0)[:, None],
-        hats(silence, SILENCE_KNOTS_S),
-        hats(last, PHRASE_KNOTS_S) * (last > 0)[:, None],
+        piecewise_linear_basis(speech, SPEECH_KNOTS_S) * (speech > 0)[:, None],
+        piecewise_linear_basis(silence, SILENCE_KNOTS_S),
+        piecewise_linear_basis(last, PHRASE_KNOTS_S) * (last > 0)[:, None],
     ]
     return np.concatenate(parts, axis=1).astype(np.float32)

@@ -14,12 +14,10 @@ from numpy.typing import ArrayLike
 from sfms_robot.frames import Doubles
 
 AXIS: Final = {"roll": 0, "pitch": 1, "yaw": 2}  # the coordinate axis that each one turns about
-RADIUS_M: Final = 0.1  # how far from its centre a head is felt to move: weighs radians against metres
-WEIGHTS: Final = np.array([RADIUS_M] * 3 + [1.0] * 3)  # pose -> metres
 
 
 def rotation(rpy_rad: Doubles) -> Doubles:
-    """Roll, pitch, yaw (..., 3) -> R (..., 3, 3)."""
+    """Return R (..., 3, 3) of roll, pitch, yaw (..., 3)."""
     cosine, sine = np.cos(rpy_rad), np.sin(rpy_rad)
     cr, cp, cy = cosine[..., 0], cosine[..., 1], cosine[..., 2]
     sr, sp, sy = sine[..., 0], sine[..., 1], sine[..., 2]
@@ -37,7 +35,7 @@ def rotation(rpy_rad: Doubles) -> Doubles:
 
 
 def about(axis: int, angle_rad: ArrayLike) -> Doubles:
-    """Rotation by `angle_rad` (...) about one coordinate axis -> (..., 3, 3)."""
+    """Return the rotation (..., 3, 3) by `angle_rad` (...) about one coordinate axis."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     first, second = (axis + 1) % 3, (axis + 2) % 3
     out = np.zeros((*angle.shape, 3, 3))
@@ -49,7 +47,7 @@ def about(axis: int, angle_rad: ArrayLike) -> Doubles:
 
 
 def euler(matrix: Doubles, axes: tuple[int, int, int]) -> Doubles:
-    """The angles (..., 3) with R(axes[0]) R(axes[1]) R(axes[2]) = matrix, for three different axes, in closed form.
+    """Return the angles (..., 3) with R(axes[0]) R(axes[1]) R(axes[2]) = matrix, for three different axes.
 
     The middle angle is within +-pi/2. Where it is exactly there the other two are not defined apart: the last is 0.
     """
@@ -68,7 +66,7 @@ def euler(matrix: Doubles, axes: tuple[int, int, int]) -> Doubles:
 
 
 def twist(matrix: Doubles, axis: int) -> Doubles:
-    """The turn about `axis` alone that comes nearest to `matrix` -> (...)."""
+    """Return the angle (...) of the turn about `axis` alone that is nearest to `matrix`."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     sine = matrix[..., second, first] - matrix[..., first, second]
     cosine = matrix[..., first, first] + matrix[..., second, second]
@@ -77,7 +75,7 @@ def twist(matrix: Doubles, axis: int) -> Doubles:
 
 
 def from_vector(vector: Doubles) -> Doubles:
-    """Rotation vector (..., 3) [rad] -> R (..., 3, 3), Rodrigues."""
+    """Return R (..., 3, 3) of a rotation vector (..., 3) [rad] (Rodrigues)."""
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     half_sinc = np.sinc(angle / (2 * np.pi))
     cross = np.zeros((*vector.shape[:-1], 3, 3))
@@ -89,20 +87,20 @@ def from_vector(vector: Doubles) -> Doubles:
 
 
 def angle_between(one: Doubles, other: Doubles) -> Doubles:
-    """Smallest turn [rad] (...) that takes one rotation into the other; exact for small ones too."""
+    """Return the smallest turn [rad] (...) between two rotations; exact for small ones too."""
     chord = np.linalg.norm(one - other, axis=(-2, -1)) / np.sqrt(8.0)
     angle: Doubles = 2.0 * np.arcsin(np.minimum(chord, 1.0))
     return angle
 
 
 def wrapped(angle_rad: Doubles) -> Doubles:
-    """The same angle within -pi..pi."""
+    """Return the same angle within -pi..pi."""
     out: Doubles = (angle_rad + np.pi) % (2 * np.pi) - np.pi
     return out
 
 
 def seen_from(body_yaw_rad: ArrayLike, poses: Doubles) -> Doubles:
-    """Poses (..., 6) in the frame of a body that is turned by `body_yaw_rad` (...)."""
+    """Return poses (..., 6) in the frame of a body that is turned by `body_yaw_rad` (...)."""
     body = np.asarray(body_yaw_rad, dtype=np.float64)
     cosine, sine = np.cos(body), np.sin(body)
     out = np.array(np.broadcast_to(poses, (*np.broadcast_shapes(body.shape, poses.shape[:-1]), 6)))
@@ -111,8 +109,3 @@ def seen_from(body_yaw_rad: ArrayLike, poses: Doubles) -> Doubles:
     out[..., 4] = cosine * y - sine * x
     out[..., 2] = wrapped(out[..., 2] - body)
     return out
-
-
-def distance_m(one: Doubles, other: Doubles) -> Doubles:
-    """How far two poses (..., 6) are apart, a radian counting as `RADIUS_M`."""
-    return np.asarray(np.linalg.norm((one - other) * WEIGHTS, axis=-1))

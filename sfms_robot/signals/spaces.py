@@ -10,20 +10,20 @@ A rotation R of a space turns our head by A R A^T, where A takes the space's axe
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats, reorder
-from sfms_robot.signals.flame import FlameMatrix
+from sfms_robot.frames import BLENDSHAPES, JAW_FULL_OPEN_RAD, MOTION_DIM, ORDERS, POSE, SHAPES, Doubles, Floats, reorder
 from sfms_robot.signals.rotations import rotation as rotation_of
 
 LOCKED: Final = 1e-7  # cosine of an angle about y from which x and z cannot be told apart
-JAW_FULL_OPEN_RAD: Final = np.radians(25.0)  # jaw angle shown as jawOpen 1, as the timeline has it
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Space:
         dim: numbers per frame.
         expression, rotation: where they stand; `translation` and `jaw` where there are any.
         unit: of rotation and translation.
-        euler: is the rotation three angles about the fixed axes x, y, z? Otherwise it is axis-angle.
+        euler: the rotation is three angles about the fixed axes x, y, z; otherwise it is axis-angle.
         axes: A (3, 3), rows are our x, y, z in the space's axes.
         neutral: rotation of a face that looks straight ahead, as the space writes it.
         metres_per_unit: of the translation; None: it has no metric scale and is left out.
-        verified: how the axes are known, or None: nobody has proved them; flip what turns out wrong.
+        verified: proof of the axes; None: they are unproved and may have to be flipped.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Decoded:
     Attributes:
         motion: (N, 58).
         jaw_rad: (N, 3) axis-angle in our axes, + about y lowers the chin, or None: the space has no jaw.
-        missing: one line about what could not be shown, or None.
+        missing: one line about a part that could not be shown, or None.
     """
 
     motion: Floats
@@ -92,7 +92,7 @@ def decode(
     metres_per_unit: float | None = None,
     flame: FlameMatrix | None = None,
 ) -> Decoded:
-    """Frames (N, dim) of the space of that name -> ours.
+    """Return frames (N, dim) of the named space as our motion.
 
     neutral (dim,): the person's face at rest; by default the space's own, with the translation's median. Blendshapes
     are clipped to 0..1. Raises ConfigError for an unknown space or a flame matrix where it has no meaning, and
@@ -125,7 +125,7 @@ def decode(
     jaw_open = np.clip(jaw_rad[:, 1] / JAW_FULL_OPEN_RAD, 0.0, 1.0)
     if flame is not None:
         motion[:, SHAPES] = flame.solve(values[:, known.expression], jaw_open)
-    motion[:, SHAPES][:, BLENDSHAPES.index("jawOpen")] = jaw_open
+    motion[:, SHAPES][:, _JAW] = jaw_open
     return Decoded(motion.astype(np.float32), jaw_rad.astype(np.float32), limitation(space, flame))
 
 
@@ -136,7 +136,7 @@ def encode(
     neutral: Doubles | None = None,
     metres_per_unit: float | None = None,
 ) -> Floats:
-    """Our motion (N, 58) in a space (N, dim), about `neutral` (dim,), by default the space's own: undoes `decode`.
+    """Return our motion (N, 58) in a space (N, dim), about `neutral` (dim,), by default the space's own.
 
     Without `metres_per_unit` the translation stays at rest. deca56 takes pose and jaw, its expression stays at rest:
     ours cannot be written in it. Raises ConfigError for an unknown space.
@@ -160,13 +160,13 @@ def encode(
     if known.jaw is None:
         out[:, known.expression] = values[:, SHAPES]
     else:
-        opening = JAW_FULL_OPEN_RAD * values[:, SHAPES][:, BLENDSHAPES.index("jawOpen")]
+        opening = JAW_FULL_OPEN_RAD * values[:, SHAPES][:, _JAW]
         out[:, known.jaw] += opening[:, None] * axes[1]
     return out.astype(np.float32)
 
 
 def rest_of(space: str) -> Doubles:
-    """(dim,) a face at rest that looks straight ahead. Raises ConfigError for an unknown space."""
+    """Return a face at rest (dim,) that looks straight ahead. Raises ConfigError for an unknown space."""
     if space == "arkit58":  # our own
         return np.zeros(MOTION_DIM)
     known = _space(space)
@@ -176,7 +176,7 @@ def rest_of(space: str) -> Doubles:
 
 
 def limitation(space: str, flame: FlameMatrix | None) -> str | None:
-    """One line about what the space cannot show, or None."""
+    """Return the limitation of the space in one line, or None."""
     if space != "deca56" or flame is not None:
         return None
     return f"{space} without a matrix drives pose and jaw only: expression is not shown"
@@ -190,8 +190,9 @@ def _space(name: str) -> Space:
 
 @lru_cache(maxsize=64)
 def _at_rest(space: str, *rotation: float) -> tuple[Doubles, Doubles]:
-    """A (3, 3) of a space, and A (3, 3) after the rotation of a face at rest as the space writes it: a head's rotation
-    R is A^T R of ours, then that. Not to be changed.
+    """Return A (3, 3) of a space, and A times the rotation of a face at rest. Not to be changed in place.
+
+    A head's rotation in the space is A^T R (A times rest), R being ours.
     """
     known = _space(space)
     axes = np.array(known.axes, dtype=np.float64)
@@ -199,7 +200,7 @@ def _at_rest(space: str, *rotation: float) -> tuple[Doubles, Doubles]:
 
 
 def _rotations(space: Space, values: Doubles) -> Doubles:
-    """(N, 3) as the space writes them -> (N, 3, 3)."""
+    """Return matrices (N, 3, 3) of rotations (N, 3) as the space writes them."""
     if space.euler:
         return rotation_of(values)
     from scipy.spatial.transform import Rotation
@@ -220,3 +221,122 @@ def angles_of(turns: Doubles) -> Doubles:
     upright = level < LOCKED
     x = np.where(upright, np.arctan2(-turns[:, 1, 2], turns[:, 1, 1]), x)
     return np.stack([x, y, np.where(upright, 0.0, z)], axis=1)
+
+
+# --- FLAME's expression as ARKit blendshapes, with a matrix that the user brings --------------------------------------
+#
+# The matrix has one row of FLAME coefficients per blendshape: weights @ matrix = coefficients. Such matrices are badly
+# conditioned (rows of rare shapes are huge), so it is not inverted: the result is the nearest weights within 0..1, with
+# a small price on their size and on left and right being different. Gaze is not in FLAME's expression: its channels
+# stay 0. The rows of the jaw are not used, because the jaw has a pose.
+
+COEFFICIENTS: Final = 50  # the first ones, those that deca56 has
+_SIZE_PRICE: Final = 0.02  # of the matrix's own scale
+_SIDES_PRICE: Final = 0.05
+_JAW: Final = BLENDSHAPES.index("jawOpen")
+_FIXED_AT_0: Final = [i for i, name in enumerate(BLENDSHAPES) if name.startswith("eyeLook")]
+_SIDES: Final = [
+    (i, BLENDSHAPES.index(name.removesuffix("Left") + "Right"))
+    for i, name in enumerate(BLENDSHAPES)
+    if name.endswith("Left") and name.removesuffix("Left") not in ("jaw", "mouth") and not name.startswith("eyeLook")
+]
+_STEPS: Final = 400
+_SETTLED: Final = 1e-8  # largest change of an unknown in one step
+
+
+def bounded_least_squares(matrix: Doubles, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
+    """Return the x (N, n), low <= x <= high, with the least ||matrix x - wanted||^2, per row of `wanted` (N, m).
+
+    matrix (m, n) of full column rank (add rows of a ridge where it is not); low, high (n,) or (N, n). Accelerated
+    projected gradient with restarts (O'Donoghue and Candes 2015): every step is one matrix product for all N.
+    """
+    gram = matrix.T @ matrix
+    target = wanted @ matrix  # (N, n)
+    step = 1.0 / float(np.linalg.eigvalsh(gram)[-1])
+    here: Doubles = np.clip(np.linalg.solve(gram, target.T).T, low, high)
+    ahead, momentum = here, np.ones((len(wanted), 1))
+    for _ in range(_STEPS):
+        slope = ahead @ gram - target
+        there: Doubles = np.clip(ahead - step * slope, low, high)
+        moved = there - here
+        uphill = (slope * moved).sum(axis=1, keepdims=True) > 0
+        momentum = np.where(uphill, 1.0, momentum)
+        following = (1.0 + np.sqrt(1.0 + 4.0 * momentum**2)) / 2.0
+        ahead = there + np.where(uphill, 0.0, (momentum - 1.0) / following) * moved
+        here, momentum = there, following
+        if np.abs(moved).max(initial=0.0) < _SETTLED:
+            break
+    return here
+
+
+@dataclass(frozen=True)
+class FlameMatrix:
+    """`rows` (52, 50): FLAME coefficients of every blendshape at 1, in the order of `frames.BLENDSHAPES`."""
+
+    rows: Doubles
+
+    def solve(self, expression: Doubles, jaw_open: Doubles | None = None) -> Doubles:
+        """Return blendshapes (N, 52), 0..1, for coefficients (N, 50); jaw_open (N,), 0..1, is taken unchanged."""
+        scale = float(np.sqrt((self.rows**2).sum(axis=1).mean()))
+        sides = np.zeros((len(_SIDES), len(BLENDSHAPES)))
+        for row, (left, right) in enumerate(_SIDES):
+            sides[row, left], sides[row, right] = 1.0, -1.0
+        prices = np.concatenate([_SIZE_PRICE * np.eye(len(BLENDSHAPES)), _SIDES_PRICE * sides]) * scale
+        wanted = np.concatenate([expression, np.zeros((len(expression), len(prices)))], axis=1)
+        low, high = np.zeros((len(expression), len(BLENDSHAPES))), np.ones((len(expression), len(BLENDSHAPES)))
+        high[:, _FIXED_AT_0] = 0.0
+        if jaw_open is not None:
+            low[:, _JAW] = high[:, _JAW] = jaw_open
+        return bounded_least_squares(np.concatenate([self.rows.T, prices]), wanted, low, high)
+
+
+def read_matrix(file: Path, order: str = "alphabetical") -> FlameMatrix:
+    """Read a matrix of one row per blendshape and at least 50 columns; more (up to 100, jaw, eyes) are left out.
+
+    .npy: rows in the named order of `frames.ORDERS`. .csv: the same, or each row begins with the blendshape's name.
+    Raises ConfigError for a file that cannot be used.
+    """
+    if order not in ORDERS:
+        raise ConfigError(f"order {order!r} is not known ({', '.join(ORDERS)})")
+    names, values = _npy(file, order) if file.suffix == ".npy" else _csv(file, order)
+    if values.ndim != 2 or values.shape[1] < COEFFICIENTS:
+        raise ConfigError(f"{file}: is {values.shape}, not a row of at least {COEFFICIENTS} per blendshape")
+    if len(values) != len(names):
+        raise ConfigError(f"{file}: has {len(values)} rows, order {order!r} has {len(names)}")
+    if not np.isfinite(values).all():
+        raise ConfigError(f"{file}: row {names[int(np.argwhere(~np.isfinite(values))[0, 0])]} is not finite")
+    rows = np.zeros((len(BLENDSHAPES), COEFFICIENTS))
+    for name, row in zip(names, values, strict=True):
+        if name in BLENDSHAPES:
+            rows[BLENDSHAPES.index(name)] = row[:COEFFICIENTS]
+    if not rows.any():
+        raise ConfigError(f"{file}: holds nothing but zeros")
+    return FlameMatrix(rows)
+
+
+def _npy(file: Path, order: str) -> tuple[tuple[str, ...], Doubles]:
+    try:
+        return ORDERS[order], np.asarray(np.load(file, allow_pickle=False), dtype=np.float64)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file}: cannot be read as a matrix: {error}") from error
+
+
+def _csv(file: Path, order: str) -> tuple[tuple[str, ...], Doubles]:
+    try:
+        with file.open(encoding="utf-8", newline="") as text:
+            cells = [row for row in csv.reader(text) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
+    names = ORDERS[order]
+    if cells and cells[0][0] in (*BLENDSHAPES, "_neutral"):
+        names = tuple(row[0] for row in cells)
+        unknown = [name for name in names if name not in (*BLENDSHAPES, "_neutral")]
+        if unknown or len(set(names)) < len(names):
+            wrong = unknown[0] if unknown else next(name for name in names if names.count(name) > 1)
+            problem = "is not a blendshape" if unknown else "is given twice"
+            raise ConfigError.at(file, "row", wrong, problem, BLENDSHAPES if unknown else ())
+        cells = [row[1:] for row in cells]
+    try:
+        return names, np.array(cells, dtype=np.float64)
+    except ValueError as error:
+        raise ConfigError(f"{file}: not a matrix of numbers: {error}") from error

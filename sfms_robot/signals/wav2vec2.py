@@ -12,9 +12,7 @@ Deviation: REACT's baselines run whole recordings and stretch 50 latents a secon
 
 from __future__ import annotations
 
-import hashlib
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +21,6 @@ import torch
 
 from sfms_robot.errors import ModelError, optional
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats
-from sfms_robot.signals.audio_features import Feature
 
 CONTEXT_FRAMES: Final = 50
 STRIDE: Final = 320  # samples a latent
@@ -31,47 +28,47 @@ FIELD: Final = 400  # samples the last latent sees
 WINDOW: Final = CONTEXT_FRAMES * FRAME_SAMPLES + FIELD - STRIDE  # 32,080, at a hop of one frame
 LATENTS_PER_FRAME: Final = FRAME_SAMPLES // STRIDE
 BATCH: Final = 16
-_CONFIG, _PREPROCESSOR = "config.json", "preprocessor_config.json"
-_WEIGHTS: Final = ("model.safetensors", "pytorch_model.bin")
+FILES: Final = ("config.json", "preprocessor_config.json", "model.safetensors", "pytorch_model.bin")
 
 
 class Wav2Vec2:
-    """A wav2vec2 model of a local folder. Holds weights; what a stream has heard is a value of the caller's."""
+    """A wav2vec2 model of a local folder. Holds weights; the past of a stream is a value of the caller."""
 
     def __init__(self, folder: Path | str, device: str = "cpu", hop_frames: int = 1) -> None:
-        """Raises MissingExtra without transformers, ModelError for a folder that holds no such model."""
+        """Load the model. Raises MissingExtra without transformers, ModelError for a folder without such a model."""
         with optional("wav2vec2"):
             import transformers
         self.folder = Path(folder)
-        settings = _json(self.folder / _CONFIG)
+        config = self.folder / FILES[0]
+        settings = _json(config)
         if settings.get("model_type") != "wav2vec2":
-            raise ModelError(f"{self.folder / _CONFIG}: model_type = {settings.get('model_type')!r} is not wav2vec2")
+            raise ModelError(f"{config}: model_type = {settings.get('model_type')!r} is not wav2vec2")
         try:
             model: Any = transformers.Wav2Vec2Model.from_pretrained(str(self.folder), local_files_only=True)
         except (OSError, ValueError, RuntimeError) as error:
             raise ModelError(f"{self.folder}: no wav2vec2 weights that can be read: {error}".splitlines()[0]) from error
         kernels, strides = model.config.conv_kernel, model.config.conv_stride
         if _reach(kernels, strides) != (FIELD, STRIDE):
-            raise ModelError(f"{self.folder / _CONFIG}: conv_stride = {list(strides)} is not a latent every 20 ms")
+            raise ModelError(f"{config}: conv_stride = {list(strides)} is not a latent every 20 ms")
         self._model = model.eval().to(device)
         self._device = device
         self.hop_frames = hop_frames
         self._hop = hop_frames * FRAME_SAMPLES
         self._window = WINDOW + self._hop - FRAME_SAMPLES
-        preprocessor = self.folder / _PREPROCESSOR
+        preprocessor = self.folder / FILES[1]
         self._normalise = bool(_json(preprocessor).get("do_normalize", True)) if preprocessor.is_file() else True
         self.dim = int(model.config.hidden_size)
 
     def start(self) -> Floats:
-        """Past of a stream that has heard nothing: (31440,) zeros."""
+        """Return the past of a new stream: (31440,) zeros."""
         return np.zeros(self._window - self._hop, dtype=np.float32)
 
     def step(self, samples: Floats, past: Floats) -> tuple[Floats, Floats]:
-        """Rows of the hops that `samples` complete, and the past of the next call.
+        """Return the rows of the hops that `samples` complete, and the past of the next call.
 
         Args:
             samples: (n,) mono 16 kHz, -1..1; any n.
-            past: what the last call returned, or `start()`; not changed.
+            past: from the last call, or `start()`; not changed.
 
         Returns:
             (frames, dim), a multiple of `hop_frames`, and the samples to hand in next time: 31440 and those of a hop
@@ -85,9 +82,9 @@ class Wav2Vec2:
         return self._rows(windows), seen[hops * self._hop :].copy()
 
     def of_recording(self, samples: Floats, fps: float = FRAME_HZ) -> Floats:
-        """(frames, dim) of a whole recording.
+        """Return the rows (frames, dim) of a whole recording.
 
-        At 25 fps what a stream gives; a last hop that is not complete ends in silence. At other rates windows end with
+        At 25 fps those of a stream; a last hop that is not complete ends in silence. At other rates windows end with
         their frame, which takes a hop of one: raises ValueError for others.
         """
         frames = int(len(samples) * fps / AUDIO_HZ + 1e-6)
@@ -104,7 +101,7 @@ class Wav2Vec2:
 
     @torch.no_grad()
     def _rows(self, windows: Floats) -> Floats:
-        """(hops, window) -> (hops * hop_frames, dim)."""
+        """Return the rows (hops * hop_frames, dim) of windows (hops, window)."""
         rows = []
         for at in range(0, len(windows), BATCH):
             sound = torch.from_numpy(windows[at : at + BATCH].copy()).to(self._device)
@@ -117,15 +114,8 @@ class Wav2Vec2:
         return np.concatenate(rows)
 
 
-def feature(folder: Path | str, fps: float = FRAME_HZ, device: str = "cpu", hop_frames: int = 1) -> Feature:
-    """To be kept by `signals.audio_features.cached`; its version tells the hop and a hash of the model's files."""
-    model = Wav2Vec2(folder, device, hop_frames)
-    compute = partial(model.of_recording, fps=fps)
-    return Feature("wav2vec2", f"1 hop {hop_frames} {_digest(model.folder)}", model.dim, fps, compute)
-
-
 def _reach(kernels: list[int], strides: list[int]) -> tuple[int, int]:
-    """Samples that a latent sees, and samples from one to the next."""
+    """Return the samples that a latent sees, and the samples from one to the next."""
     field, stride = 1, 1
     for kernel, step in zip(kernels, strides, strict=True):
         field += (kernel - 1) * stride
@@ -133,20 +123,11 @@ def _reach(kernels: list[int], strides: list[int]) -> tuple[int, int]:
     return field, stride
 
 
-def _digest(folder: Path) -> str:
-    found = hashlib.sha256()
-    for name in (_CONFIG, _PREPROCESSOR, *_WEIGHTS):
-        if (folder / name).is_file():
-            with (folder / name).open("rb") as stream:
-                found.update(hashlib.file_digest(stream, "sha256").digest())
-    return found.hexdigest()[:16]
-
-
 def _json(file: Path) -> dict[str, Any]:
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ModelError(f"{file}: no such file: a model folder holds {_CONFIG} and {_WEIGHTS[0]}") from error
+        raise ModelError(f"{file}: no such file: a model folder holds {FILES[0]} and {FILES[2]}") from error
     except ValueError as error:
         raise ModelError(f"{file}: not JSON: {error}") from error
     if not isinstance(found, dict):

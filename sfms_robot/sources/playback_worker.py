@@ -19,7 +19,7 @@ import numpy as np
 
 from sfms_robot.errors import PortError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
-from sfms_robot.signals.interpolation import at_positions
+from sfms_robot.signals.audio import at_positions
 from sfms_robot.sources.drift import SampleClock
 from sfms_robot.sources.sound_devices import (
     DeviceStream,
@@ -205,6 +205,7 @@ class Playout:
         self._settled = False  # it goes on where the last block ended
         self.silences: deque[Silence] = deque(maxlen=_UNTOLD)
         self._counts = {"underruns": 0, "jumps": 0}
+        at_positions(np.zeros(1, np.float32), np.zeros(1))  # makes its table now, not in the callback of the device
 
     def start(self, origin_s: float) -> None:
         """Loop time 0 is `origin_s` of `time.monotonic`."""

@@ -15,7 +15,7 @@ from sfms_robot.app.replay.page_replay import pictures
 from sfms_robot.app.replay.run_file import _records
 from sfms_robot.app.replay.run_playback import PlaybackOptions, play_back
 from sfms_robot.app.session import RunOptions, run
-from sfms_robot.config.arig import STATES, paper_state
+from sfms_robot.config.listener import STATES, paper_state
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.lab.evaluation.rollout import speaker_frames

@@ -21,7 +21,7 @@ from sfms_robot.app.head.calibrate import Outcome, calibrate, calibrate_on
 from sfms_robot.app.open_head import HeadOptions, open_head
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
-from sfms_robot.config.calibrate_first import held_back
+from sfms_robot.config.head import held_back
 from sfms_robot.config.overlay import (
     Overlay,
     calibrated,

@@ -14,8 +14,7 @@ from sfms_robot.lab.corpora.formats import detect, open_dataset, open_for, split
 from sfms_robot.lab.learning.sfms.features import gather
 from sfms_robot.lab.train.data_conversion import convert_data
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.flame import COEFFICIENTS
-from sfms_robot.signals.spaces import decode, rest_of
+from sfms_robot.signals.spaces import COEFFICIENTS, decode, rest_of
 
 
 def matrix(folder):

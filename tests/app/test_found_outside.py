@@ -10,13 +10,12 @@ from sfms_robot.app.open_head import HeadOptions, OpenHead, build_bus, build_mot
 from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
-from sfms_robot.config.calibrate_first import held_back
+from sfms_robot.config.head import held_back
 from sfms_robot.data import head_names
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.motion.limits import JointLimits
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, STANDS_RAD, Interrupt
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.recording import RecordedVoice
@@ -86,7 +85,7 @@ def test_a_head_found_outside_its_limits_runs_and_comes_to_rest(name, careful, s
     head = held_back(whole) if careful else whole
     log, motion, _, _ = driven(head, found_outside(head, whole, np.random.default_rng(seed)), SECONDS, seed)
     assert log.audited.violations == 0
-    assert motion.limiter.start(log.audited.recent_rad[-1]).way_in is None  # all are inside
+    assert motion.limiter.start(log.audited.recent_rad[-1]).recovery is None  # all are inside
 
 
 @pytest.mark.parametrize("name", ["op3_head", "reachy_mini", "face28"])

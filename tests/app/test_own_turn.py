@@ -5,8 +5,8 @@ import pytest
 
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan
-from sfms_robot.runtime.feed import InlineFeed
-from sfms_robot.runtime.presence import TURN_GAP_S
+from sfms_robot.runtime.clock import InlineFeed
+from sfms_robot.runtime.states import TURN_GAP_S
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.push import PushedSpeech

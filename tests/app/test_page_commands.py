@@ -96,7 +96,7 @@ def test_the_rest_is_handed_on():
         ("show", {"channels": {"jawOpen": 2.0}, "seconds": 1.0}, "jawOpen = 2 is not a number in its range"),
         ("neutral", {"seconds": -1.0}, "seconds = -1 is not a positive number"),
         ("expression", {"name": "dance", "seconds": 1.0}, "expression 'dance' is not there .smile"),
-        ("look_at", {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "seconds": 1.0}, "is no point"),
+        ("look_at", {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "seconds": 1.0}, "is not a point"),
         ("knobs", {"intensity": {"tail": 1.0}, "style": {}}, "'tail' is not a region"),
         ("knobs", {"intensity": {"neck": 3.0}, "style": {}}, "is not in 0..2"),
         ("calm", {"rates": {"dance": 1.0}}, "dance"),

@@ -4,7 +4,7 @@ import pytest
 
 from sfms_robot.app.calibrated_head import ready
 from sfms_robot.config import load_head
-from sfms_robot.config.calibrate_first import PACE, TRAVEL, held_back
+from sfms_robot.config.head import PACE, TRAVEL, held_back
 from sfms_robot.data import head_names
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 

@@ -4,10 +4,9 @@ import re
 
 import pytest
 
-from sfms_robot.config import FirmwareMap, load_firmware_map, load_head, map_files
-from sfms_robot.config.check import check_head
-from sfms_robot.config.named_bus import highest_rate_hz
-from sfms_robot.config.safety_rules import Safety, is_harmless, register_problems
+from sfms_robot.config import FirmwareMap, Safety, load_firmware_map, load_head, map_files
+from sfms_robot.config.check import check_head, is_harmless, register_problems
+from sfms_robot.config.consistency import highest_rate_hz
 from sfms_robot.errors import ConfigError
 
 HEAD = """

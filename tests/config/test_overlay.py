@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from sfms_robot.config import load_firmware_map, load_head
-from sfms_robot.config.mapping import Expression
+from sfms_robot.config.joint import Expression
 from sfms_robot.config.overlay import (
     OLD_FILE,
     CalibrateLayer,
@@ -22,10 +22,11 @@ from sfms_robot.config.overlay import (
     layered,
     load_overlay,
     overlay_file,
+    provenance,
     record_stored,
+    refusals,
     save_overlay,
 )
-from sfms_robot.config.provenance import provenance, refusals
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration

@@ -1,7 +1,7 @@
 """Every value of a joint is told with the place it comes from."""
 
 from sfms_robot.config import load_head
-from sfms_robot.config.provenance import SHOWN, provenance
+from sfms_robot.config.overlay import SHOWN, provenance
 
 
 def test_a_value_comes_from_its_own_line_its_twin_the_defaults_or_nowhere():

@@ -5,7 +5,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config.yaml_file import DEEPEST, read, with_number
+from sfms_robot.config.base import DEEPEST, read, with_number
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 

@@ -13,8 +13,7 @@ from sfms_robot.config import load_head
 from sfms_robot.data import head_names
 from sfms_robot.emulator.launch import launch
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.servo.families import family_named
 from sfms_robot.sources.paired import PairedSource

@@ -11,7 +11,7 @@ from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FaceFrame, Sp
 from sfms_robot.listeners.eventful import EventfulListener, frame_of, target_at
 from sfms_robot.listeners.events.model import LEAD_FRAMES, EventModel
 from sfms_robot.signals.control import COLUMNS
-from sfms_robot.signals.eye_angles import directions
+from sfms_robot.signals.gaze_kinematics import directions
 
 LIVELY = Calmness(nod=40, shake=10, tilt=10, smile=20, brow_raise=20, blink=40, gaze_shift=30, addressed="assume")
 NOTHING = Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))

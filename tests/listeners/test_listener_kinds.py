@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.config.listener_kinds import LISTENER_KINDS, parse_listener
+from sfms_robot.config.listener import LISTENER_KINDS, parse_listener
 from sfms_robot.errors import ConfigError
 
 
@@ -13,4 +13,4 @@ def test_a_kind_that_is_none_is_one_line_with_the_choices():
 
 @pytest.mark.parametrize("name", LISTENER_KINDS)
 def test_our_settings_say_their_own_kind(name):
-    assert LISTENER_KINDS[name].settings_class().model_fields["kind"].annotation.__args__ == (name,)
+    assert LISTENER_KINDS[name].settings.model_fields["kind"].annotation.__args__ == (name,)

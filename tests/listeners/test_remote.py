@@ -6,7 +6,7 @@ import logging
 import pytest
 from remote_rig import SERVER_CLOCK_S, Counting, Network, Robot, Server
 
-from sfms_robot.config.calmness import Calmness
+from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.remote import HUNG_S
 from sfms_robot.listeners.remote_messages import Notice, Refusal, words_message

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
-from sfms_robot.motion.chase import Bound, Stop, StopChase
+from sfms_robot.motion.jerk_step import Bound, Stop, StopChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
 

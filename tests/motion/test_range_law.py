@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from sfms_robot.app.wiring import calibration_of, firmware_maps
 from sfms_robot.config import Head, load_head
-from sfms_robot.config.calibrate_first import held_back
+from sfms_robot.config.head import held_back
 from sfms_robot.data import head_names
 from sfms_robot.motion.audit import CommandAudit
-from sfms_robot.motion.chase import StopChase, TimeOptimalChase
+from sfms_robot.motion.jerk_step import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
 from sfms_robot.servo.goals import Goals

@@ -121,7 +121,7 @@ FAULTS = (
     Fault("runtime/halt.py", "        if active:\n", "        if False:\n", LOOP),
     Fault("runtime/halt.py", "self._closed.get(cause) == closing:", "cause in self._closed:", LOOP),
     Fault("runtime/halt.py", '            bus.torque_off("release")', "            pass", LOOP),
-    Fault("runtime/halt_switches.py", "return not path.parent.is_dir()", "return False", LOOP),
+    Fault("runtime/halt.py", "return not path.parent.is_dir()", "return False", LOOP),
     Fault("runtime/loop.py", "if state.run.since_s == now_s and released.any():", "if False:", LOOP),
     Fault("runtime/loop.py", "if not parts.halt.causes:", "if True:", LOOP),
     Fault("runtime/states.py", "    if now.halted:", "    if False:", LOOP),

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import CameraMount
-from sfms_robot.retarget.gaze_target import Camera
-from sfms_robot.signals.eye_angles import direction_to
+from sfms_robot.retarget.gaze import Camera
+from sfms_robot.signals.gaze_kinematics import direction_to
 
 METRES = st.tuples(*[st.floats(-3, 3)] * 3)
 POSES = st.tuples(*[st.floats(-1, 1)] * 3, *[st.floats(-0.1, 0.1)] * 3).map(np.array)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.config import load_head
-from sfms_robot.config.drives import drives
+from sfms_robot.config.head import drives
 from sfms_robot.frames import BLENDSHAPES
 from sfms_robot.retarget.channel_mapping import Units
 from sfms_robot.retarget.response_fit import FLATTEST, STEEPEST, asked, fit, fitted_drives, rms

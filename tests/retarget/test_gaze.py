@@ -11,7 +11,7 @@ from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.channel_mapping import ChannelMapping
-from sfms_robot.signals.eye_angles import Jump, directions, turn
+from sfms_robot.signals.gaze_kinematics import Jump, directions, turn
 
 TICK_S, LEADS_S = 0.01, np.array([0.0, 0.04, 0.07])
 FULL_RAD = np.radians([30.0, 20.0])

@@ -10,8 +10,8 @@ from sfms_robot.config import CameraMount, Gaze, Life, Person
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM
 from sfms_robot.ports import Watched
 from sfms_robot.retarget import spontaneous
-from sfms_robot.retarget.gaze_target import Camera, HeadTurn
-from sfms_robot.signals.eye_angles import direction_to, directions, turn
+from sfms_robot.retarget.gaze import Camera, HeadTurn
+from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
 
 TICK_S, LEADS_S = 0.01, np.array([0.0, 0.05, 0.08])
 FULL_RAD = np.radians([30.0, 20.0])

@@ -8,7 +8,7 @@ import pytest
 from sfms_robot.config import Idle, Life
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
-from sfms_robot.retarget.idle import CLOSED_S, CLOSING_S, OPENING_S
+from sfms_robot.retarget.spontaneous import CLOSED_S, CLOSING_S, OPENING_S
 
 TICK_S, LEADS_S = 0.02, np.array([0.0, 0.03, 0.06])
 BLINK, YAW, PITCH = CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sfms_robot.config import parse
 from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.errors import ConfigError
-from sfms_robot.retarget.kinematics import Serial
+from sfms_robot.retarget.neck import Serial
 from sfms_robot.signals import rotations
 
 AXES = ("roll", "pitch", "yaw")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
-from sfms_robot.config import Bus, Expression, Head, Joint, LimitClass
+from sfms_robot.config import BusConfig, Expression, Head, Joint, LimitClass
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM
 from sfms_robot.retarget.channel_mapping import ChannelMapping
 
@@ -16,7 +16,7 @@ def head_of(*drives, **joint) -> Head:
     return Head(
         name="test",
         description="",
-        buses={"main": Bus(family="dynamixel2", baud=1000000)},
+        buses={"main": BusConfig(family="dynamixel2", baud=1000000)},
         limits={"any": LimitClass(speed_deg_s=1, acceleration_deg_s2=1, jerk_deg_s3=1)},
         joints={
             f"joint{i}": Joint(bus="main", id=i, model="m", zero_ticks=2048, limits="any", drive=drive, **settings)

@@ -11,7 +11,7 @@ from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget.puppet import EYES_S, FALL_S, HEAD_S, RISE_S, Puppet
-from sfms_robot.signals.eye_angles import directions
+from sfms_robot.signals.gaze_kinematics import directions
 
 DT_S = 0.01
 LEADS_S = np.array([0.0, 0.02, 0.05, 0.11])
@@ -152,8 +152,8 @@ REFUSED = [
     (lambda p: p.show(np.zeros(52), 1), r"shape \(52,\)"),
     (lambda p: p.show(np.zeros(58), 0), "seconds = 0"),
     (lambda p: p.show(np.zeros(58), math.inf), "seconds = inf"),
-    (lambda p: p.look_at(0, 0, 0, 1), r"look_at\(0, 0, 0\) is no point"),
-    (lambda p: p.look_at(math.nan, 0, 0, 1), "is no point"),
+    (lambda p: p.look_at(0, 0, 0, 1), r"look_at\(0, 0, 0\) is not a point"),
+    (lambda p: p.look_at(math.nan, 0, 0, 1), "is not a point"),
     (lambda p: p.look_at(1, 0, 0, -1), "seconds = -1"),
 ]
 

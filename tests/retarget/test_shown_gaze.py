@@ -6,12 +6,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sfms_robot.config import Gaze, Life, load_head
-from sfms_robot.config.calibrate_first import held_back
+from sfms_robot.config.head import held_back
 from sfms_robot.data import head_names
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.signals.eye_angles import directions
+from sfms_robot.signals.gaze_kinematics import directions
 from sfms_robot.signals.rotations import rotation
 
 FULL_RAD = np.radians([30.0, 20.0])

@@ -16,8 +16,7 @@ from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError, ModelError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.retarget.spontaneous import HeadLife
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.safety import REST_LIMIT_S, Interrupt, Released

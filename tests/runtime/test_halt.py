@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from sfms_robot.errors import ConfigError, HaltedError
-from sfms_robot.runtime.halt import MOST_CAUSES, HaltLatch
-from sfms_robot.runtime.halt_switches import halt_signals, halt_switch, open_line, watching_line
+from sfms_robot.runtime.halt import MOST_CAUSES, HaltLatch, halt_signals, halt_switch, open_line, watching_line
 
 LONG_S = 5.0  # for what must happen; nothing waits so long unless it fails
 DOORS = ("device", "page", "fleet")

@@ -15,8 +15,7 @@ from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, FaceFrame, Plan, SpeakerFrame
 from sfms_robot.ports import Bus, Source, Tick
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import Reading
-from sfms_robot.runtime.heat import COOLER_C, PER_S, WARM_SHARE, Heat, HeatGuard, temperatures_C
+from sfms_robot.runtime.safety import COOLER_C, PER_S, WARM_SHARE, Heat, HeatGuard, temperatures_C
 
 WARM, HOT = np.full(3, 60.0), np.full(3, 67.0)
 

@@ -14,8 +14,7 @@ from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.ports import Source, Tick
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.runtime.feed import InlineFeed
+from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive, turned_by_hand
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link

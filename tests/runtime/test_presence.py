@@ -3,7 +3,7 @@
 import numpy as np
 
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, SpeakerFrame
-from sfms_robot.runtime.presence import GONE_S, TURN_GAP_S, Presence
+from sfms_robot.runtime.states import GONE_S, TURN_GAP_S, Presence
 
 SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
 NONE = np.zeros(0, np.float32)

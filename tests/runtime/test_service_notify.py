@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.ports import Tick
-from sfms_robot.runtime.service_notify import NotifyingObserver, ServiceManager
+from sfms_robot.runtime.observers import NotifyingObserver, ServiceManager
 
 
 @pytest.fixture(params=["path", "abstract"])

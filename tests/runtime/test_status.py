@@ -57,7 +57,7 @@ def test_the_person_is_what_the_newest_frame_holds() -> None:
         ("listening", (), None),
         ("degraded", ("voice", "jaw"), "without voice, jaw"),
         ("halted", ("key",), "until every cause is cleared"),
-        ("idle", (), "nobody is seen or heard"),
+        ("idle", (), "no person is seen or heard"),
         ("fault", ("the supply is gone",), "the supply is gone"),
     ],
 )

@@ -5,7 +5,7 @@ from emulated_devices import device_of, servos_of
 from emulated_port import EmulatedPort, Straight
 from virtual_time import Time
 
-from sfms_robot.config import Bus, Safety, load_firmware_map
+from sfms_robot.config import BusConfig, Safety, load_firmware_map
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 
@@ -38,7 +38,7 @@ class Bench:
             self.ports.append(self.new_port(self.board, baud, self.clock))
             return self.ports[-1]
 
-        config = Bus(family=firmware_map.family, baud=baud, crc=crc[0])
+        config = BusConfig(family=firmware_map.family, baud=baud, crc=crc[0])
         conversion, more = Straight(firmware_map, limit_rad), {"confirmed": True, "config": config} | more
         self.bus = family_named(firmware_map.family).build("face", servos, conversion, open_port, baud, **more)
 

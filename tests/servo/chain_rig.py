@@ -8,7 +8,7 @@ import numpy as np
 from emulated_devices import device_of, servos_of
 from emulated_port import BAUD, EmulatedPort, FaultyPort, Straight
 
-from sfms_robot.config import Bus, Faults, FirmwareMap, Safety, load_firmware_map
+from sfms_robot.config import BusConfig, Faults, FirmwareMap, Safety, load_firmware_map
 from sfms_robot.servo.chain.chain_bus import ChainBus
 from sfms_robot.servo.families import families
 from sfms_robot.servo.policy import BusServo
@@ -37,7 +37,7 @@ def bus_of(
     of = maps[0].family, maps[0].protocol
     name, family = next((name, each) for name, each in families().items() if each.maps == of)
     conversion = conversion or Straight(maps[0], limit_rad)
-    options = Bus(family=name, baud=baud, **config)
+    options = BusConfig(family=name, baud=baud, **config)
     more = {"confirmed": True} if family.board else {"faults": faults}  # hobby servos jump to their first pose
     return family.build("face", servos, conversion, open_port, baud, read_deadline_s, config=options, **more)
 

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from sfms_robot.config import load_head
-from sfms_robot.config.named_bus import BUS_FAMILIES, BUS_GROUP
+from sfms_robot.config.joint import BUS_FAMILIES, BUS_GROUP
 from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.families import BusFamily, families, family_named, servo_families

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, FaceFrame
 from sfms_robot.signals.attention import AttentionState, attend
-from sfms_robot.signals.eye_angles import turn
+from sfms_robot.signals.gaze_kinematics import turn
 from sfms_robot.signals.tracks import read_track
 
 FULL_RAD = np.radians([30.0, 20.0])

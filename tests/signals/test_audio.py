@@ -54,7 +54,7 @@ def test_what_is_no_sound_is_refused_in_one_line(tmp_path):
 
 
 UNUSABLE = {
-    "one sample a second": (np.full(10, 0.1), 1, "PCM_16", "1 samples a second is no rate for speech"),
+    "one sample a second": (np.full(10, 0.1), 1, "PCM_16", "1 samples a second is not a rate of speech"),
     "integers as floats": (np.full(10, 1e6), 16000, "FLOAT", r"samples up to 1e\+06, full scale is 1"),
     "the largest float": (np.full(100_000, 1e38), 48000, "FLOAT", r"samples up to 1e\+38"),
     "one NaN late": (np.r_[np.zeros(200_000), np.nan], 16000, "DOUBLE", "not finite"),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE
 from sfms_robot.signals import gaze_kinematics as gaze
-from sfms_robot.signals.eye_angles import directions
+from sfms_robot.signals.gaze_kinematics import directions
 
 FULL_RAD = np.array([gaze.EYE_PAN_RAD, gaze.EYE_TILT_RAD])
 TARGETS = st.tuples(st.floats(-30, 30), st.floats(-20, 20)).map(np.radians)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.signals.interpolation import at_positions
+from sfms_robot.signals.audio import at_positions
 
 RATE_HZ = 16_000
 

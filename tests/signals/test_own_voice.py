@@ -13,9 +13,16 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import InputError
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
-from sfms_robot.signals.motor_noise import STILL_RAD_S, SUPPRESSION_LATENCY_SAMPLES, MotorNoise, total_speed
-from sfms_robot.signals.own_voice_gate import OwnVoiceGate
-from sfms_robot.signals.speech_probability import FORGETS_WINDOWS, WINDOW, SpeechProbability
+from sfms_robot.signals.own_voice_gate import (
+    FORGETS_WINDOWS,
+    STILL_RAD_S,
+    SUPPRESSION_LATENCY_SAMPLES,
+    WINDOW,
+    MotorNoise,
+    OwnVoiceGate,
+    SpeechProbability,
+    total_speed,
+)
 
 
 def talk(who, start_s=0.0, seconds=10.0):

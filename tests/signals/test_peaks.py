@@ -7,8 +7,8 @@ from hypothesis.extra import numpy as arrays
 from scipy import signal
 from scipy.interpolate import PchipInterpolator
 
-from sfms_robot.retarget.compile import _monotone_cubics
-from sfms_robot.signals.peaks import band_pass, find_peaks, half_widths
+from sfms_robot.retarget.channel_mapping import _monotone_cubics
+from sfms_robot.signals.events import band_pass, find_peaks, half_widths
 
 LEVELS = strategies.one_of(strategies.integers(-3, 3).map(float), strategies.floats(-2, 2, width=16))
 

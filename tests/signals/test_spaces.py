@@ -8,10 +8,17 @@ from scipy.spatial.transform import Rotation
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, SHAPES
-from sfms_robot.signals.bounded import bounded_least_squares
-from sfms_robot.signals.flame import FlameMatrix, read_matrix
 from sfms_robot.signals.rotations import rotation
-from sfms_robot.signals.spaces import JAW_FULL_OPEN_RAD, SPACES, angles_of, decode, encode
+from sfms_robot.signals.spaces import (
+    JAW_FULL_OPEN_RAD,
+    SPACES,
+    FlameMatrix,
+    angles_of,
+    bounded_least_squares,
+    decode,
+    encode,
+    read_matrix,
+)
 
 RNG = np.random.default_rng(5)
 MATRIX = RNG.normal(size=(52, 50))

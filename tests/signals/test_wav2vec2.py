@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sfms_robot.errors import MissingExtra, ModelError
+from sfms_robot.lab.corpora.audio_features import cached, wav2vec2_feature
 from sfms_robot.signals import wav2vec2
-from sfms_robot.signals.audio_features import MFCC78, Feature, cached, entry
 
 NOISE = np.random.default_rng(0).normal(0, 0.1, 16_000).astype(np.float32)
 
@@ -112,53 +112,8 @@ def test_missing_extra_names_the_install(monkeypatch, tmp_path):
         wav2vec2.Wav2Vec2(tmp_path)
 
 
-# --- the cache ------------------------------------------------------------------------------------------------
-
-
-def counting(calls: list[int], version: str = "1") -> Feature:
-    def compute(samples):
-        calls.append(len(samples))
-        return samples[: len(samples) // 640 * 640].reshape(-1, 640)[:, :3]
-
-    return Feature("three", version, 3, 25, compute)
-
-
-def test_same_sound_is_computed_once_and_read_back_exactly(tmp_path):
-    calls: list[int] = []
-    first, again = (cached(NOISE, counting(calls), tmp_path) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    assert len(calls) == 1 and not list(tmp_path.rglob("*.part"))
-
-
-def test_other_sound_and_other_versions_are_other_entries(tmp_path):
-    calls: list[int] = []
-    for samples, version in ((NOISE, "1"), (NOISE[1:], "1"), (NOISE, "2"), (NOISE, "1")):
-        cached(samples, counting(calls, version), tmp_path)
-    assert len(calls) == 3 and len(list(tmp_path.rglob("*.npz"))) == 3
-
-
-@pytest.mark.parametrize("at", [0, 200, -100, None])
-def test_broken_entry_is_computed_again_and_mended(tmp_path, at):
-    calls: list[int] = []
-    whole = cached(NOISE, counting(calls), tmp_path)
-    file = entry(NOISE, counting(calls), tmp_path)
-    content = bytearray(file.read_bytes())
-    if at is None:
-        content = content[:50]
-    else:
-        content[at] ^= 0xFF
-    file.write_bytes(content)
-    np.testing.assert_array_equal(cached(NOISE, counting(calls), tmp_path), whole)
-    cached(NOISE, counting(calls), tmp_path)
-    assert len(calls) <= 2 and (at not in (200, None) or len(calls) == 2)
-
-
 def test_wav2vec2_version_is_that_of_the_weights(folder, tmp_path):
-    one = wav2vec2.feature(folder)
+    one = wav2vec2_feature(folder)
     rows = cached(NOISE, one, tmp_path)
-    np.testing.assert_array_equal(cached(NOISE, wav2vec2.feature(folder), tmp_path), rows)
+    np.testing.assert_array_equal(cached(NOISE, wav2vec2_feature(folder), tmp_path), rows)
     assert one.version != wav2vec2.Wav2Vec2(folder).folder.name and one.dim == 16
-
-
-def test_mfcc_is_a_feature_that_can_be_kept(tmp_path):
-    assert cached(NOISE, MFCC78, tmp_path).shape == (25, 78)

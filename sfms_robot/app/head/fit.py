@@ -16,7 +16,7 @@ import numpy as np
 
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.config import Head, load_head
-from sfms_robot.config.drives import drives
+from sfms_robot.config.head import drives
 from sfms_robot.config.overlay import FitLayer, Fitted, head_hash, layered, load_overlay, overlay_file, save_overlay
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.tracker import Skin, Tracker

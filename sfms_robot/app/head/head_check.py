@@ -22,12 +22,11 @@ from sfms_robot.app.out_files import INK, new_figure, plain, save
 from sfms_robot.app.wiring import firmware_maps
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.check import check_head
-from sfms_robot.config.drives import drives
+from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, POSE_CHANNELS, Doubles, Floats
 from sfms_robot.motion.limits import JointLimits
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.kinematics import Neck
+from sfms_robot.retarget.head_retargeter import HeadRetargeter, Neck
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from sfms_robot.config import Head, load_head
 from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.robot_scene import RobotScene
-from sfms_robot.retarget.kinematics import build_neck
+from sfms_robot.retarget.head_retargeter import build_neck
 
 _CELL_PX: Final = (300, 290)
 _COLUMNS: Final = 3

@@ -16,7 +16,8 @@ from sfms_robot.config import find, load_head
 from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
-from sfms_robot.retarget.kinematics import Solved, build_neck
+from sfms_robot.retarget.head_retargeter import build_neck
+from sfms_robot.retarget.neck import Solved
 
 POSE_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")  # in the order of a pose
 BODY_COLUMN = "body_yaw_rad"

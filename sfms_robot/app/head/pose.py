@@ -19,7 +19,7 @@ from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
-from sfms_robot.runtime.feed import IDLE_FEED
+from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import EASE_S, Interrupt
 from sfms_robot.signals.minimum_jerk import ease
 

@@ -23,8 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sfms_robot.app.listen.knobs import STEP
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.halt_switches import resume_here
+from sfms_robot.runtime.halt import HaltLatch, resume_here
 from sfms_robot.runtime.safety import Interrupt
 
 try:

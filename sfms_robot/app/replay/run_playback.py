@@ -23,8 +23,7 @@ from sfms_robot.app.session import Panel, Programme, drive_head, run_log
 from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.halt_switches import halt_signals
+from sfms_robot.runtime.halt import HaltLatch, halt_signals
 from sfms_robot.runtime.observers import RunStatus
 from sfms_robot.runtime.safety import Interrupt, signals_to
 

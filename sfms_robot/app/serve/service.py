@@ -124,7 +124,7 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
 
     Raises ConfigError, MissingExtra, ModelError, PortError.
     """
-    from sfms_robot.runtime.service_notify import ServiceManager
+    from sfms_robot.runtime.observers import ServiceManager
 
     check_zenoh()
     name = check_name(options.name or Path(options.listener).name, "listener")

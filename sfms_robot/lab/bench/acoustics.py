@@ -18,7 +18,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, optional
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.speech_probability import WINDOW, SpeechProbability
+from sfms_robot.signals.own_voice_gate import WINDOW, SpeechProbability
 
 Bools = NDArray[np.bool_]
 

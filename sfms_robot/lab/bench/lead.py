@@ -24,7 +24,7 @@ from sfms_robot.emulator.launch import Chain
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.lab.bench.measure import HEAD, Row, row
 from sfms_robot.ports import Clock, Observer, Tick
-from sfms_robot.runtime.feed import IDLE_FEED
+from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt
 
 HORIZON, HOP = 8, 4  # frames of a plan, and between two plans

@@ -15,7 +15,7 @@ from sfms_robot.lab.bench.adversary import adversarial
 from sfms_robot.lab.bench.measure import HEAD, Row, row, times
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.kinematics import Stewart
+from sfms_robot.retarget.stewart import Stewart
 from sfms_robot.runtime.loop import difference
 
 RATE_HZ = 100.0

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, SPACE_CHANNELS, Floats, ListenerEvent
+from sfms_robot.lab.corpora.action_units import FAU_VALUE
 from sfms_robot.signals import mel as log_mel
-from sfms_robot.signals.action_units import FAU_VALUE
 
 # Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
 SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))

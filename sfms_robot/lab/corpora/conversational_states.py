@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.signals.events import runs
 

@@ -13,12 +13,11 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, POSE, SHAPES, Doubles, Floats
+from sfms_robot.lab.corpora.action_units import FAU_VALUE, FULL, WITHOUT_SHAPE, blendshapes_of
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.resampling import at_frame_rate
-from sfms_robot.signals.action_units import FAU_VALUE, FULL, WITHOUT_SHAPE, blendshapes_of
-from sfms_robot.signals.flame import FlameMatrix
 from sfms_robot.signals.rotations import rotation
-from sfms_robot.signals.spaces import SPACES, decode, encode, limitation
+from sfms_robot.signals.spaces import SPACES, FlameMatrix, decode, encode, limitation
 
 CONVERTIBLE: Final = ("arkit58", "deca56", "faceverse58", "seamless27")
 _ANGLES: Final = slice(0, 3)  # of a pose: roll, pitch, yaw

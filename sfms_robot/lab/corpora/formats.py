@@ -18,12 +18,12 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.lab.corpora import stored
+from sfms_robot.lab.corpora.audio_features import Feature, cached
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
 from sfms_robot.lab.corpora.external import dualtalk, l2l, lm_listener, react, react2025, seamless, vico
 from sfms_robot.lab.corpora.reading import pose_last
-from sfms_robot.signals.audio_features import Feature, cached
 
 LAYOUTS: Final = {
     layout.name: layout

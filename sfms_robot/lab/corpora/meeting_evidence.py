@@ -13,7 +13,8 @@ import numpy as np
 from sfms_robot.frames import FRAME_HZ, Doubles
 from sfms_robot.lab.corpora.compose.ami import Person
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
-from sfms_robot.signals.events import Bools, listening_mask
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask
+from sfms_robot.signals.events import Bools
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
 from sfms_robot.lab.corpora.collection import ClipError, Problem
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.events import listening_mask, voice_activity
 
 SOUND_SLACK_S: Final = 0.2  # sound may end this much before the face: containers round
 FRAMES_SLACK: Final = 2  # two tracks of one clip may differ by this

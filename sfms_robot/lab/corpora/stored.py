@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.config.yaml_file import read as read_yaml
+from sfms_robot.config.base import read as read_yaml
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Floats
 from sfms_robot.lab.corpora.clips import read

@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 from sfms_robot import config
 from sfms_robot.config import find, parse_training
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN

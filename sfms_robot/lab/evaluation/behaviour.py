@@ -9,6 +9,7 @@ import numpy as np
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Floats
 from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.signals import events
 
 ROTATIONS = slice(0, 3)
@@ -51,16 +52,16 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> Behaviour:
         onsets += sum(bool(dyad.listening[int(start * FRAME_HZ)]) for start in starts)
         minutes += listened
         sizes += [size for _, _, size in nods]
-        spoke = np.zeros(len(motion), bool) if dyad.audio is None else events.voice_activity(dyad.audio)
-        ends = events.phrase_ends(spoke, FRAME_HZ)
-        counts += events.phrase_end_counts(starts, ends, dyad.listening, FRAME_HZ)
+        spoke = np.zeros(len(motion), bool) if dyad.audio is None else phrase_timing.voice_activity(dyad.audio)
+        ends = phrase_timing.phrase_ends(spoke, FRAME_HZ)
+        counts += phrase_timing.phrase_end_counts(starts, ends, dyad.listening, FRAME_HZ)
         blinks += len(events.find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ))
         smiles += len(events.find_smiles(motion[:, CHANNEL_INDEX["mouthSmileLeft"]], FRAME_HZ))
         total += len(motion) / FRAME_HZ / 60
     return Behaviour(
         nods=onsets / minutes if minutes else float("nan"),
         nod_deg=float(np.degrees(np.median(sizes))) if sizes else float("nan"),
-        phrase_end_ratio=events.ratio_of([float(count) for count in counts]),
+        phrase_end_ratio=phrase_timing.ratio_of([float(count) for count in counts]),
         blinks=blinks / total,
         smiles=smiles / total,
         still_share=_still(motions),

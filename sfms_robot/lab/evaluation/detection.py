@@ -14,9 +14,9 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, YAW_PITCH, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.acting import Score, act
-from sfms_robot.signals.events import MOTION_EVENTS, find_gaze_shifts
-from sfms_robot.signals.eye_angles import directions
-from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, head_part
+from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
+from sfms_robot.signals.events import MOTION_EVENTS
+from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions, head_part
 from sfms_robot.signals.motion_primitives import Motions
 
 IN_TIME_S: Final = 0.12

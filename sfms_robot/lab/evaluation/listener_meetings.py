@@ -21,6 +21,7 @@ from sfms_robot.lab.corpora.compose.composed import Stretch, active, cast, own_v
 from sfms_robot.lab.corpora.compose.recorded import heard
 from sfms_robot.lab.corpora.compose.speaking import sent
 from sfms_robot.lab.corpora.compose.voices import Voice, laugh, lay, mouth_over
+from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.signals import events
 from sfms_robot.signals.events import Bools
@@ -66,13 +67,13 @@ class ListenerMeeting:
     @property
     def listening(self) -> Bools:
         """(N,) others spoke in the last 2 s, he is silent and in view."""
-        return events.listening_mask(self.others, FRAME_HZ, self.own) & ~self.unseen
+        return phrase_timing.listening_mask(self.others, FRAME_HZ, self.own) & ~self.unseen
 
     @property
     def spoken_to(self) -> Bools:
         """(N,) exactly one other speaks, he has been silent for a second, and it is known where the other looks."""
         ends_s = [end / FRAME_HZ for _, end in events.runs(self.own)]
-        spoke = events.window_after(ends_s, (0.0, SILENT_S), self.frames, FRAME_HZ)
+        spoke = phrase_timing.window_after(ends_s, (0.0, SILENT_S), self.frames, FRAME_HZ)
         return self.listening & self.alone & ~spoke & ~np.isnan(self.attention)
 
     @property

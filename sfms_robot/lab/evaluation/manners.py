@@ -13,6 +13,7 @@ import numpy as np
 from scipy.signal import welch
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, Doubles, Floats
+from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.detection import gaze_rad, seen
 from sfms_robot.signals import events
 
@@ -99,7 +100,7 @@ def looks_s(gaze: Doubles) -> list[float]:
 
 def shifts(gaze: Doubles) -> int:
     """How often gaze (N, 2) goes 5 degrees and farther within 0.2 s."""
-    return len(events.find_gaze_shifts(gaze[:, 0], gaze[:, 1], FRAME_HZ, SHIFT_RAD))
+    return len(phrase_timing.find_gaze_shifts(gaze[:, 0], gaze[:, 1], FRAME_HZ, SHIFT_RAD))
 
 
 def sway_db(motions: Sequence[Floats]) -> Doubles:

@@ -29,9 +29,10 @@ from sfms_robot.frames import (
     SpeakerFrame,
 )
 from sfms_robot.lab.evaluation.detection import seen
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.lab.evaluation.rollout import Rollout, speaker_frames
 from sfms_robot.listeners.events.model import ALWAYS
-from sfms_robot.signals.events import MOTION_EVENTS, listening_mask, voice_activity
+from sfms_robot.signals.events import MOTION_EVENTS
 
 Inputs = Literal["voice", "face", "both"]
 Spoil = Callable[[Floats, np.random.Generator], Floats]

@@ -16,12 +16,13 @@ import numpy as np
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.ami import Person
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
+from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.bootstrap import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.deciding import spans_of
 from sfms_robot.lab.evaluation.detection import Calibration, gaze_shifts, seen
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
 from sfms_robot.lab.evaluation.nod_table import Counts, cells
-from sfms_robot.signals import events, phase
+from sfms_robot.signals import phase
 from sfms_robot.signals.events import MOTION_EVENTS, Bools
 
 WITHIN_S: Final = 0.5  # a nod this close counts for an instant
@@ -43,14 +44,14 @@ Runs = Sequence[Doubles]  # spans (K, 2) [s] of what was done, once for each see
 def times_of(one: ListenerMeeting) -> dict[str, Bools]:
     """Masks (N,) of the times that nods are counted in; `after_phrase` and `later` make the phrase-end ratio."""
     frames, listening = one.frames, one.listening
-    ends = events.phrase_ends(one.others, FRAME_HZ)
+    ends = phrase_timing.phrase_ends(one.others, FRAME_HZ)
     silence_s = phase.times(one.others.tolist())[:, 1]
     return {
         "nods_per_minute": listening,
         "addressed_nods_per_minute": one.addressed,
         "bystander_nods_per_minute": one.bystander,
-        "nods_after_phrase": events.window_after(ends, events.AFTER_S, frames, FRAME_HZ) & listening,
-        "nods_later": events.window_after(ends, events.LATER_S, frames, FRAME_HZ) & listening,
+        "nods_after_phrase": phrase_timing.window_after(ends, phrase_timing.AFTER_S, frames, FRAME_HZ) & listening,
+        "nods_later": phrase_timing.window_after(ends, phrase_timing.LATER_S, frames, FRAME_HZ) & listening,
         "nods_long_silence": (silence_s > LONG_SILENCE_S) & ~one.own & ~one.unseen,
     }
 
@@ -177,7 +178,7 @@ def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Boo
     others[onsets] = False
     if len(onsets) < LEAST or not others.any():
         return np.zeros(2)
-    return np.array([events.rank_auc(scores, onsets, others) * len(onsets), len(onsets)], np.float64)
+    return np.array([phrase_timing.rank_auc(scores, onsets, others) * len(onsets), len(onsets)], np.float64)
 
 
 def contingent(
@@ -204,7 +205,9 @@ def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubl
 
 def nod_share(runs: Runs, frames: int) -> Doubles:
     """(frames,) share of the runs with a nod within 0.5 s: the nod probability of every instant."""
-    return np.asarray(np.mean([events.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in runs], axis=0), np.float64)
+    return np.asarray(
+        np.mean([phrase_timing.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in runs], axis=0), np.float64
+    )
 
 
 def nod_contingency(who: str, runs: Runs, one: ListenerMeeting, within: Bools) -> Sums:
@@ -230,7 +233,7 @@ def table_rates(people: Sequence[Person]) -> Doubles:
     for person in people:
         whole = Stretch(person, 0.0, person.until_s)
         others, own, unseen = (active(spans, whole) for spans in (person.others, person.talk, person.unseen))
-        listening = events.listening_mask(others, FRAME_HZ, own) & ~unseen
+        listening = phrase_timing.listening_mask(others, FRAME_HZ, own) & ~unseen
         onsets = frames_before(person.nods[:, 0], len(others))
         parts.append(Counts.of(cells(phase.times(others.tolist())), onsets, listening))
     return Counts.total(parts).rates()

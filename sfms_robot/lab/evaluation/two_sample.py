@@ -22,7 +22,7 @@ from scipy.signal import butter, sosfiltfilt
 from torch import Tensor, nn
 
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_HZ, Doubles, Floats
-from sfms_robot.signals.events import rank_auc
+from sfms_robot.lab.evaluation.phrase_timing import rank_auc
 
 REGIONS: Final[Mapping[str, tuple[int, ...]]] = {
     "head": tuple(range(6)),

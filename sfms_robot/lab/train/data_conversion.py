@@ -15,7 +15,7 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import ClipError, Dataset, Order, guarded
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, Residual, names, to_ours
 from sfms_robot.lab.train.datasets import scanned
-from sfms_robot.signals.flame import FlameMatrix, read_matrix
+from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
 
 def convert_data(

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from sfms_robot import config
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, MOTION_DIM, ListenerEvent
 from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.corpora.clips import Dyad, samples_of

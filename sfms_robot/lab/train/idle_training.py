@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from sfms_robot.config import find
-from sfms_robot.config.listener_kinds import LISTENER_KINDS
+from sfms_robot.config.listener import LISTENER_KINDS
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES
 from sfms_robot.lab.corpora.collection import usable

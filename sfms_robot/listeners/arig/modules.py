@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.config.arig import EVENT_STATES, STATES
+from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.listeners.arig.parts import (
     CrossAttention,
     FeedForward,

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config.arig import EVENT_STATES, STATES
+from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.signals import control
 

@@ -20,7 +20,7 @@ from sfms_robot.config.base import Finite, NonNegative, Positive
 from sfms_robot.data import data_dir
 from sfms_robot.frames import EVENT_KINDS, Doubles
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE, NUMBERS
-from sfms_robot.signals.hats import log_time
+from sfms_robot.signals.phase import log_time
 
 STEP_FRAMES: Final = 2
 STEP_S: Final = 0.08

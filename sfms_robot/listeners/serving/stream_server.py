@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.config.base import parse
-from sfms_robot.config.calmness import Calmness
+from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import PacketError, RobotError
 from sfms_robot.frames import FRAME_S, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.inbox import MOST_WAITING

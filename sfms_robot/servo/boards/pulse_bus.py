@@ -27,7 +27,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config import Bus as BusConfig
+from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion

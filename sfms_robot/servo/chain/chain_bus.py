@@ -28,8 +28,7 @@ from typing import Any, ClassVar, Final, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config import Bus as BusConfig
-from sfms_robot.config import Faults
+from sfms_robot.config import BusConfig, Faults
 from sfms_robot.config.wire_time import Framing
 from sfms_robot.errors import BusError, PacketError
 from sfms_robot.frames import Doubles, Reading

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from sfms_robot.config import Bus as BusConfig
+from sfms_robot.config import BusConfig
 from sfms_robot.config.wire_time import BITS, Framing, Way
 from sfms_robot.servo.chain.link import AWAY_LATE_S, Answer, RegisterLink
 from sfms_robot.servo.chain.member import Member

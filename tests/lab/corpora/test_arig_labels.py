@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.conversational_states import PATTERNS, STATE, Voices, label, of_activity
 

@@ -18,9 +18,9 @@ from sfms_robot.lab.corpora.compose.motions import edges
 from sfms_robot.lab.corpora.compose.splicing import held, stretched, tiled
 from sfms_robot.lab.corpora.compose.voices import find_voices, lay, read_voice, split_voices
 from sfms_robot.lab.corpora.splits import SPLITS
-from sfms_robot.signals.events import find_blinks, find_nods, find_smiles, phrase_ends, voice_activity
-from sfms_robot.signals.eye_angles import directions
-from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD
+from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
+from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
+from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions
 from sfms_robot.signals.motion_primitives import KINDS, read_motions
 
 PITCH = CHANNEL_INDEX["pitch"]

@@ -8,7 +8,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, FaceFrame, SpeakerFrame
 from sfms_robot.lab.corpora.compose.ami import Person, phrases
 from sfms_robot.lab.corpora.compose.voices import read_voice
 from sfms_robot.lab.evaluation.listener_meetings import listener_meeting, part, shifted, without_own_voice
-from sfms_robot.signals.events import voice_activity
+from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.motion_primitives import read_motions
 
 NONE = np.zeros((0, 2))

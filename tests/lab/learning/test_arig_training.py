@@ -11,7 +11,7 @@ from tiny_arig_training import HZ, dyad, settings, write
 
 from sfms_robot import config
 from sfms_robot.config import parse_training
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.learning.arig.features import (

@@ -3,7 +3,7 @@ import pytest
 from tiny_arig import RAW, arig_listener, talk
 
 from sfms_robot import config
-from sfms_robot.config.listener_kinds import LISTENER_KINDS, parse_listener
+from sfms_robot.config.listener import LISTENER_KINDS, parse_listener
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.listeners import checkpoint
@@ -37,7 +37,7 @@ def test_what_is_wrong_is_named(changes, said: str):
 
 
 def test_arig_is_a_kind():
-    assert isinstance(parse_listener(RAW, "x"), config.Arig) and LISTENER_KINDS["arig"].settings_class() is config.Arig
+    assert isinstance(parse_listener(RAW, "x"), config.Arig) and LISTENER_KINDS["arig"].settings is config.Arig
 
 
 @pytest.mark.parametrize(("name", "context"), [("arig-small", 32), ("arig-paper", 512)])

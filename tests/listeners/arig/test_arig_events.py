@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
 
-from sfms_robot.config.arig import EVENT_STATES, STATES, paper_state
+from sfms_robot.config.listener import EVENT_STATES, STATES, paper_state
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, ListenerEvent
 from sfms_robot.listeners.arig.sojourns import (
     FEEDBACK,

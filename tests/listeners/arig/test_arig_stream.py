@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
 
 from sfms_robot import config
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame

@@ -11,7 +11,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE, NUMBERS
 from sfms_robot.listeners.events.hazards import FILE, HazardBank, load_tables
-from sfms_robot.signals.hats import hats
+from sfms_robot.signals.phase import piecewise_linear_basis
 
 SHIPPED = data_dir("sim") / "listeners" / FILE
 
@@ -39,7 +39,7 @@ def test_log_odds_are_the_sum_of_curves_and_numbers(tables, kind):
     for name, weight in hazard.weights.items():
         value = evidence[:, AT[name]]
         if isinstance(weight, dict):
-            expected += hats(value, tuple(weight)) @ np.array(list(weight.values()))
+            expected += piecewise_linear_basis(value, tuple(weight)) @ np.array(list(weight.values()))
         else:
             expected += weight * np.nan_to_num(value)
     np.testing.assert_allclose(bank.log_odds(bank.contributions(evidence))[:, 0], expected, atol=1e-9)

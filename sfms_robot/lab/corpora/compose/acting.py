@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.config.drives import other_side
+from sfms_robot.config.head import other_side
 from sfms_robot.frames import (
     BLENDSHAPES,
     CHANNEL_INDEX,

@@ -49,7 +49,7 @@ from sfms_robot.lab.corpora.compose.voices import (
     split_voices,
 )
 from sfms_robot.lab.corpora.splits import SPLITS, Split
-from sfms_robot.signals.events import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 LENGTH_S: Final = (30.0, 60.0)

@@ -17,7 +17,8 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.compose.acting import Score, act
 from sfms_robot.lab.corpora.compose.looks import Dwell
 from sfms_robot.lab.corpora.compose.voices import Voice, room
-from sfms_robot.signals.events import phrase_ends, runs, voice_activity
+from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.motion_primitives import Motions
 
 LENGTH_S: Final = (15.0, 35.0)

@@ -20,8 +20,9 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
 from sfms_robot.lab.corpora.compose.motions import SHAPE, facegood_mouth, table
 from sfms_robot.lab.corpora.splits import SPLITS, Split, by_split, split_of_voice
+from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.events import runs, voice_activity
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.tracks import read_track, resample
 
 _SOUNDS: Final = (".wav", ".flac")

@@ -21,8 +21,8 @@ import numpy as np
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem
+from sfms_robot.lab.corpora.learning2listen import l2l_bilateral
 from sfms_robot.lab.corpora.reading import dyad, npy, pose_last, track
-from sfms_robot.signals.learning2listen import l2l_bilateral
 from sfms_robot.signals.mel import FLOOR, LN_PER_DB, MEL_BINS, ROWS_PER_FRAME
 
 FPS: Final = 30.0

@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sfms_robot.lab.corpora.action_units import WITHOUT_SHAPE, WITHOUT_UNIT
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem, guarded
 from sfms_robot.lab.corpora.external.seamless_evidence import Evidence, weigh
@@ -43,8 +44,8 @@ from sfms_robot.lab.corpora.external.seamless_person import (
     voice_of,
 )
 from sfms_robot.lab.corpora.reading import frames_of, npz_shapes
-from sfms_robot.signals.action_units import WITHOUT_SHAPE, WITHOUT_UNIT
-from sfms_robot.signals.events import listening_mask, runs
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask
+from sfms_robot.signals.events import runs
 
 NAME: Final = "seamless"
 LABELS: Final = ("improvised", "naturalistic")

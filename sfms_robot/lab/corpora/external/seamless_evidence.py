@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import Doubles
-from sfms_robot.signals.action_units import FAU_VALUE
+from sfms_robot.lab.corpora.action_units import FAU_VALUE
 
 SIGNS: Final = ("pitch", "yaw", "roll", "jaw drop", "eyes closed")
 CLEAR: Final = 0.3  # correlations nearer to 0 prove nothing

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.lab.corpora.action_units import FAU_VALUE
 from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, samples_of
 from sfms_robot.lab.corpora.collection import ClipError, guarded
 from sfms_robot.lab.corpora.external import seamless_evidence as evidence
 from sfms_robot.lab.corpora.reading import npz_shapes, track
-from sfms_robot.signals.action_units import FAU_VALUE
+from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import AudioFile, read_audio
-from sfms_robot.signals.events import voice_activity
 
 FPS: Final = 30.0
 SPACE: Final = "seamless27"  # rotation 3 | action units 24

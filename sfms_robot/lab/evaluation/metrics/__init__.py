@@ -3,6 +3,7 @@
 FRRea, a distance between rendered images, is out of scope: nothing here renders faces for judging.
 """
 
+from sfms_robot.lab.corpora.learning2listen import l2l_bilateral, l2l_mean_std
 from sfms_robot.lab.evaluation.metrics.dim_metrics import (
     cluster_centres,
     frechet_distance,
@@ -27,7 +28,6 @@ from sfms_robot.lab.evaluation.metrics.react_metrics import (
     reactface_frd,
     synchrony_lags,
 )
-from sfms_robot.signals.learning2listen import l2l_bilateral, l2l_mean_std
 
 __all__ = [
     "ccc",

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, LATERAL_POSE, Floats
 from sfms_robot.lab.corpora.clips import Dyad as Conversation

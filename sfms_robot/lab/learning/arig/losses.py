@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.config.arig import STATES
+from sfms_robot.config.listener import STATES
 from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, track
 from sfms_robot.listeners.arig.model import ArigModel, Dyad

@@ -5,20 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.signals.events import (
-    find_blinks,
+from sfms_robot.lab.evaluation.phrase_timing import (
     find_gaze_shifts,
-    find_nods,
-    find_smiles,
     listening_mask,
     near,
     nods_per_minute,
     phrase_end_ratio,
     phrase_ends,
     rank_auc,
-    runs,
     voice_activity,
 )
+from sfms_robot.signals.events import find_blinks, find_nods, find_smiles, runs
 
 RATE = 25
 

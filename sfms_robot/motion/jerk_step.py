@@ -1,7 +1,7 @@
-"""One joint at a time: its fastest stop, and one tick of its way to a reference that it cannot meet in one tick.
+"""The fastest stop of one joint, and one tick of its way to a reference that it cannot meet in one tick.
 
-A state is position, speed and acceleration of a joint, all along one axis. Plain floats: the limiter asks for one joint
-at a time, and only where its array arithmetic has not settled the matter.
+A state is position, speed and acceleration of a joint, all along one axis. Plain floats: the limiter calls this for one
+joint at a time, and only where its array arithmetic has not settled the matter.
 
 `ruckig` (Berscheid and Kroeger, 2021) plans the fastest way, where it is installed. It has no wheel for Linux on ARM;
 `StopChase` is the fallback without it: always lawful, a little slower to arrive.
@@ -47,17 +47,20 @@ class Stop(NamedTuple):
 
     @classmethod
     def of(cls, speed: float, acceleration: float, bound: Bound) -> Stop:
-        """From a finite state, wherever it is."""
+        """Return the stop from any finite state."""
         most, jerk = bound.acceleration, bound.jerk
+        # Speed once the acceleration is gone, by jerk alone: v + a |a| / 2J. Its sign is the way of the stop.
         s = 1.0 if speed + acceleration * abs(acceleration) / (2 * jerk) >= 0 else -1.0
         v, a = s * speed, s * acceleration
+        # Without a held piece, -J until -peak and +J back to 0 take v = (peak^2 - a^2 / 2) / J off the speed.
         peak = min(math.sqrt(max(jerk * v + a * a / 2, 0.0)), most)
         t1 = max((a + peak) / jerk, 0.0)
+        # The held piece takes the rest of the speed at -most.
         t2 = max(v + a * t1 - jerk * (t1 * t1) / 2 - peak * peak / (2 * jerk), 0.0) / most
         return cls(s, v, a, jerk, (t1, t2, peak / jerk))
 
     def after(self, time_s: float) -> State:
-        """Way, speed and acceleration, with their signs, `time_s` into the stop; inf for its end."""
+        """Return way, speed and acceleration, with their signs, `time_s` into the stop; inf for its end."""
         p, v, a, left = 0.0, self.speed, self.acceleration, time_s
         for jerk, lasts in zip((-self.jerk, 0.0, self.jerk), self.times_s, strict=True):
             t = min(lasts, left)
@@ -65,17 +68,18 @@ class Stop(NamedTuple):
             p += t * (v + t * (a / 2 + t * jerk / 6))
             v += t * (a + t * jerk / 2)
             a += t * jerk
-        if left > 0:  # what rounding leaves of speed and acceleration at the end is none
+        if left > 0:  # at the end speed and acceleration are 0 but for rounding
             return self.s * p, 0.0, 0.0
         return self.s * p, self.s * v, self.s * a
 
     def extent(self) -> tuple[float, float]:
-        """How far it goes below and above the position it starts from [rad].
+        """Return the way below and above the position it starts from [rad].
 
         Where the joint moves against s at first, it turns round on the way, while the acceleration still falls.
         """
         end, turn = self.after(math.inf)[0], 0.0
         if self.speed < 0:
+            # It turns round where v + a t - J t^2 / 2 = 0.
             v, a, jerk = self.speed, self.acceleration, self.jerk
             t = (a - math.sqrt(max(a * a + 2 * jerk * v, 0.0))) / jerk
             turn = self.s * t * (v + t * (a / 2 - t * jerk / 6))
@@ -83,13 +87,13 @@ class Stop(NamedTuple):
 
 
 def lawful(state: State, low: float, high: float, bound: Bound) -> bool:
-    """Whether `state` can stop inside low..high, speed and acceleration within limits all the way.
+    """Return whether `state` can stop inside low..high, speed and acceleration within limits all the way.
 
-    Nothing that is not finite is lawful.
+    A state that is not finite is not lawful.
     """
     position, speed, acceleration = state
     most, size = bound.acceleration, abs(acceleration)
-    lasts = size / bound.jerk  # how long it takes until the acceleration is gone
+    lasts = size / bound.jerk  # time until the acceleration is gone
     peak = speed + 0.5 * acceleration * lasts  # speed by then
     fastest = bound.speed * (1 + SLACK)
     if not (abs(speed) <= fastest and abs(peak) <= fastest and size <= most * (1 + SLACK)):  # neither for NaN
@@ -105,28 +109,28 @@ def lawful(state: State, low: float, high: float, bound: Bound) -> bool:
 
 
 def moves_in(state: State, way: float, bound: Bound) -> bool:
-    """Whether a joint moves along `way` (1 or -1) or stands still, also all the while it stops."""
+    """Return whether a joint moves along `way` (1 or -1) or stands still, also during its whole stop."""
     _, speed, acceleration = state
     return way * speed >= 0 and way * (speed + 0.5 * acceleration * abs(acceleration) / bound.jerk) >= -_STANDS_RAD_S
 
 
 class Chase(Protocol):
-    """A way to follow, for joints that share one tick."""
+    """A way to a reference, for joints that share one tick."""
 
     def step(self, joint: int, before: State, target: State, lawful: Lawful) -> State | None:
-        """The state one tick after `before` on the way to `target`, both lawful; None where there is no lawful one."""
+        """Return the state one tick after `before` on the way to `target`, both lawful; None without a lawful one."""
 
 
 ChaseFactory = Callable[[Sequence[Bound], float], Chase]
 
 
 def build_chase(bounds: Sequence[Bound], dt_s: float) -> Chase:
-    """The fastest there is for joints within `bounds` at ticks of `dt_s`."""
+    """Return the fastest way available for joints within `bounds` at ticks of `dt_s`."""
     return TimeOptimalChase(bounds, dt_s) if HAS_RUCKIG else StopChase(bounds, dt_s)
 
 
 class TimeOptimalChase:
-    """The first tick of ruckig's fastest way."""
+    """Chase by the first tick of ruckig's fastest way."""
 
     def __init__(self, bounds: Sequence[Bound], dt_s: float) -> None:
         import ruckig
@@ -154,7 +158,7 @@ class TimeOptimalChase:
 
 
 class StopChase:
-    """As much jerk toward the target as lets the joint still stop where the target would stop.
+    """Chase by the most jerk toward the target that still lets the joint stop where the target would stop.
 
     A state reached in one tick by a mixture of braking and full jerk is the same mixture of the two states, and the
     more jerk, the farther on its stop ends: so the mixture is found by halving.
@@ -165,7 +169,7 @@ class StopChase:
 
     def step(self, joint: int, before: State, target: State, lawful: Lawful) -> State | None:
         bound, dt = self._bounds[joint], self._dt_s
-        way = self._stops_at(target, bound) - self._stops_at(before, bound)
+        way = _stops_at(target, bound) - _stops_at(before, bound)
         if way == 0:
             return None
         s = 1.0 if way > 0 else -1.0
@@ -175,7 +179,7 @@ class StopChase:
             more = share + step
             after = tuple(b + more * (p - b) for b, p in zip(braked, pushed, strict=True))
             if abs(after[0] - before[0]) <= bound.speed * dt and lawful(after):
-                onward = s * (self._stops_at(after, bound) - self._stops_at(target, bound))
+                onward = s * (_stops_at(after, bound) - _stops_at(target, bound))
                 if onward <= 0:
                     best, share = after, more
             if more == 1.0 and best is not None:
@@ -184,7 +188,7 @@ class StopChase:
         return best
 
     def _ends(self, before: State, bound: Bound, s: float) -> tuple[State, State]:
-        """One tick of braking, and one of full jerk along `s` as far as the acceleration may go."""
+        """Return one tick of braking, and one of full jerk along `s` within the limit of acceleration."""
         position, speed, acceleration = before
         way, *rates = Stop.of(speed, acceleration, bound).after(self._dt_s)
         rising = min(max((bound.acceleration - s * acceleration) / bound.jerk, 0.0), self._dt_s)
@@ -198,6 +202,6 @@ class StopChase:
             ]
         return (position + way, *rates), pushed
 
-    @staticmethod
-    def _stops_at(state: State, bound: Bound) -> float:
-        return state[0] + Stop.of(state[1], state[2], bound).after(float("inf"))[0]
+
+def _stops_at(state: State, bound: Bound) -> float:
+    return state[0] + Stop.of(state[1], state[2], bound).after(math.inf)[0]

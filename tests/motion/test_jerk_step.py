@@ -9,7 +9,7 @@ import ruckig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.motion.chase import StopChase, TimeOptimalChase
+from sfms_robot.motion.jerk_step import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
 
@@ -74,7 +74,7 @@ def test_a_moving_reference_is_met_again_after_a_jump(chase, hz):
 def test_without_ruckig_the_limiter_chases_by_itself():
     code = (
         "import sys; sys.modules['ruckig'] = None\n"
-        "from sfms_robot.motion.chase import StopChase, build_chase\n"
+        "from sfms_robot.motion.jerk_step import StopChase, build_chase\n"
         "assert isinstance(build_chase([], 0.01), StopChase)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Features of sound that cost enough to be kept: computed once per recording, read from disk ever after.
+"""Features of sound that are expensive to compute: once per recording, then read from disk.
 
 An entry's name is the hash of the samples, the feature and its version, so nothing stale is ever read and files may be
 renamed. Entries carry a checksum; one that is broken is computed again. Writing is atomic: several programs may share
@@ -13,6 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -26,7 +27,7 @@ from sfms_robot.signals.mfcc import mfcc78
 
 @dataclass(frozen=True)
 class Feature:
-    """Something computed from sound, frame by frame.
+    """A feature computed from sound, frame by frame.
 
     Attributes:
         version: changes whenever the same samples give other rows: another algorithm, other weights.
@@ -45,8 +46,22 @@ class Feature:
 MFCC78: Final = Feature("mfcc", "1", MFCC_DIM, FRAME_HZ, mfcc78)
 
 
+def wav2vec2_feature(folder: Path | str, fps: float = FRAME_HZ, device: str = "cpu", hop_frames: int = 1) -> Feature:
+    """Return the feature of a wav2vec2 model folder; its version holds the hop and a hash of the model's files."""
+    from sfms_robot.signals.wav2vec2 import FILES, Wav2Vec2  # needs torch
+
+    model = Wav2Vec2(folder, device, hop_frames)
+    digest = hashlib.sha256()
+    for file in (model.folder / name for name in FILES):
+        if file.is_file():
+            with file.open("rb") as stream:
+                digest.update(hashlib.file_digest(stream, "sha256").digest())
+    version = f"1 hop {hop_frames} {digest.hexdigest()[:16]}"
+    return Feature("wav2vec2", version, model.dim, fps, partial(model.of_recording, fps=fps))
+
+
 def cached(samples: Floats, feature: Feature, folder: Path) -> Floats:
-    """(frames, dim) from `folder`, or computed and put there. Raises ConfigError when the folder cannot be written."""
+    """Return rows (frames, dim) from `folder`, or compute and keep them. Raises ConfigError if it is read-only."""
     file = entry(samples, feature, folder)
     found = _read(file, feature.dim)
     if found is not None:
@@ -62,14 +77,14 @@ def cached(samples: Floats, feature: Feature, folder: Path) -> Floats:
 
 
 def entry(samples: Floats, feature: Feature, folder: Path) -> Path:
-    """Where the rows of these samples are kept."""
-    told = f"{feature.name}\0{feature.version}\0{feature.fps:g}\0{samples.dtype.str}\0"
-    key = hashlib.sha256(told.encode() + np.ascontiguousarray(samples).tobytes()).hexdigest()
+    """Return the file in which the rows of these samples are kept."""
+    identity = f"{feature.name}\0{feature.version}\0{feature.fps:g}\0{samples.dtype.str}\0"
+    key = hashlib.sha256(identity.encode() + np.ascontiguousarray(samples).tobytes()).hexdigest()
     return folder / feature.name / key[:2] / f"{key[2:34]}.npz"
 
 
 def _read(file: Path, dim: int) -> Floats | None:
-    """Rows whose checksum holds, else None."""
+    """Return the rows if their checksum holds, else None."""
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             rows = np.asarray(arrays["rows"])

@@ -1,7 +1,9 @@
 """A head's language at the edge: every example of the guide loads, every mistake is told, the schema is in step."""
 
 import copy
+import json
 import re
+import sys
 import tempfile
 from pathlib import Path
 
@@ -9,15 +11,16 @@ import pytest
 import yaml
 
 from sfms_robot.config import Expression, Head, Joint, LimitClass, Region, load, parse
+from sfms_robot.config.base import read
 from sfms_robot.config.check import check_head
 from sfms_robot.config.head import Gaze, Idle
-from sfms_robot.config.mapping import Coupling, Fold
-from sfms_robot.config.schema import text
-from sfms_robot.config.yaml_file import read
+from sfms_robot.config.joint import Coupling, Fold
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNELS
 
-GUIDE = (Path(__file__).parents[1] / "docs" / "heads.md").read_text(encoding="utf-8")
+SCHEMA = data_dir("configs") / "heads" / "head.schema.json"
+GUIDE = (Path(__file__).parents[2] / "docs" / "heads.md").read_text(encoding="utf-8")
 
 
 def parsed(block: str):
@@ -63,9 +66,22 @@ def test_the_first_head_of_the_guide_is_about_twenty_lines():
     assert len(re.findall(r"```yaml\n(.*?)```", GUIDE, re.S)[0].splitlines()) <= 22
 
 
+def schema():
+    """Return the JSON schema of a head's file, with bare names of expressions and joints that inherit keys."""
+    whole = Head.model_json_schema()
+    parts = whole["$defs"]
+    names = [{"enum": list(CHANNELS)}, {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_]*$"}]
+    parts["Node"] = {k: v for k, v in parts["Expression"].items() if k != "title"}
+    parts["Expression"] = {"title": "Expression", "anyOf": [*names, {"$ref": "#/$defs/Node"}]}
+    parts["Node"]["properties"]["channel"]["anyOf"][0] = {"enum": list(CHANNELS)}
+    parts["Fold"]["properties"]["channel"] = {"enum": list(CHANNELS), "title": "Channel"}
+    parts["Joint"]["required"] = ["id"]  # joint_defaults or mirror_of may give the others
+    return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}, indent=1) + "\n"
+
+
 def test_the_schema_for_editors_is_in_step():
-    shipped = (data_dir("configs") / "heads" / "head.schema.json").read_text(encoding="utf-8")
-    assert shipped == text(), "python -m sfms_robot.config.schema > configs/heads/head.schema.json"
+    shipped = SCHEMA.read_text(encoding="utf-8")
+    assert shipped == schema(), "python tests/config/test_head_language.py --write"
 
 
 WRONG = {
@@ -188,3 +204,7 @@ def test_a_wrong_neck_hides_nothing_else(tmp_path):
 def test_a_file_of_the_wrong_shape_is_told_and_never_raised(raw, tmp_path):
     written(tmp_path, raw)
     assert check_head(str(tmp_path))
+
+
+if __name__ == "__main__" and "--write" in sys.argv:
+    SCHEMA.write_text(schema(), encoding="utf-8")

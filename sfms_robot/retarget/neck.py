@@ -1,31 +1,76 @@
-"""A neck of one, two or three axes in series, in closed form.
+"""The solution that every neck gives, and a neck of one, two or three axes in series, in closed form.
 
-R = R(first axis) R(second) R(third), from the base to the head. Three axes take any rotation. Two take what is left of
-it when the missing axis is put last and dropped: a pan-tilt neck keeps the direction of the face and loses the roll.
-One takes the turn about it that leaves least. Then each axis goes to its joint, to two joints in series (`shared`), or
+R = R(first axis) R(second) R(third), from the base to the head. Three axes take any rotation. Two take the rest of it
+when the missing axis is put last and dropped: a pan-tilt neck keeps the direction of the face and loses the roll. One
+takes the turn about it that leaves least. Then each axis goes to its joint, to two joints in series (`shared`), or
 pitch and roll together to a differential. Translation is not for such a neck: all of it is residual.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.config.kinematics import SerialNeck, Split
 from sfms_robot.frames import Doubles
-from sfms_robot.retarget.kinematics.neck import Range, Ranges, Solved, checked, low_pass
 from sfms_robot.signals import rotations
 
 EXACT_RAD: Final = 1e-9
 EXACT_M: Final = 1e-9
 _POSE_ORDER: Final = (2, 1, 0)  # R = Rz(yaw) Ry(pitch) Rx(roll)
 
+Range = tuple[float, float]  # min, max [rad]
+Ranges = Mapping[str, Range]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solved:
+    """Joints for one pose or many.
+
+    Attributes:
+        angles_rad: (..., J) in the neck's joint order, always inside the joints' ranges.
+        reached: (...) True if these joints give the requested pose.
+        residual_rad: (...) the turn that is missing.
+        residual_m: (...) the shift that is missing.
+        shown: (..., 6) the pose that these joints give, always finite; a turn that is reached is equal to the requested
+            one, to the bit.
+    """
+
+    angles_rad: Doubles
+    reached: NDArray[np.bool_]
+    residual_rad: Doubles
+    residual_m: Doubles
+    shown: Doubles
+
+
+def low_pass(angle_rad: float, before_rad: float, cutoff_hz: float, dt_s: float) -> float:
+    """Return one step of a one-pole low-pass, exact for an angle that holds still during `dt_s`."""
+    return float(before_rad + (1.0 - np.exp(-2.0 * np.pi * cutoff_hz * dt_s)) * (angle_rad - before_rad))
+
+
+def checked(poses: Doubles) -> Doubles:
+    """Return the poses as float64 (..., 6). Raises ValueError for another shape or a value that is not finite."""
+    out = np.asarray(poses, dtype=np.float64)
+    if out.shape[-1:] != (6,):
+        raise ValueError(f"a pose is (..., 6), not {out.shape}")
+    if np.count_nonzero(np.isfinite(out)) < out.size:
+        raise ValueError("a pose is not finite")
+    return out
+
 
 class Serial:
-    """Implements `neck.Neck`. The memory is the low-passed angle of each axis, (number of axes,)."""
+    """A serial neck, with the methods of every neck. The memory is the low-passed angle of each axis, (axes,).
+
+    Attributes:
+        joints: names.
+        axes: the pose channels that it can show.
+        turns_body: True if one of the joints turns the body below the head.
+    """
 
     turns_body = False
 
@@ -45,16 +90,29 @@ class Serial:
         self._splits = [(column, place) for column, place in enumerate(places) if isinstance(place, Split)]
 
     def solve(self, poses: Doubles, body_yaw_rad: Doubles | None = None) -> Solved:
+        """Solve poses (..., 6), each held for ever. Without `body_yaw_rad` (...) the neck's own rule turns the body.
+
+        Raises ValueError where a pose is not finite, or a body yaw is given to a neck without one.
+        """
         if body_yaw_rad is not None:
             raise ValueError("this neck has no body yaw")
         poses = checked(poses)
         angles = self._axis_angles(poses)
-        return self._solved(poses, angles, angles)
+        joints = self._joint_angles(angles, angles)
+        rotation, shown = self._rotation(joints), np.zeros_like(poses)
+        missing_rad = rotations.angle_between(rotations.rotation(poses[..., :3]), rotation)
+        missing_m = np.asarray(np.linalg.norm(poses[..., 3:], axis=-1))
+        exact = np.asarray(missing_rad <= EXACT_RAD)
+        shown[..., :3] = np.where(exact[..., None], poses[..., :3], rotations.euler(rotation, _POSE_ORDER)[..., ::-1])
+        reached = np.asarray(exact & (missing_m <= EXACT_M))
+        return Solved(angles_rad=joints, reached=reached, residual_rad=missing_rad, residual_m=missing_m, shown=shown)
 
     def start(self) -> Doubles:
+        """Return the memory of a neck that stands at home."""
         return np.zeros(len(self._axes))
 
     def step(self, pose: Doubles, dt_s: float, memory: Doubles) -> tuple[Doubles, Doubles]:
+        """Return the joints (J,) for one pose (6,) after `dt_s`, and the memory after it."""
         wanted = checked(pose)
         angles, slow = self._axis_angles(wanted), memory.copy()
         for column, place in self._splits:
@@ -63,12 +121,13 @@ class Serial:
         return self._joint_angles(angles, slow), slow
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
+        """Return the poses (..., 6) of joint angles (..., J); a search begins at `start` (..., 6)."""
         out = np.zeros((*angles_rad.shape[:-1], 6))
-        out[..., :3] = rotations.euler(self._rotation(angles_rad), (2, 1, 0))[..., ::-1]
+        out[..., :3] = rotations.euler(self._rotation(angles_rad), _POSE_ORDER)[..., ::-1]
         return out
 
     def _axis_angles(self, poses: Doubles) -> Doubles:
-        """Poses (..., 6) -> the angle of each axis (..., k), whatever the joints can do."""
+        """Return the angle of each axis (..., k) for poses (..., 6), without the limits of the joints."""
         if self._axes in (_POSE_ORDER, _POSE_ORDER[:2]):
             return poses[..., self._axes]  # the pose is written in these very angles
         rotation = rotations.rotation(poses[..., :3])
@@ -78,18 +137,8 @@ class Serial:
         a, b, c = (*self._axes, *missing)
         return rotations.euler(rotation, (a, b, c))[..., : len(self._axes)]
 
-    def _solved(self, poses: Doubles, angles: Doubles, slow: Doubles) -> Solved:
-        joints = self._joint_angles(angles, slow)
-        rotation, shown = self._rotation(joints), np.zeros_like(poses)
-        missing_rad = rotations.angle_between(rotations.rotation(poses[..., :3]), rotation)
-        missing_m = np.asarray(np.linalg.norm(poses[..., 3:], axis=-1))
-        reached = (missing_rad <= EXACT_RAD) & (missing_m <= EXACT_M)
-        exact = np.asarray(missing_rad <= EXACT_RAD)[..., None]
-        shown[..., :3] = np.where(exact, poses[..., :3], rotations.euler(rotation, (2, 1, 0))[..., ::-1])
-        return Solved(joints, np.asarray(reached), missing_rad, missing_m, shown)
-
     def _joint_angles(self, angles: Doubles, slow: Doubles) -> Doubles:
-        """Axis angles and their low-passed ones (..., k) -> joints (..., J) inside their ranges."""
+        """Return joints (..., J) inside their ranges for axis angles and their low-passed ones (..., k)."""
         out = np.zeros((*angles.shape[:-1], len(self.joints)))
         alone = np.minimum(np.maximum(angles[..., self._single_axes], self._single_low), self._single_high)
         out[..., self._single_joints] = alone
@@ -99,17 +148,17 @@ class Serial:
             parts = shared(angle, low, self._ranges[place.lower], self._ranges[place.upper])
             for joint, part in zip((place.lower, place.upper), parts, strict=True):
                 out[..., self._column[joint]] = part
-        if (pair := self._config.differential) is not None:
+        if (pair := self._config.differential) is not None:  # left, right = pitch_gain pitch +- roll_gain roll
             order = self._config.order
-            pitch, roll = angles[..., order.index("pitch")], angles[..., order.index("roll")]
-            servos = servo_angles(pitch, roll, pair.pitch_gain, pair.roll_gain)
+            pitch = pair.pitch_gain * angles[..., order.index("pitch")]
+            roll = pair.roll_gain * angles[..., order.index("roll")]
             low, high = np.array([self._ranges[pair.left], self._ranges[pair.right]]).T
             columns = [self._column[pair.left], self._column[pair.right]]
-            out[..., columns] = shrunk(servos, low, high)
+            out[..., columns] = shrunk(np.stack([pitch + roll, pitch - roll], axis=-1), low, high)
         return out
 
     def _rotation(self, joints: Doubles) -> Doubles:
-        """Joints (..., J) -> R (..., 3, 3)."""
+        """Return R (..., 3, 3) of joints (..., J)."""
         turns = []
         for name, axis, place in zip(self._config.order, self._axes, self._places, strict=True):
             if isinstance(place, str):
@@ -119,9 +168,9 @@ class Serial:
             else:
                 pair = self._config.differential
                 assert pair is not None  # an axis without a joint has the differential
-                servos = joints[..., [self._column[pair.left], self._column[pair.right]]]
-                both = axis_angles(servos, pair.pitch_gain, pair.roll_gain)
-                angle = both[("pitch", "roll").index(name)]
+                left, right = joints[..., self._column[pair.left]], joints[..., self._column[pair.right]]
+                pitches = name == "pitch"
+                angle = (left + right) / (2 * pair.pitch_gain) if pitches else (left - right) / (2 * pair.roll_gain)
             turns.append(rotations.about(axis, angle))
         return reduce(np.matmul, turns)
 
@@ -129,32 +178,17 @@ class Serial:
 def shared(total_rad: Doubles, lower_rad: Doubles, lower: Range, upper: Range) -> tuple[Doubles, Doubles]:
     """Return both joints' angles inside their ranges, from the total (...) and the lower joint's part (...).
 
-    What one joint cannot take the other does, so the sum is the total wherever both together can.
+    The part beyond the range of one joint goes to the other, so the sum is the total wherever both together can.
     """
     below = np.clip(lower_rad, *lower)
     above = np.clip(total_rad - below, *upper)
     return np.clip(total_rad - above, *lower), above
 
 
-def servo_angles(pitch_rad: Doubles, roll_rad: Doubles, pitch_gain: float, roll_gain: float) -> Doubles:
-    """Return left and right (..., 2) of a differential, from pitch and roll (...).
-
-    left = a pitch + b roll, right = a pitch - b roll.
-    """
-    pitch, roll = pitch_gain * pitch_rad, roll_gain * roll_rad
-    return np.stack([pitch + roll, pitch - roll], axis=-1)
-
-
-def axis_angles(servos_rad: Doubles, pitch_gain: float, roll_gain: float) -> tuple[Doubles, Doubles]:
-    """Return pitch and roll (...) of a differential, from left and right (..., 2)."""
-    left, right = servos_rad[..., 0], servos_rad[..., 1]
-    return (left + right) / (2 * pitch_gain), (left - right) / (2 * roll_gain)
-
-
 def shrunk(servos_rad: Doubles, low_rad: Doubles, high_rad: Doubles) -> Doubles:
     """Return both servos (..., 2) shrunk by one factor until both are in range (2,), which holds 0.
 
-    One factor keeps pitch : roll as asked, where clipping each servo would turn a nod into a tilt.
+    One factor keeps the ratio of pitch and roll, where clipping each servo would turn a nod into a tilt.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         over = np.where(servos_rad > high_rad, high_rad / servos_rad, 1.0)
