@@ -8,7 +8,7 @@
 import os
 import sys
 
-from sfms_robot.child_process import ONE_THREAD
+from sfms_robot.processes import ONE_THREAD
 
 os.environ.update(ONE_THREAD)  # before numpy and torch are loaded, here and in the workers that pytest starts
 
@@ -18,7 +18,7 @@ from hypothesis import settings
 from sound_server import SoundServer
 
 from sfms_robot.cli.main import main
-from sfms_robot.config import head_names
+from sfms_robot.data import head_names
 
 # A busy computer is not a failure: no deadlines.
 settings.register_profile("quick", max_examples=20, deadline=None, derandomize=True)

@@ -19,12 +19,11 @@ BASE = {
     "data",
     "config",
     "ranges",
-    "child_process",
     "endpoint",
     "origin",
     "network",
     "plugins",
-    "realtime",
+    "processes",
 }
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
 ALLOWED = {

@@ -46,7 +46,17 @@ def serve(
     over = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
-    options = ServeOptions(listener, name, zenoh, metrics, hop, processes, everybody, runs_on, insecure)
+    options = ServeOptions(
+        listener=listener,
+        name=name,
+        zenoh=zenoh,
+        metrics=metrics,
+        hop=hop,
+        processes=processes,
+        everybody=everybody,
+        engine=runs_on,
+        insecure=insecure,
+    )
     figures = serve_until(options, over, _say)
     if json:
         print_json(figures)

@@ -125,7 +125,7 @@ class Listener(Model):
         flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
         events: is it told of nods, smiles and blinks that were decided elsewhere (`signals.control`)? Then it draws
             everything but gaze: not the eyes' direction, nor the head's part of it, which follow it by kinematics.
-        sway: is slow motion of the head a process of its own (`listeners.sway`), not drawn by the model? Needs events.
+        sway: is slow motion of the head a process of its own (`listeners.idle`), not drawn by the model? Needs events.
     """
 
     kind: str

@@ -12,20 +12,20 @@ from __future__ import annotations
 
 import json
 import os
-import select
+import queue
 import shutil
 import socket
-import subprocess
-import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import IO, Any, Literal, Self, cast
+from typing import Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
 from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.processes import Child
 
 __all__ = ["Chain", "EmulatedServo", "launch", "wait"]
 
@@ -33,6 +33,7 @@ READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be lat
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
 
 _START_S = 20.0
+_CLOSE_S = 5.0
 _refusal = partial(ConfigError.at, "emulated chain")
 _BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
@@ -46,11 +47,11 @@ class Chain:
         control: path of the control socket.
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
         servos: what is plugged in.
-        priority: "fifo" where it answers as promptly as hardware; else why not (`realtime.realtime_priority`).
-        process, folder: what ends with it.
+        priority: "fifo" where it answers as promptly as hardware; else why not (`processes.realtime_priority`).
+        child, folder: its process, and the folder of its socket; both end with it.
     """
 
-    process: subprocess.Popen[bytes]
+    child: Child
     servos: Sequence[EmulatedServo]
     virtual: bool
     device: str
@@ -60,7 +61,8 @@ class Chain:
 
     @property
     def pid(self) -> int:
-        return self.process.pid
+        """Return the id of its process."""
+        return self.child.process.pid
 
     @property
     def read_deadline_s(self) -> float:
@@ -125,11 +127,6 @@ class Chain:
         """The last replies: ids, due_s, sent_s."""
         return cast("list[dict[str, Any]]", self._json("stamps"))
 
-    @property
-    def stdout(self) -> IO[bytes]:
-        """Says nothing any more, and ends with the process."""
-        return cast("IO[bytes]", self.process.stdout)
-
     def digest(self) -> tuple[str, int]:
         """SHA-256 and number of all bytes that hosts have sent."""
         _, sha, count = self.ask("digest").split()
@@ -137,9 +134,7 @@ class Chain:
 
     def close(self) -> None:
         """End the process and remove its folder. Idempotent."""
-        if self.process.poll() is None:
-            self.process.terminate()
-        _reap(self.process)
+        self.child.close(_CLOSE_S)
         shutil.rmtree(self.folder, ignore_errors=True)
         if os.path.islink(self.device) and not os.path.exists(self.device):
             os.unlink(self.device)  # it was killed, and left its link behind
@@ -205,38 +200,33 @@ def launch(
         "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
-    process, ready = _started(description)
-    return Chain(process=process, servos=tuple(servos), virtual=virtual, **ready)
+    child, ready = _started(description)
+    return Chain(child=child, servos=tuple(servos), virtual=virtual, **ready)
 
 
-def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:
-    """The process, and what it says when it is ready. Raises ConfigError for what it refuses, BusError."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sfms_robot.emulator.chain_process"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,  # signals of the terminal are for the host
-    )
-    stdin, stdout = cast("IO[bytes]", process.stdin), cast("IO[bytes]", process.stdout)
-    try:
-        stdin.write(json.dumps(description).encode() + b"\n")
-        stdin.flush()
-        ready = stdout.readline() if select.select([stdout], [], [], _START_S)[0] else b""
-    except OSError:
-        ready = b""
-    if not ready.startswith(b"ready "):
-        process.kill()
-        _reap(process)
-        if ready.startswith(b"refused "):
-            raise ConfigError(ready.removeprefix(b"refused ").decode().strip())
-        raise BusError(f"the emulated chain did not start (exit code {process.returncode})")
-    return process, json.loads(ready.removeprefix(b"ready "))
+def _started(description: Mapping[str, Any]) -> tuple[Child, dict[str, str]]:
+    """Return the process, and its message when it is ready. Raises ConfigError for what it refuses, BusError."""
+    child = Child("sfms_robot.emulator.chain_process:main", description, name="emulator")
+    answer = child.receive(_START_S)
+    if isinstance(answer, dict):
+        return child, answer
+    child.close(_CLOSE_S)
+    if isinstance(answer, ConfigError):
+        raise answer
+    raise BusError(f"the emulated chain did not start (exit code {child.process.returncode})")
 
 
 def wait(chains: Sequence[Chain]) -> Chain:
-    """Block until a chain ends by itself, and say which."""
-    pipes = {chain.stdout: chain for chain in chains}
-    return pipes[select.select(list(pipes), [], [])[0][0]]
+    """Block until the process of a chain ends, and return that chain."""
+    ended: queue.SimpleQueue[Chain] = queue.SimpleQueue()
+
+    def join(chain: Chain) -> None:
+        chain.child.reader.join()
+        ended.put(chain)
+
+    for chain in chains:
+        threading.Thread(target=join, args=(chain,), daemon=True).start()
+    return ended.get()
 
 
 def _map(servo: EmulatedServo) -> FirmwareMap:
@@ -278,15 +268,3 @@ def _check_link(link: str) -> None:
         raise _refusal("link", link, "is already there")
     if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
         raise _refusal("link", link, "lies in a folder that does not exist")
-
-
-def _reap(process: subprocess.Popen[bytes]) -> None:
-    """Wait for the end, with force if it takes too long, and close the pipes."""
-    try:
-        process.wait(timeout=5.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None and not pipe.closed:
-            pipe.close()

@@ -10,8 +10,7 @@ from sfms_robot.errors import ModelError
 from sfms_robot.frames import BLENDSHAPES, EVENT_KINDS, FRAME_S, MOTION_DIM, SHAPES, changed
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.idle_motion import AFTER_SPEECH_S, BANDS, BANDS_HZ, KNOTS, IdleMotion, RestMap
-from sfms_robot.listeners.sway import EASE_S
+from sfms_robot.listeners.idle import AFTER_SPEECH_S, EASE_S, IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, IdleMotion, RestMap
 
 BROW = BLENDSHAPES.index("browInnerUp")
 
@@ -19,7 +18,7 @@ BROW = BLENDSHAPES.index("browInnerUp")
 def made(size=0.02, spread=0.0, rest=0.0):
     loadings = np.zeros((2, len(BLENDSHAPES)), np.float32)
     loadings[0, BROW], loadings[1, BROW + 1] = size, size
-    amplitude = np.full((BANDS, 2), BANDS**-0.5, np.float32)
+    amplitude = np.full((IDLE_BANDS, 2), IDLE_BANDS**-0.5, np.float32)
     held = np.tile(np.linspace(0.4, 0.6, KNOTS, dtype=np.float32)[:, None], len(BLENDSHAPES))
     return IdleMotion(loadings, amplitude, spread, held, held + np.float32(rest))
 
@@ -86,7 +85,7 @@ def test_faces_stay_faces():
 def test_it_is_no_faster_than_its_bands():
     moved = made().start(2).added(faces(5000), 10 + np.arange(5000) * 0.04)[:, SHAPES][:, BROW].astype(np.float64)
     power, hz = np.abs(np.fft.rfft(moved - moved.mean())) ** 2, np.fft.rfftfreq(5000, 0.04)
-    assert power[hz > BANDS_HZ[-1] + 0.05].sum() < 0.01 * power.sum()
+    assert power[hz > IDLE_BANDS_HZ[-1] + 0.05].sum() < 0.01 * power.sum()
 
 
 def test_streams_go_their_own_ways_and_people_differ_by_the_spread():
@@ -116,7 +115,7 @@ BROKEN = {
     "falls": {"held": -RISING},
     "steeper": {"held": 0.1 * RISING, "shown": 0.3 * RISING},
     "by 0.6": {"shown": FLAT - 0.6},
-    "amplitude": {"amplitude": np.zeros((BANDS, 3), np.float32)},
+    "amplitude": {"amplitude": np.zeros((IDLE_BANDS, 3), np.float32)},
     "moves a face by": {"loadings": np.ones((2, 52), np.float32)},
     "a spread of": {"spread": np.float32([7.0])},
 }

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sfms_robot.frames import FRAME_S, Plan
-from sfms_robot.listeners.process import LATE_S, Lateness
+from sfms_robot.listeners.thread import LATE_S, Lateness
 
 
 def plan(made_at_s, horizon=8):

@@ -6,8 +6,8 @@ from people_rad import PEOPLE_RAD
 
 from sfms_robot.data import data_dir
 from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.idle import BANDS, BANDS_HZ, EASE_S, LINES, UNEVEN, WIDEST, HeadSway, draw_sway, sway_at
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import BANDS, BANDS_HZ, EASE_S, LINES, UNEVEN, WIDEST, HeadSway, draw_sway, sway_at
 
 
 def made(seed: int = 0, amplitude: float = 0.01, spread: float = 0.0) -> np.ndarray:

@@ -1,13 +1,18 @@
 """When a listener nods, smiles, laughs, says "mm-hm", raises its brows, blinks, looks away: learned from people.
 
-    person's frame -> evidence (sensing) -> log-odds of each kind (hazards) -> a number drawn falls below: event
+    person's frame -> evidence -> log-odds of each kind (hazards) -> a number drawn falls below: event
 
-A hazard is asked every 80 ms. What is decided begins `LEAD_FRAMES` later, so that a plan made every fourth frame still
-shows its onset, and is never taken back. Nothing of the head happens inside a nod, a
-shake or a tilt; nobody nods, laughs or says "mm-hm" who is speaking or has not been spoken to for two seconds.
+A hazard is the chance of an event in the next 80 ms, as a sum of curves learned from people: log-odds are added, by
+name. `sim/listeners/events.yaml` holds them: of every kind an intercept and, per evidence (`events.evidence`), either a
+number that multiplies it or the values of a curve at its knots, between which it is straight over log(1 + seconds /
+0.2). A curve whose last value is 0 forgets. `gaze_shift` is the hazard of looking away from the person.
+
+Hazards are drawn every 80 ms. An event begins `LEAD_FRAMES` after it is decided, so that a plan made every fourth frame
+still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a shake or a tilt; a head does
+not nod, laugh or say "mm-hm" while it speaks, or when no other person has spoken for two seconds.
 
 Laws: the same evidence and seed give the same events; a later frame changes nothing before; memory is never changed in
-place; hazards are finite whatever comes in; more of a `Calmness` rate is never less of its hazard.
+place; hazards are finite whatever the input; more of a `Calmness` rate is never less of its hazard.
 """
 
 from __future__ import annotations
@@ -17,17 +22,202 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from sfms_robot.config import Calmness
+from sfms_robot.config import Calmness, Model, load
+from sfms_robot.config.base import Finite, NonNegative, Positive
+from sfms_robot.data import data_dir
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame, changed
-from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
-from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
-from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
+from sfms_robot.listeners.events.evidence import (
+    AT,
+    EVIDENCE,
+    NUMBERS,
+    Sensed,
+    SenseMemory,
+    begun_before,
+    done,
+    remembered,
+    sense,
+)
 from sfms_robot.listeners.lots import Use, uniforms
 from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
+from sfms_robot.signals.hats import log_time
+
+STEP_FRAMES: Final = 2
+STEP_S: Final = 0.08
+FILE: Final = "events.yaml"  # in sim/listeners
+_BOUND: Final = 30.0  # of log-odds
+_LONG_AGO: Final = 50.0  # on the axis of curves, beyond every knot
+
+Curve = Annotated[dict[NonNegative, Finite], Field(min_length=2)]
+Quantiles = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
+
+
+class Hazard(Model):
+    """When: one kind of event.
+
+    Attributes:
+        learned_from: whose events these are.
+        per_minute: how often they do it, in the time in which they may.
+        intercept: log-odds of 80 ms when nothing speaks for or against it.
+        weights: by evidence.
+    """
+
+    learned_from: str
+    per_minute: Positive
+    intercept: Finite
+    weights: Annotated[dict[str, Finite | Curve], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _known(self) -> Hazard:
+        for name, weight in self.weights.items():
+            if name not in EVIDENCE:
+                raise ValueError(f"weights.{name} is not known evidence ({', '.join(EVIDENCE)})")
+            if isinstance(weight, dict) == (name in NUMBERS):
+                wanted = "one number" if name in NUMBERS else "values by knot [s]"
+                raise ValueError(f"weights.{name} needs {wanted}")
+            if isinstance(weight, dict) and list(weight) != sorted(weight):
+                raise ValueError(f"weights.{name}: knots have to rise")
+        return self
+
+
+class Shape(Model):
+    """How long and how large, drawn evenly from quantiles (the first is the least, the last the greatest).
+
+    Attributes:
+        duration_s: of the whole event; of looking away, until the look back.
+        size: see `frames.ListenerEvent`; nods, shakes and tilts in degrees, a gaze shift too.
+        habit: quantiles of what every stream multiplies its sizes by; drawn once.
+        swings_hz: quantiles of the pace of nods and shakes; drawn once.
+    """
+
+    duration_s: Quantiles
+    size: Quantiles
+    habit: Quantiles = (1.0, 1.0)
+    swings_hz: Quantiles | None = None
+
+    @model_validator(mode="after")
+    def _rising(self) -> Shape:
+        for name in ("duration_s", "size", "habit", "swings_hz"):
+            values = getattr(self, name)
+            if values is not None and list(values) != sorted(values):
+                raise ValueError(f"{name}: quantiles have to rise")
+        return self
+
+
+class EventTables(Model):
+    """What the file holds: when and how, by kind; every kind has both."""
+
+    hazards: dict[str, Hazard]
+    shapes: dict[str, Shape]
+
+    @model_validator(mode="after")
+    def _whole(self) -> EventTables:
+        for section in ("hazards", "shapes"):
+            given = getattr(self, section)
+            for kind in [*given, *EVENT_KINDS]:
+                if kind not in EVENT_KINDS or kind not in given:
+                    problem = "is missing" if kind in EVENT_KINDS else "is not a kind of event"
+                    raise ValueError(f"{section}: {kind} {problem} ({', '.join(EVENT_KINDS)})")
+        return self
+
+
+def load_tables(file: Path | None = None) -> EventTables:
+    """From a file as `train events` writes it, or the bundled one. Raises a ConfigError of one line."""
+    return load(EventTables, data_dir("sim") / "listeners" / FILE if file is None else file)
+
+
+@dataclass(frozen=True)
+class _Knots:
+    """Every knot of every curve of every kind, one after the other (K,), and numbers as curves of one knot.
+
+    Attributes:
+        column: of the evidence.
+        weight: value at the knot.
+        left, left_slope, right, right_slope: where on the axis its hat is 0 and how steep it rises from there.
+        number: it multiplies a number.
+        first: (T,) index of the first knot of each term; `kind`: (H,) index of the first term of each kind.
+    """
+
+    column: NDArray[np.int64]
+    weight: Doubles
+    left: Doubles
+    left_slope: Doubles
+    right: Doubles
+    right_slope: Doubles
+    number: NDArray[np.bool_]
+    first: NDArray[np.int64]
+    kind: NDArray[np.int64]
+
+
+class HazardBank:
+    """All hazards at once, of one row of evidence or of many."""
+
+    def __init__(self, hazards: Mapping[str, Hazard]) -> None:
+        self.kinds: tuple[str, ...] = tuple(hazards)
+        self.terms: tuple[tuple[str, ...], ...] = tuple(tuple(hazards[kind].weights) for kind in self.kinds)
+        self._intercepts = np.array([hazards[kind].intercept for kind in self.kinds])
+        self._knots = _flat(hazards)
+        self._starts = [int(start) for start in self._knots.kind]
+
+    def contributions(self, evidence: Doubles) -> Doubles:
+        """(..., len(EVIDENCE)) -> (..., T): what each term adds to the log-odds of its kind; NaN and none add 0."""
+        k = self._knots
+        value = evidence[..., k.column]
+        time = np.minimum(log_time(np.maximum(evidence, 0.0)), _LONG_AGO)[..., k.column]
+        hat = np.minimum((time - k.left) * k.left_slope, (k.right - time) * k.right_slope)
+        hat = np.minimum(np.maximum(hat, 0.0), 1.0)
+        each = np.where(np.isnan(value), 0.0, k.weight * np.where(k.number, value, hat))
+        return np.asarray(np.add.reduceat(each, k.first, axis=-1), np.float64)
+
+    def log_odds(self, contributions: Doubles) -> Doubles:
+        """(..., T) -> (..., H), always finite."""
+        total = self._intercepts + np.add.reduceat(contributions, self._knots.kind, axis=-1)
+        return np.asarray(np.minimum(np.maximum(np.where(np.isnan(total), 0.0, total), -_BOUND), _BOUND), np.float64)
+
+    def told(self, contributions: Doubles, kind: str, most: int = 4) -> dict[str, float]:
+        """The largest terms of one kind, by evidence, of contributions (T,)."""
+        at = self.kinds.index(kind)
+        own = contributions[self._starts[at] : self._starts[at] + len(self.terms[at])]
+        largest = sorted(range(len(own)), key=lambda index: -abs(own[index]))[:most]
+        return {self.terms[at][index]: round(float(own[index]), 3) for index in largest if own[index]}
+
+
+def _flat(hazards: Mapping[str, Hazard]) -> _Knots:
+    rows: list[tuple[float, ...]] = []
+    first: list[int] = []
+    kind: list[int] = []
+    for hazard in hazards.values():
+        kind.append(len(first))
+        for name, weight in hazard.weights.items():
+            first.append(len(rows))
+            rows += _curve(AT[name], weight)
+    column, weights, left, left_slope, right, right_slope, number = np.array(rows, np.float64).T
+    return _Knots(
+        column.astype(np.int64), weights, left, left_slope, right, right_slope, number.astype(bool),
+        np.array(first), np.array(kind),
+    )  # fmt: skip
+
+
+def _curve(column: int, weight: float | Mapping[float, float]) -> list[tuple[float, ...]]:
+    """A row of `_Knots` for each knot. The first hat is 1 before its knot, the last behind it."""
+    if not isinstance(weight, Mapping):
+        return [(column, weight, 0.0, 0.0, 0.0, 0.0, True)]
+    at = log_time(list(weight)).tolist()
+    rows: list[tuple[float, ...]] = []
+    for index, value in enumerate(weight.values()):
+        low, high = index == 0, index == len(at) - 1
+        left, left_slope = (-1.0, 1e9) if low else (at[index - 1], 1 / (at[index] - at[index - 1]))
+        right, right_slope = (np.inf, 1.0) if high else (at[index + 1], 1 / (at[index + 1] - at[index]))
+        rows.append((column, value, left, left_slope, right, right_slope, False))
+    return rows
+
+
+# --- Decisions --------------------------------------------------------------------------------------------------------
 
 LEAD_FRAMES: Final = 3  # an event decided with frame n begins behind frame n + LEAD_FRAMES
 LISTENING_S: Final = 2.0  # somebody else spoke this recently

@@ -13,10 +13,8 @@ from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting
 from sfms_robot.lab.evaluation.reference_hazard import mute
 from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.lab.learning.events.event_trainer import student
-from sfms_robot.listeners.events.evidence import HEARD
-from sfms_robot.listeners.events.hazards import STEP_FRAMES, EventTables
-from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.events.sensing import Sensed
+from sfms_robot.listeners.events.evidence import HEARD, Sensed
+from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, EventTables
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.events import runs
 from sfms_robot.sources.speakers import shipped_speaker

@@ -5,10 +5,9 @@ import pytest
 
 from sfms_robot.config import Calmness
 from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FRAME_SAMPLES, FaceFrame, ListenerEvent, SpeakerFrame
-from sfms_robot.listeners.events.evidence import HEARD, heard_in
+from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, most_in, scene_in, steps_in
+from sfms_robot.listeners.events.evidence import HEARD, Sensed, sense
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.events.sensing import Sensed, scene_in, sense
-from sfms_robot.listeners.events.whole import hazards_in, most_in, steps_in
 
 FRAMES = 4000
 CALMNESS = [Calmness(), Calmness(nod=6.0, blink=0, addressed="assume")]
