@@ -181,7 +181,7 @@ class PipeWriter:
 
     A message is written by the thread that hands it over where the pipe has room: some microseconds, and no switch to
     another thread in the middle of a tick. Of several threads one writes, and finds what the others have added; none
-    waits for another. When the pipe is full, a thread of its own waits until it has room. Messages that cannot be
+    waits for another. When the pipe is full, another thread waits until it has room. Messages that cannot be
     written since the other process has ended are dropped.
 
     Args:

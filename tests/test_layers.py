@@ -44,6 +44,7 @@ SHARED_NAMES = {
     "features": "what SFMS is trained on, and what ARIG is trained on",
     "losses": "what SFMS learns by, and what ARIG learns by",
     "registry": "the kinds of listeners, and those of sources",
+    "idle": "what a listener adds to a face at rest, and what a head does without one",
 }
 
 MODULES = sorted(PACKAGE.rglob("*.py"))

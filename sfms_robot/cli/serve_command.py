@@ -53,7 +53,7 @@ def serve(
         metrics=metrics,
         hop=hop,
         processes=processes,
-        everybody=everybody,
+        all_heads=everybody,
         engine=runs_on,
         insecure=insecure,
     )

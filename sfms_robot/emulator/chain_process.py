@@ -1,4 +1,4 @@
-"""The process of an emulated chain: a pseudo terminal for the host, a control socket beside it.
+"""The process of an emulated chain: a pseudo terminal for the host, and a control socket.
 
 Started by `launch`, which sends a description and receives where the chain is, or the ConfigError that refuses it. The
 process ends on SIGTERM, or when the pipe to its parent does.
@@ -8,13 +8,13 @@ control socket says how many there are and what time it is. Control requests and
 
     sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  take BYTES in total at SECONDS, then send LENGTH bytes of reply, those
                                                  due by UNTIL; what came by SECONDS for bytes before FROM is lost
-    time SECONDS                     ok          only that; what happens by itself by then happens
+    time SECONDS                     ok          only advance the time
     digest                           digest SHA256 COUNT  of every byte the host sent
     kill ID | revive ID              ok          the servo falls silent, or answers again
     fault ID BITS                    ok          latch hardware errors
-    turn ID TICKS                    ok          somebody turns the shaft by hand to where its position reads TICKS
-    heat ID DEGREES                  ok          its temperature is this from now on, and goes where its load takes it
-    state ID                         json {...}  what an onlooker sees: position, goal, torque, ...
+    turn ID TICKS                    ok          turn the shaft by hand to where its position reads TICKS
+    heat ID DEGREES                  ok          set its temperature, which follows its load from then on
+    state ID                         json {...}  its true state: position, goal, torque, ...
     inject SPEC                      ok          a fault (see `faults`), from now on unless it says
     clear                            ok          no more faults
     supply VOLTS                     ok          of all servos
@@ -76,7 +76,7 @@ class PseudoTerminal:
         os.replace(beside, link)
 
     def baud(self) -> int:
-        """What the host has set."""
+        """Return the baud rate that the host has set."""
         raw = fcntl.ioctl(self.fd, _TCGETS2, bytes(_TERMIOS2.size))
         return int(_TERMIOS2.unpack(raw)[_OUTPUT_RATE])
 
@@ -87,7 +87,7 @@ class PseudoTerminal:
             view = view[os.write(self.fd, view) :]
 
     def close(self) -> None:
-        """Hosts see the device vanish. The link goes too, unless somebody else has taken its name."""
+        """Close the device, and remove the link unless it points to another one by now."""
         if os.path.islink(self.link) and os.readlink(self.link) == self.path:
             os.unlink(self.link)
         os.close(self.fd)
@@ -292,7 +292,7 @@ class Server:
 
 
 def _wire(description: Mapping[str, Any]) -> EmulatedWire:
-    """What is plugged in, with its faults."""
+    """Return the wire with its servos and faults."""
     tables = {name: Table.from_plain(plain) for name, plain in description["tables"].items()}
     servos = [EmulatedServo(**row) for row in description["servos"]]
     devices = plugged(servos, tables, description["behind_silent"] != "skip")

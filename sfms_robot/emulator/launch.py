@@ -1,11 +1,11 @@
-"""Start an emulated servo chain in a process of its own, and stop it again.
+"""Start an emulated servo chain in a child process, and stop it again.
 
     with launch([EmulatedServo(1), EmulatedServo(2, start_ticks=1500)]) as chain:
         SerialPort(chain.device, 1_000_000, clock)
 
 Servos of several protocols, and boards, may share one wire.
 
-The process ends with the `with` block, and by itself when this one dies.
+The process ends with the `with` block, and when this one dies.
 """
 
 from __future__ import annotations
@@ -66,14 +66,15 @@ class Chain:
 
     @property
     def read_deadline_s(self) -> float:
-        """Silence after which one of its servos is rightly called silent."""
+        """Return the silence after which one of its servos counts as silent [s]."""
         return PROMPT_DEADLINE_S if self.priority == "fifo" else READ_DEADLINE_S
 
     def kill(self, servo_id: int) -> None:
-        """The servo falls silent, as with its cable out; its motor keeps doing what it was told."""
+        """Silence a servo, as with its cable out; its motor follows its last goal."""
         self.ask(f"kill {servo_id}")
 
     def revive(self, servo_id: int) -> None:
+        """Let a servo answer again."""
         self.ask(f"revive {servo_id}")
 
     def fault(self, servo_id: int, bits: int) -> None:
@@ -85,30 +86,31 @@ class Chain:
         self.ask(f"turn {servo_id} {ticks}")
 
     def heat(self, servo_id: int, temperature_C: float) -> None:
-        """A servo has this temperature from now on, and goes where its load takes it."""
+        """Set the temperature of a servo, which follows its load from then on."""
         self.ask(f"heat {servo_id} {temperature_C}")
 
     def state(self, servo_id: int) -> dict[str, Any]:
-        """What an onlooker sees: position [ticks], goal, torque, faults, temperature_C."""
+        """Return the true state of a servo: position [ticks], goal, torque, faults, temperature_C."""
         return cast("dict[str, Any]", self._json(f"state {servo_id}"))
 
     def inject(self, spec: str) -> None:
-        """A fault from now on, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
+        """Begin a fault, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
         self.ask(f"inject {spec}")
 
     def clear_faults(self) -> None:
+        """End all faults."""
         self.ask("clear")
 
     def faults(self) -> list[str]:
-        """Specs of the faults that go on or are to come."""
+        """Return the specs of faults that last or are to come."""
         return cast("list[str]", self._json("faults"))
 
     def supply(self, volts: float) -> None:
-        """Another supply voltage for all servos."""
+        """Set the supply voltage of all servos."""
         self.ask(f"supply {volts!r}")
 
     def hang_up(self) -> None:
-        """Unplug the adapter: hosts see the device vanish."""
+        """Unplug the adapter: the device vanishes for hosts."""
         self.ask("hangup")
 
     def come_back(self) -> None:
@@ -116,19 +118,19 @@ class Chain:
         self.ask("return")
 
     def time_is(self, now_s: float) -> None:
-        """In virtual time: let happen what happens by itself by `now_s`, though no host says a word."""
+        """Advance virtual time to `now_s` without a host."""
         self.ask(f"time {now_s!r}")
 
     def statistics(self) -> dict[str, Any]:
-        """bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
+        """Return bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
         return cast("dict[str, Any]", self._json("stats"))
 
     def stamps(self) -> list[dict[str, Any]]:
-        """The last replies: ids, due_s, sent_s."""
+        """Return the last replies: ids, due_s, sent_s."""
         return cast("list[dict[str, Any]]", self._json("stamps"))
 
     def digest(self) -> tuple[str, int]:
-        """SHA-256 and number of all bytes that hosts have sent."""
+        """Return SHA-256 and number of all bytes that hosts have sent."""
         _, sha, count = self.ask("digest").split()
         return sha, int(count)
 
@@ -149,7 +151,7 @@ class Chain:
         return json.loads(self.ask(request).removeprefix("json "))
 
     def ask(self, request: str) -> str:
-        """One line to the control socket, and its answer. Raises BusError when it is refused."""
+        """Send one line to the control socket and return the answer. Raises BusError when it is refused."""
         try:
             with socket.socket(socket.AF_UNIX) as control:
                 control.connect(self.control)
@@ -175,10 +177,10 @@ def launch(
     """Start a chain and wait until it can be opened.
 
     Args:
-        virtual: time is what the host says it is (see `servo.port.VirtualTimePort`).
+        virtual: the host sets the time (see `servo.port.VirtualTimePort`).
         timing: replies at once, or in the time that bytes and return delays take.
-        behind_silent: whether the ids behind a silent one in a sync read are silent too.
-        faults: specs (see `emulator.faults`); `seed` throws their dice.
+        behind_silent: "chain_break" silences the ids behind a silent one in a sync read.
+        faults: specs (see `emulator.faults`); `seed` of their random numbers.
         link: a symbolic link to the device, removed at the end.
 
     Raises ConfigError for an unknown model, register or fault, a baud the model does not have, an id used twice or a
@@ -230,7 +232,7 @@ def wait(chains: Sequence[Chain]) -> Chain:
 
 
 def _map(servo: EmulatedServo) -> FirmwareMap:
-    """The layout that holds for its firmware; for families without such layouts, the only one."""
+    """Return the registers of a servo's firmware; for families without firmware maps, the only ones."""
     named = load_firmware_map(servo.model)
     return variant(servo.model, servo.firmware) if named.protocol == 2 else named
 
@@ -248,7 +250,7 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
             raise _refusal("id", servo.id, "is not a servo id", [f"0..{highest}"])
         bauds = sorted(table.baud_codes.values())
         if bauds and servo.baud not in bauds:
-            raise _refusal("baud", servo.baud, f"is no rate of {servo.model}", bauds)
+            raise _refusal("baud", servo.baud, f"is not a rate of {servo.model}", bauds)
         if table.channels is not None:
             if servo.registers.keys() - _BOARD_SETTINGS.get(table.family, set()) or servo.supply_v is not None:
                 problem = "is a board of hobby servos: it has no registers, and does not know its supply"
@@ -257,7 +259,7 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
         for name, value in servo.registers.items():
             register = table.registers.get(name)
             if register is None:
-                raise _refusal("register", name, f"is none of {servo.model}", table.registers)
+                raise _refusal("register", name, f"is not a register of {servo.model}", table.registers)
             if not register.low <= value <= register.high:
                 allowed = [f"{register.low}..{register.high}"]
                 raise _refusal(name, value, f"is out of range of {servo.model}", allowed)

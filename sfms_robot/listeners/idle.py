@@ -65,7 +65,7 @@ CLOCK_S = (4.0, 8.0)  # least and most
 
 
 class HeadSway:
-    """The sway of one listener's streams; nothing at all for one with `sway: false`.
+    """The sway of one listener's streams; none for one with `sway: false`.
 
     Its tensors, fitted by `learning.slow_motion`: `sway_mixture` (BANDS, S, S) and `sway_spread` () of `draw_sway`, in
     units of its motion space, of the S channels that move the head.
@@ -78,14 +78,14 @@ class HeadSway:
         self._tensors = tensors
 
     def start(self, seed: int) -> Doubles:
-        """A stream's own, as `sway_at` takes it; empty without."""
+        """Return the sway of a stream, as `sway_at` takes it; empty without."""
         if not self._head:
             return np.zeros((3, 0, 0))
         mixture, spread = self._tensors["sway_mixture"], float(self._tensors["sway_spread"])
         return draw_sway(mixture, spread, seed, self._lateral, self._shifting)
 
     def added(self, motion: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
-        """Motion (..., N, C) of frames `first`, `first` + 1, ... with the sway of each stream, in place.
+        """Add the sway of each stream to motion (..., N, C) of frames `first`, `first` + 1, ..., in place.
 
         `sway`: (..., 3, 1 + L, S). `first` is of all streams, or (...) of each.
         """
@@ -98,10 +98,10 @@ class HeadSway:
 def draw_sway(
     mixture: Floats, spread: float, seed: int, lateral: Sequence[int] = (), shifting: Sequence[int] = ()
 ) -> Doubles:
-    """What one stream's sway is made of.
+    """Draw the lines of one stream's sway.
 
     Args:
-        mixture: (BANDS, S, S) M of each band: what (a, b) of a line become in each channel.
+        mixture: (BANDS, S, S) M of each band, from (a, b) of a line to the channels.
         spread: deviation of the logarithm of sizes between people.
         seed: of the stream.
         lateral: channels that a mirror turns around.
@@ -128,7 +128,7 @@ def draw_sway(
 
 
 def _clocks(uniform: Doubles, channels: int, shifting: Sequence[int]) -> Doubles:
-    """(3, S) of each channel's clock, of two that are drawn: `uniform` (4,) are their lengths and phases."""
+    """Return (3, S) of each channel's clock, of two that are drawn; `uniform` (4,): their lengths and phases."""
     second = np.zeros(channels, np.intp)
     second[list(shifting)] = 1
     turn = 2 * math.pi / (CLOCK_S[0] + (CLOCK_S[1] - CLOCK_S[0]) * uniform[:2])
@@ -136,8 +136,9 @@ def _clocks(uniform: Doubles, channels: int, shifting: Sequence[int]) -> Doubles
 
 
 def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
-    """Sway (..., 3, 1 + L, S) at times (T,) since the stream began, or (..., T) of each -> (..., T, S) in units of the
-    motion; 0 before that.
+    """Return sway (..., 3, 1 + L, S) at times (T,) since the stream began, or (..., T) of each: (..., T, S).
+
+    In units of the motion; 0 before the stream began.
     """
     lines, clocks = sway[..., 1:, :], sway[..., :1, :]
     own_s = times_s[..., None] + sum_of_lines(times_s[..., None], *_parts(clocks))  # (..., T, S)
@@ -145,26 +146,27 @@ def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
 
 
 def _parts(lines: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Frequencies, sizes, phases of lines (..., 3, L, S)."""
+    """Return frequencies, sizes and phases of lines (..., 3, L, S)."""
     return lines[..., 0, :, :], lines[..., 1, :, :], lines[..., 2, :, :]
 
 
 # --- Spectral lines ---------------------------------------------------------------------------------------------------
 #
 # A line a cos 2 pi f t + b sin 2 pi f t is one cosine, |(a, b)| cos(2 pi f t - atan2(b, a)), and is kept as such.
-# Idle motion (`idle_motion`) is a sum of lines too.
+# Sway and idle motion are both sums of lines.
 
 EASE_S: Final = 3.0
 
 
 def as_cosines(a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
-    """Size and phase [rad] of lines with the factors a of the cosine and b of the sine."""
+    """Return size and phase [rad] of lines with the factors a of the cosine and b of the sine."""
     return np.hypot(a, b), np.arctan2(b, a)
 
 
 def sum_of_lines(times_s: NDArray[np.floating], frequency: Doubles, size: Doubles, phase: Doubles) -> Doubles:
-    """Lines (..., L, K), frequency [rad/s], at times (T, 1) of all, (..., T, 1) of each, or (..., T, K), where every
-    column goes by a clock of its own -> (..., T, K).
+    """Return the sum of lines (..., L, K), frequency [rad/s]: (..., T, K).
+
+    Times are (T, 1) of all, (..., T, 1) of each, or (..., T, K) where every column has another clock.
     """
     turn = times_s[..., None, :] * frequency[..., None, :, :]  # (..., T, L, K)
     turn -= phase[..., None, :, :]
@@ -173,7 +175,7 @@ def sum_of_lines(times_s: NDArray[np.floating], frequency: Doubles, size: Double
 
 
 def set_in(times_s: NDArray[np.floating]) -> Doubles:
-    """0 before a stream begins, 1 from `EASE_S` on, smooth in between."""
+    """Return 0 before a stream begins, 1 from `EASE_S` on, smooth in between."""
     begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
     return np.asarray(begun**2 * (3 - 2 * begun))
 
@@ -190,17 +192,17 @@ SHIFTING = frozenset(("x", "y", "z", *(f"translation_{axis}" for axis in "xyz"))
 
 
 def head_channels(channels: Sequence[str]) -> list[int]:
-    """Which of the channels move the head."""
+    """Return which of the channels move the head."""
     return [index for index, name in enumerate(channels) if name in HEAD]
 
 
 def lateral_channels(channels: Sequence[str]) -> list[int]:
-    """Which of the `head_channels` a mirror turns around, by their place among those."""
+    """Return which of the `head_channels` a mirror turns around, by their place among those."""
     return [at for at, index in enumerate(head_channels(channels)) if channels[index] in LATERAL]
 
 
 def shifting_channels(channels: Sequence[str]) -> list[int]:
-    """Which of the `head_channels` move the head without turning it, by their place among those."""
+    """Return which of the `head_channels` move the head without turning it, by their place among those."""
     return [at for at, index in enumerate(head_channels(channels)) if channels[index] in SHIFTING]
 
 
@@ -224,14 +226,13 @@ _TENSORS: Final = ("loadings", "amplitude", "spread", "held", "shown")
 
 @dataclass(frozen=True)
 class RestMap:
-    """Maps of 52 channels, pieces of straight lines: below the first knot and above the last a channel is moved, no
-    more. 0 and above stays so.
+    """Maps of 52 channels, pieces of straight lines; beyond the first and last knot a channel is only shifted.
 
     Attributes:
-        base: (52,) what is added everywhere.
-        low: (52, J) where each piece begins.
-        width: (52, J) how long it is.
-        gain: (52, J) how much steeper than 1.
+        base: (52,) added everywhere.
+        low: (52, J) beginning of each piece.
+        width: (52, J) its length.
+        gain: (52, J) its slope minus 1.
     """
 
     base: Doubles
@@ -241,13 +242,13 @@ class RestMap:
 
     @classmethod
     def between(cls, held: Floats, shown: Floats) -> RestMap:
-        """From values (J + 1, 52), which never fall, to others."""
+        """Return the map from values (J + 1, 52), which never fall, to others."""
         low, width = held[:-1].T.astype(np.float64), np.diff(held, axis=0).T.astype(np.float64)
         gain = np.diff(shown, axis=0).T / np.maximum(width, 1e-9) - 1
         return cls((shown[0] - held[0]).astype(np.float64), low, width, gain)
 
     def off(self, shapes: Doubles) -> Doubles:
-        """How far the map takes shapes (N, 52)."""
+        """Return by how much the map changes shapes (N, 52)."""
         part = shapes[:, :, None] - self.low
         np.minimum(np.maximum(part, 0, out=part), self.width, out=part)
         return np.asarray(self.base + np.einsum("ncj,cj->nc", part, self.gain), np.float64)
@@ -255,8 +256,9 @@ class RestMap:
 
 @dataclass(frozen=True)
 class IdleStream:
-    """One stream's own: of every line, which is one cosine, frequency [rad/s], size and phase [rad], (L, K) each;
-    loadings (K, 52), and the map of where it rests.
+    """The idle motion of one stream.
+
+    Of each line, one cosine, frequency [rad/s], size and phase [rad], (L, K) each; loadings (K, 52); the map of rest.
     """
 
     frequency: Doubles
@@ -266,9 +268,9 @@ class IdleStream:
     rest: RestMap
 
     def added(self, frames: Floats, times_s: Doubles, silent_s: Doubles | float = math.inf) -> Floats:
-        """Motion (N, 58) with the idle motion of times (N,) since the stream began: a new array.
+        """Return motion (N, 58) with the idle motion of times (N,) since the stream began: a new array.
 
-        `silent_s`: (N,), how long its own voice has not been heard; `inf`: never.
+        `silent_s`: (N,) since its own voice ended; `inf`: it has never spoken.
         """
         parts = sum_of_lines(times_s[:, None], self.frequency, self.size, self.phase)  # (N, K)
         idle = parts @ self.loadings  # (N, 52)
@@ -283,13 +285,13 @@ class IdleStream:
 
 @dataclass(frozen=True)
 class IdleMotion:
-    """What was learned: K components.
+    """Idle motion as learned, of K components.
 
     Attributes:
-        loadings: (K, 52) how far each blendshape goes with a component, of deviation 1.
+        loadings: (K, 52) blendshapes of each component, of deviation 1.
         amplitude: (IDLE_BANDS, K) deviation of each component within each band; of all bands together about 1.
         spread: deviation of the logarithm of sizes between people.
-        held, shown: (KNOTS, 52) quantiles of what the listener's resting face does with this, and of people's.
+        held, shown: (KNOTS, 52) quantiles of the listener's resting face with this motion, and of people's.
     """
 
     loadings: Floats
@@ -299,7 +301,7 @@ class IdleMotion:
     shown: Floats
 
     def start(self, seed: int) -> IdleStream:
-        """A stream's own, by lot of its seed."""
+        """Draw the idle motion of a stream by its seed."""
         rng = np.random.default_rng([_SEED, seed])
         edges, (bands, parts) = np.array(IDLE_BANDS_HZ), self.amplitude.shape
         uniform = rng.random((bands, IDLE_LINES, parts))
@@ -325,7 +327,7 @@ class IdleMotion:
         """Read `file`. Raises ModelError if it is missing, cut off, of another shape, or moves a face too far."""
         found = read_weights(file)
         if set(found) != {*_TENSORS}:
-            raise ModelError(f"{file}: holds {', '.join(sorted(found))}, not {', '.join(_TENSORS)}")
+            raise ModelError(f"{file}: expected {', '.join(_TENSORS)}, got {', '.join(sorted(found))}")
         loadings, amplitude, spread, held, shown = (found[name] for name in _TENSORS)
         parts = len(loadings) if loadings.ndim else 0
         shapes = [(parts, _COUNT), (IDLE_BANDS, parts), (KNOTS, _COUNT), (KNOTS, _COUNT)]
@@ -337,12 +339,12 @@ class IdleMotion:
             )
         steps = np.diff(np.stack([held, shown]).astype(np.float64), axis=1)
         if steps.min() < 0 or (steps[1] > STEEPEST * steps[0] + _ROUNDING).any():
-            raise ModelError(f"{file}: a map of where a face rests falls, or is steeper than {STEEPEST:g}")
+            raise ModelError(f"{file}: held, shown: the map of rest falls, or is steeper than {STEEPEST:g}")
         largest = float(np.abs(loadings).max(initial=0.0) * np.linalg.norm(amplitude, axis=0).max(initial=0.0))
         largest = max(largest, float(np.abs(shown - held).max()))
         if largest > LARGEST or not 0 <= float(spread.item()) <= 1:
             raise ModelError(
-                f"{file}: moves a face by {largest:.3g}, with a spread of {float(spread.item()):.3g}; "
-                f"at rest none moves by more than {LARGEST:g}, nor differ people by more than 1"
+                f"{file}: expected motion up to {LARGEST:g} and a spread of 0..1, got {largest:.3g} and "
+                f"{float(spread.item()):.3g}"
             )
         return cls(loadings, amplitude, float(spread.item()), held, shown)

@@ -1,4 +1,4 @@
-"""A listener in a process of its own: the same `step`, frames one way, plans the other. Both ends are in this file.
+"""A listener in a child process: the same `step`, frames one way, plans the other. Both ends are in this file.
 
 In one process networks and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
 model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it.

@@ -25,7 +25,7 @@ def load_listener(
     engine: EngineName = "auto",
     threads: int | None = None,
 ) -> Listener:
-    """Return a listener by its shipped name, of a folder with config.yaml and weights, or of another package.
+    """Return a listener: by its shipped name, from a folder with config.yaml and weights, or from another package.
 
     Shipped ones are `ports.BatchListener`s.
 

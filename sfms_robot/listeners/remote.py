@@ -388,7 +388,7 @@ NamedFeed = ListenerProcess | RemoteListener
 def open_feed(
     name: str, seed: int, calmness: Calmness | None = None, router: Router = LOCAL, engine: EngineName = "auto"
 ) -> NamedFeed:
-    """Return a feed that loads in a process of its own, or connects, from now on; `wait_loaded` waits.
+    """Return a feed that loads in a child process, or connects, from now on; `wait_loaded` waits.
 
     `router`: to a listener on another machine, which chooses its engine itself.
 

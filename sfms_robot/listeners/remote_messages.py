@@ -115,7 +115,7 @@ def parse_frame(data: bytes) -> SentFrame:
         raise PacketError(f"a frame: expected 0 or {FRAME_SAMPLES} samples, got {samples} and {own_samples}")
     if not (math.isfinite(time_s) and math.isfinite(sent_s)) or number >= 1 << 31:
         raise PacketError("a frame: its time is not finite")
-    audio, own = (rest.array("<i2", count) / np.float32(_PCM) for count in (samples, own_samples))
+    audio, own = (np.asarray(rest.array("<i2", count) / _PCM, np.float32) for count in (samples, own_samples))
     face = attention = place_m = None
     if flags & FACE:
         face_s, motion = rest.number(), rest.array("<f4", MOTION_DIM)
@@ -193,7 +193,7 @@ def parse_plan(data: bytes) -> SentPlan:
 
 @validated(frozen=True, kw_only=True, config=ConfigDict(extra="ignore"))  # keys of a later protocol
 class Interface:
-    """What both sides must agree on. The text names them to a person."""
+    """The properties that both sides must share; as text, for people."""
 
     protocol: int = PROTOCOL
     version: str = __version__

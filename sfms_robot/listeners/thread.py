@@ -1,6 +1,6 @@
 """A listener object in a thread of this process (ports.PlanFeed), and what it shares with one in a child process.
 
-For a listener that cannot be loaded by name in a process of its own. It shares the interpreter with the servo loop: a
+For a listener that cannot be loaded by name in a child process. It shares the interpreter with the servo loop: a
 step that computes for long without releasing Python's lock makes ticks late. Listeners by name do not: `process`.
 """
 
@@ -80,7 +80,7 @@ class Lateness:
     """A judge of plans: in time to be shown, or not. A listener on a slow computer answers, but always too late.
 
     Attributes:
-        lasting: for `LATE_S` every plan has come after the last of its own frames. The first one in time ends it.
+        lasting: for `LATE_S` every plan has come after the time of its last frame. The first one in time ends it.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A source in a process of its own: neither pictures nor drivers may hold up the servo loop.
+"""A source in a child process: neither pictures nor drivers may hold up the servo loop.
 
 The child runs a generator function of a module that can be imported:
 
@@ -83,7 +83,8 @@ class SourceWorker:
         if any(message[0] == "finished" for message in messages):
             self._ended = "finished"
         if self._ended is None:
-            self._check(now_s, next(filter(None, map(_failure, messages)), None))
+            failures = [failure for failure in map(_failure, messages) if failure is not None]
+            self._check(now_s, failures[0] if failures else None)
         return [message[1] for message in messages if message[0] == "value"]
 
     @property

@@ -1,4 +1,4 @@
-"""The page's server in a process of its own: visitors cost the servo loop no tick.
+"""The page's server in a child process: visitors cost the servo loop no tick.
 
     run -> page     the `Address`; then bytes: a packed picture, or (visitor, JSON): a document, with visitor 0 for all
     page -> run     (visitor, dict): a document; (visitor, bytes): the voice or face of a visitor; a sign of life every
@@ -34,7 +34,7 @@ THREAD: Final = "page"  # names of the threads that a page has in the run's proc
 
 @dataclass(frozen=True)
 class Address:
-    """Where the page is to be: `--view [HOST:]PORT`, and the files of `--view-cert` and `--view-key` for https.
+    """The address of the page: `--view [HOST:]PORT`, and the files of `--view-cert` and `--view-key` for https.
 
     Attributes:
         port: 0 for any that is free; one that is taken makes room for the next that is free.
@@ -47,7 +47,7 @@ class Address:
 
     @classmethod
     def parsed(cls, wanted: str, certificate: Path | None = None, key: Path | None = None) -> Address:
-        """`wanted`: "auto", PORT or HOST:PORT. Raises ConfigError for another form, or missing files."""
+        """Parse `wanted`: "auto", PORT or HOST:PORT. Raises ConfigError for another form, or missing files."""
         if (certificate is None) != (key is None):
             raise ConfigError("--view-cert and --view-key: https needs both (docs/page.md says how to make them)")
         for flag, file in (("--view-cert", certificate), ("--view-key", key)):
@@ -58,14 +58,15 @@ class Address:
             return cls(LOOPBACK, PORT, *files)
         place = host_and_port(wanted)
         if place is None:
-            raise ConfigError(f"--view {wanted}: is no TCP port (PORT, HOST:PORT; 0 for a free one, or none)")
+            raise ConfigError(f"--view {wanted}: not a TCP port (valid: PORT, HOST:PORT, 0 for a free one, none)")
         return cls(*place, *files)
 
 
 class Asked(Protocol):
-    """Who does what visitors ask for. Called in a thread of the page's; may raise RobotError, told to the visitor."""
+    """The receiver of visitors' commands. Called in a thread of the page's; a RobotError is sent to the visitor."""
 
-    def command(self, visitor: int, command: Command) -> None: ...
+    def command(self, visitor: int, command: Command) -> None:
+        """Do what a visitor with the controls wants."""
 
     def person(self, visitor: int, message: bytes) -> None:
         """Take a piece of the voice, or a face, of the visitor with the controls: a message of docs/protocol.md."""

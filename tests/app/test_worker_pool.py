@@ -28,7 +28,7 @@ from sfms_robot.listeners.remote_messages import (
 LISTENER = "sfms-small"
 HOP = 3
 LIMIT_S = 240.0
-SERVED = Served(listener=LISTENER, name="tested", hop=HOP, everybody=True)
+SERVED = Served(listener=LISTENER, name="tested", hop=HOP, all_heads=True)
 
 
 def joined(pool, client, seed=0):

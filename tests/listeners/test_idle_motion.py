@@ -107,17 +107,17 @@ def test_what_is_saved_is_loaded(tmp_path):
 FLAT = np.zeros((KNOTS, len(BLENDSHAPES)), np.float32)
 RISING = np.repeat(np.linspace(0, 1, KNOTS, dtype=np.float32)[:, None], len(BLENDSHAPES), axis=1)
 BROKEN = {
-    "holds": {"spread": None},
+    "expected loadings": {"spread": None},
     "not finite": {"loadings": np.full((2, 52), np.nan, np.float32)},
-    "has \\(K, 52\\)": {"loadings": np.zeros((2, 51), np.float32)},
+    "expected \\(K, 52\\)": {"loadings": np.zeros((2, 51), np.float32)},
     "and twice": {"held": FLAT[:, :51]},
     "shown": {"shown": FLAT[1:]},
     "falls": {"held": -RISING},
     "steeper": {"held": 0.1 * RISING, "shown": 0.3 * RISING},
-    "by 0.6": {"shown": FLAT - 0.6},
+    "got 0.6": {"shown": FLAT - 0.6},
     "amplitude": {"amplitude": np.zeros((IDLE_BANDS, 3), np.float32)},
-    "moves a face by": {"loadings": np.ones((2, 52), np.float32)},
-    "a spread of": {"spread": np.float32([7.0])},
+    "expected motion up to": {"loadings": np.ones((2, 52), np.float32)},
+    "and 7": {"spread": np.float32([7.0])},
 }
 
 

@@ -29,7 +29,7 @@ def test_plans_that_all_come_too_late_are_named_after_a_second_until_one_is_in_t
     assert told(lateness, LATE_S, 5.0, 0.4)
     assert told(lateness, 5.0, 6.0, 0.1) == []
     assert [record.getMessage() for record in caplog.records] == [
-        "the listener's plans come too late to be shown: the head goes on without them",
+        "the listener's plans come too late to be shown: the run continues without them",
         "the listener's plans are in time again",
     ]
 

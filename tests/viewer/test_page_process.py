@@ -400,7 +400,7 @@ def test_beyond_loopback_a_token_is_made_and_asked_for(tmp_path):
 
 @pytest.mark.parametrize("wanted", ["-1", "65536", "http", "", ":80", "host:", "١"])
 def test_what_is_no_port_is_refused_in_one_line(wanted):
-    with pytest.raises(ConfigError, match=r"^--view .*is no TCP port"):
+    with pytest.raises(ConfigError, match=r"^--view .*not a TCP port"):
         Address.parsed(wanted)
 
 

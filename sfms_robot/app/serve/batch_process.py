@@ -55,7 +55,7 @@ class Served:
         server: name of this server.
         engine: what computes its networks.
         hop: None for the one that a robot would choose by what a plan takes here.
-        everybody: admit all heads, whatever they cost.
+        all_heads: admit all, whatever they cost.
     """
 
     listener: str
@@ -63,7 +63,7 @@ class Served:
     server: str = "server"
     engine: EngineName = "auto"
     hop: int | None = None
-    everybody: bool = False
+    all_heads: bool = False
 
 
 def main() -> None:
@@ -84,7 +84,7 @@ def main() -> None:
         parent.send(("error", error))
         return
     parent.send(("ready", capacity))
-    server = StreamServer(listener, served.name, None if served.everybody else capacity, served.server)
+    server = StreamServer(listener, served.name, None if served.all_heads else capacity, served.server)
     _serve(server, inbox, parent.send)
 
 

@@ -157,7 +157,8 @@ class WorkerPool:
 
     def _take(self, worker: _Worker, message: Any) -> None:
         """Handle a message of a process, in the thread that reads it."""
-        kind, value = ("ended", message.code) if isinstance(message, Ended) else message
+        said: tuple[str, Any] = ("ended", message.code) if isinstance(message, Ended) else message
+        kind, value = said
         if kind == "send":
             for stream, plan in value:
                 self._send(stream, plan)
@@ -238,7 +239,7 @@ class ServeOptions:
         metrics: TCP port of /metrics; None: none.
         hop: None for the one that a robot would choose by what a plan takes here.
         processes: number of processes; None: one for each core.
-        everybody: admit all heads, whatever they cost.
+        all_heads: admit all, whatever they cost.
         engine: what computes the listener's networks.
         insecure: allow endpoints beyond loopback without TLS.
     """
@@ -249,7 +250,7 @@ class ServeOptions:
     metrics: str | None = None
     hop: int | None = None
     processes: int | None = None
-    everybody: bool = False
+    all_heads: bool = False
     engine: EngineName = "auto"
     insecure: bool = False
 
@@ -316,7 +317,7 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
             server=os.uname().nodename,
             engine=options.engine,
             hop=options.hop,
-            everybody=options.everybody,
+            all_heads=options.all_heads,
         )
         service = ZenohService(served, config, options.processes)
         stack.callback(service.close)
@@ -350,7 +351,8 @@ def metrics_server(wanted: str) -> LoopbackServer:
     host, _, number = wanted.rpartition(":")
     port = port_number(number)
     if port is None:
-        raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
+        valid = f"0 to {HIGHEST_PORT}, 0 for a free one, HOST:PORT"
+        raise ConfigError(f"--metrics {wanted}: not a TCP port (valid: {valid})")
     try:
         server = LoopbackServer(port, _Answer, "metrics", host=host or LOOPBACK)
     except OSError as error:

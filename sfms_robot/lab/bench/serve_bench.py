@@ -74,7 +74,7 @@ def _served(name: str, say: Callable[[str], None]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as scratch:
         folder, weights = with_weights(name, Path(scratch))
         load = _Load()
-        with closing(WorkerPool(Served(listener=str(folder), name="bench", everybody=True), load.sent)) as pool:
+        with closing(WorkerPool(Served(listener=str(folder), name="bench", all_heads=True), load.sent)) as pool:
 
             def in_time(heads: int) -> bool:
                 curve.append(_loaded(pool, load, messages, heads))

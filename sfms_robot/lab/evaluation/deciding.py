@@ -72,7 +72,7 @@ def _decided(
     memory, found = model.start(seed, calmness).decided, list[ListenerEvent]()
     at, look_back = 0, math.inf  # the frame from which on a look aside is over
     while (frame := min(frames[at], look_back)) < len(heard):
-        decision, memory = model.decide(Sensed(int(frame), heard[int(frame)]), memory)
+        ((decision, memory),) = model.decide_each([Sensed(int(frame), heard[int(frame)])], [memory])
         found += decision.events
         at += frame == frames[at]
         look_back = max(frame + STEP_FRAMES, _over(memory))

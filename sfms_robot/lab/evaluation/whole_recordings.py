@@ -1,4 +1,4 @@
-"""Evidence and hazards of whole recordings at once: what `EventModel.decide` asks for step by step.
+"""Evidence and hazards of whole recordings at once: what `EventModel.decide_each` draws step by step.
 
 `heard_in` and `done_in` give the rows that `evidence.hear` and `evidence.done` give frame by frame. Where a history is
 given nothing has to be decided, so every step is asked together (`hazards_in`). Where none is, `most_in` says how
@@ -64,7 +64,7 @@ class Scene:
 
     Attributes:
         speaks: (N, P).
-        looks: (N, P) he looks at me (1) or not (0); NaN: nobody knows. The first column means nothing.
+        looks: (N, P) each looks at oneself (1) or not (0); NaN: unknown. The first column means nothing.
         laughs, smiles: (N,) one of the others does.
         nods: (N,) one of the others begins to.
     """
@@ -77,7 +77,7 @@ class Scene:
 
 
 def heard_in(scene: Scene) -> Doubles:
-    """(N, len(HEARD))."""
+    """Return the evidence (N, len(HEARD)) of a scene."""
     index = np.arange(len(scene.speaks))
     others = scene.speaks[:, 1:]
     phrase, silence, last = phase.times(np.asarray(others.any(axis=1))).T
@@ -112,7 +112,7 @@ def heard_in(scene: Scene) -> Doubles:
 
 
 def counts_in(scene: Scene) -> Bools:
-    """(N, P) whose look counts: he speaks, or nobody does and he holds the floor. Never one's own."""
+    """Return (N, P) whose look counts: of those who speak, else of the holder of the floor. Never one's own."""
     others = scene.speaks.copy()
     others[:, MINE] = False
     holder, _ = _floor_in(scene.speaks)
@@ -123,14 +123,14 @@ def counts_in(scene: Scene) -> Bools:
 
 
 def _since(happens: Bools) -> Doubles:
-    """(N,) seconds since the newest True."""
+    """Return (N,) seconds since the newest True."""
     index = np.arange(len(happens))
     newest = np.maximum.accumulate(np.where(happens, index, -np.inf))
     return np.asarray((index - newest) * FRAME_S, np.float64)
 
 
 def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
-    """Who holds the floor (N,), -1 nobody yet, and since which frame."""
+    """Return the holder of the floor (N,), -1 for none yet, and since which frame."""
     frames, people = speaks.shape
     index = np.arange(frames)
     lengths = np.stack([phase.times(speaks[:, who])[:, 0] for who in range(people)], axis=1)
@@ -142,7 +142,7 @@ def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
 
 
 def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
-    """What `sense` takes from each frame of a recording; `evidence.heard_in` makes its rows of that."""
+    """Return the scene that `sense` sees in a recording; `heard_in` makes its rows of that."""
     memory = SenseMemory(addressed)
     deaf, ear, face = True, memory.ear, memory.face
     speaks, looks, signs = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan), []
@@ -166,7 +166,7 @@ _SINCE_BEGIN: Final = {"nod_s": "nod", "mm_hm_s": "mm_hm", "blink_s": "blink"}
 def done_in(
     spans_s: Mapping[str, Doubles], frames: int, log_rate: Doubles | float, aside: Bools | None = None
 ) -> Doubles:
-    """(frames, len(DONE)) from spans (K, 2) by kind of `EVENT_KINDS`; kinds that are not there have never been.
+    """Return (frames, len(DONE)) from spans (K, 2) by kind of `EVENT_KINDS`; kinds that are not there have never been.
 
     `aside` (K,): which of the gaze shifts go away from the person.
     """
@@ -176,7 +176,7 @@ def done_in(
 def done_at(
     spans_s: Mapping[str, Doubles], now_s: Doubles, log_rate: Doubles | float, aside: Bools | None = None
 ) -> Doubles:
-    """`done_in` at instants (M,): (M, len(DONE))."""
+    """Return `done_in` at instants (M,): (M, len(DONE))."""
     columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
     for kind in _SINCE_END:
         columns[f"{kind}_end_s"] = _since_newest(spans_s.get(kind), now_s, ends=True)
@@ -196,7 +196,7 @@ def done_at(
 
 
 def _since_newest(spans: Doubles | None, now_s: Doubles, ends: bool = False) -> Doubles:
-    """(N,) seconds since the newest span that had begun, began or ended; inf before the first, 0 inside."""
+    """Return (N,) seconds since the newest span that had begun, began or ended; inf before the first, 0 inside."""
     if spans is None or not len(spans):
         return np.full(len(now_s), np.inf)
     newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1
@@ -208,14 +208,14 @@ def _since_newest(spans: Doubles | None, now_s: Doubles, ends: bool = False) -> 
 
 
 def steps_in(frames: int) -> Ints:
-    """The frames, of so many, at whose end hazards are asked."""
+    """Return the frames, of so many, at whose end hazards are drawn."""
     return np.arange(STEP_FRAMES - 1, frames, STEP_FRAMES)
 
 
 def hazards_in(
     model: EventModel, heard: Doubles, own: Sequence[ListenerEvent], calmness: Calmness
 ) -> dict[str, Doubles]:
-    """`Decision.hazards_hz` of every frame: evidence (N, len(HEARD)), somebody's events in order -> (N,) by kind."""
+    """Return `Decision.hazards_hz` of every frame, (N,) by kind, of evidence (N, len(HEARD)) and events in order."""
     steps = steps_in(len(heard))
     now_s = np.asarray((steps + 1) * FRAME_S, np.float64)
     spans_s = {kind: _spans(own, kind) for kind in EVENT_KINDS}
@@ -236,9 +236,9 @@ def hazards_in(
 
 
 def most_in(model: EventModel, heard: Doubles, calmness: Calmness) -> Doubles:
-    """Evidence (M, len(HEARD)) of steps -> (M, len(model.bank.kinds)) the greatest probability of each kind.
+    """Return the greatest probability (M, kinds) of each kind, of evidence (M, len(HEARD)) of steps.
 
-    Greatest over everything that the stream itself may have done: each term at that one of its knots which says most.
+    Over all that the stream may have done before: each term is taken at its greatest knot.
     """
     nothing = np.full((len(heard), len(DONE)), np.nan)
     odds = [
@@ -255,7 +255,7 @@ def most_in(model: EventModel, heard: Doubles, calmness: Calmness) -> Doubles:
 
 
 def _most_by_doing(model: EventModel, calmness: Calmness) -> Doubles:
-    """(T,) the most that each term can add by what was done; 0 of terms of what is heard."""
+    """Return (T,) the most that each term can add by events of before; 0 for terms of the others."""
     curves = [weight for hazard in model.tables.hazards.values() for weight in hazard.weights.values()]
     knots_s = sorted({knot for curve in curves if isinstance(curve, dict) for knot in curve})
     rows = np.full((len(knots_s) + 1, len(EVIDENCE)), np.nan)
@@ -279,13 +279,13 @@ def _spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
 
 
 def _listening(heard: Doubles) -> Bools:
-    """(M,) somebody has spoken just now, and it was not oneself."""
+    """Return (M,) whether another person has spoken just now, and oneself does not."""
     spoken = ~(np.isnan(heard[:, AT["phrase_s"]]) & np.isnan(heard[:, AT["last_phrase_s"]]))
     return np.asarray(spoken & (heard[:, AT["silence_s"]] <= LISTENING_S) & (heard[:, AT["own_voice_s"]] > 0))
 
 
 def _may_happen(heard: Doubles, spans_s: Mapping[str, Doubles], away: Bools, now_s: Doubles) -> dict[str, Bools]:
-    """(M,) by kind: the moment allows it, of listening and of what is under way."""
+    """Return (M,) by kind whether it may begin, by listening and by the events under way."""
     under_way = {}
     for kind, spans in spans_s.items():
         newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1

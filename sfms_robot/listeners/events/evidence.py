@@ -1,4 +1,4 @@
-"""What decisions are made from, frame by frame: who speaks, who looks, what faces do, and what was done.
+"""Evidence for decisions, frame by frame: voices, looks, signs of faces, and the events of before.
 
     SpeakerFrame -> signs of the face, voice, look (`Instant`) -> a row of evidence (`hear`); own events -> `done`
 
@@ -9,9 +9,9 @@ Of the others' voices together (`signals.phase`): how long the phrase lasts so f
 floor is held by the person, oneself among them, who is in a phrase of a second or more; of several the latest to begin,
 and the last one while none is. Looks count of those who speak now, else of the holder of the floor.
 
-The ear hears who speaks, the face says who looks, nods, smiles and laughs. A head that talks moves all the time, by
-more than many a nod: nods are those of a silent person. Each input may be missing. No microphone: a mouth that moves is
-a voice. No face: no nod and no laugh. No attention: the head is looked at, for one person talks to one head; an
+Sound says whether the person speaks, the face whether they look, nod, smile and laugh. A head that talks moves all the
+time, by more than many a nod: only a silent person nods. Each input may be missing. No microphone: a mouth that moves
+is a voice. No face: no nod and no laugh. No attention: the head is looked at, for one person talks to one head; an
 attention of NaN is unknown, and so is that of a face that has had one before and is lost. Attention flickers; looked-at
 changes only when a quarter second of it, smoothed, has clearly crossed the middle.
 """
@@ -72,7 +72,12 @@ NOBODY: Final = -1
 
 @dataclass(frozen=True)
 class Instant:
-    """One frame of a `Scene`: speaks (P,), looks (P,), and the rest."""
+    """One frame of a conversation of P people, oneself the first.
+
+    Attributes:
+        speaks, looks: (P,) each speaks; each looks at oneself, NaN: unknown.
+        laughs, nods, smiles: one of the others does, or begins to nod.
+    """
 
     speaks: tuple[bool, ...]
     looks: tuple[float, ...]
@@ -83,13 +88,13 @@ class Instant:
 
 @dataclass(frozen=True)
 class Hearing:
-    """What a stream remembers of the others.
+    """The memory of a stream of the others.
 
     Attributes:
-        frame: how many frames have been heard.
-        voices: of all others together; `each` of everybody, oneself the first.
-        spoke: the newest frame of each one's voice.
-        holder, held: of the floor, and since when.
+        frame: number of frames so far.
+        voices, each: phrases of all others together, and of each person, oneself the first.
+        spoke: newest frame of each one's voice.
+        holder, held: of the floor, and since which frame.
         looked: since which frame one is looked at, None while not.
         laughed, nodded, smiled: newest frames.
     """
@@ -107,17 +112,17 @@ class Hearing:
 
     @property
     def own_voice_s(self) -> float:
-        """Since the newest own voice; `inf`: there has been none."""
+        """Return the time since the newest own voice [s]; `inf`: there has been none."""
         return (self.frame - 1 - self.spoke[MINE]) * FRAME_S
 
 
 def hearing(people: int = 2) -> Hearing:
-    """Nothing heard yet of a conversation of so many, oneself among them."""
+    """Return the memory at the beginning of a conversation of so many, oneself among them."""
     return Hearing(0, SpeechPhase(), (SpeechPhase(),) * people, (-math.inf,) * people)
 
 
 def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
-    """One frame -> its row (len(HEARD),) and what is remembered."""
+    """Take one frame; return its row (len(HEARD),) and the memory after it."""
     now = before.frame
     others = instant.speaks[1:]
     speaking = sum(others)
@@ -164,9 +169,9 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
 
 
 def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doubles:
-    """(len(DONE),) at an instant, from events in the order of their beginnings.
+    """Return the row (len(DONE),) at an instant, from events in the order of their beginnings.
 
-    An event that has yet to begin has begun for this purpose if it is among them.
+    Events that have yet to begin count as begun.
     """
     since = dict.fromkeys(DONE, math.inf)
     nods, aside = 0, False
@@ -192,7 +197,7 @@ def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doub
 
 
 def begun_before(events: Sequence[ListenerEvent], now_s: float) -> list[ListenerEvent]:
-    """Those that had begun before an instant, and may still matter."""
+    """Return the events that had begun before an instant, and may still matter."""
     return [
         event
         for event in events
@@ -201,7 +206,7 @@ def begun_before(events: Sequence[ListenerEvent], now_s: float) -> list[Listener
 
 
 def remembered(events: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
-    """What has to be kept of events in order: nods of the last minute, of every other kind the newest."""
+    """Return the events, in order, that may still matter: nods of the last minute, of every other kind the newest."""
     newest = {event.kind: event for event in events}
     return tuple(
         event
@@ -227,7 +232,7 @@ BEAM: Final = 0.35
 HELD_FRAMES: Final = 6
 OPENING: Final = 0.02  # mean change of jawOpen per frame of a mouth that moves
 _SMOOTH: Final = 0.5  # share of a new value
-_NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: somebody who always beams is neutral within a minute
+_NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: a person who always beams is neutral within a minute
 _NEUTRAL_FALL: Final = 0.1
 _MOTION: Final = 0.12
 _SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
@@ -238,7 +243,7 @@ _PITCH: Final = CHANNEL_INDEX["pitch"]
 
 @dataclass(frozen=True)
 class Signs:
-    """Of one frame: a nod has just been seen; the person smiles, laughs; the mouth moves as in speech."""
+    """The signs of one frame: a nod has just been seen; the person smiles, laughs; the mouth moves as in speech."""
 
     nods: bool = False
     smiles: bool = False
@@ -248,14 +253,14 @@ class Signs:
 
 @dataclass(frozen=True)
 class FaceState:
-    """What is remembered of a face.
+    """The memory of a face.
 
     Attributes:
-        frame: how many have been asked for.
+        frame: number of frames so far.
         pitch_rad: smoothed, unwrapped, of the last second.
         nodded: frame of the newest nod; sway_rad: mean swing of the last seconds.
-        neutral, held: of the smile: its neutral, and for how many frames it has been up.
-        jaw, opening: jawOpen, and how much it changes per frame.
+        neutral, held: neutral of the smile, and frames for which it has been up.
+        jaw, opening: jawOpen, and its change per frame.
     """
 
     frame: int = 0
@@ -269,7 +274,7 @@ class FaceState:
 
 
 def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceState]:
-    """One frame of 40 ms. Without a face, or with one that holds what is not finite, nothing is seen."""
+    """Read the signs of one frame of 40 ms: none without a face, or with one that is not finite."""
     motion = None if face is None else face.motion
     if motion is None or not np.isfinite(motion).all():
         return Signs(), changed(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
@@ -298,14 +303,14 @@ def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
 
 
 def _swing(values: tuple[float, ...] | list[float]) -> float:
-    """How far up it went, if by now it is most of the way back; else 0."""
+    """Return how far up it went, if by now it is most of the way back; else 0."""
     top = max(values)
     risen = top - min(values[: values.index(top) + 1])
     return risen if top - values[-1] >= BACK * risen else 0.0
 
 
 def _smile(level: float, state: FaceState) -> tuple[bool, bool, FaceState]:
-    """Smiles, beams; after it has been up for a quarter of a second."""
+    """Return (smiles, beams, state); a smile counts after it has been up for a quarter of a second."""
     neutral = level if state.neutral is None else state.neutral
     neutral += _NEUTRAL_FALL * (level - neutral) if level < neutral else min(_NEUTRAL_RISE, level - neutral)
     over = level - neutral
@@ -320,20 +325,22 @@ Addressed = Literal["sense", "assume", "never"]
 OWN_VOICE_DB: Final = -50.0  # of full scale; what a program says is silent otherwise
 LOOK_S: Final = 0.25
 LOOKED, NOT_LOOKED = 0.6, 0.4
-LOST_FRAMES: Final = 25  # without a face nobody knows where its owner looks
+LOST_FRAMES: Final = 25  # after so many without a face the look is unknown
 _KEPT: Final = math.exp(-FRAME_S / LOOK_S)
 
 
 @dataclass(frozen=True)
 class SenseMemory:
-    """What is remembered of the person.
+    """The memory of the person.
 
     Attributes:
-        addressed: as asked for.
-        ear: of their voice; deaf: there has been no sound to hear at all.
-        attention: smoothed; None before any. looked: 1, 0, or NaN for nobody knows.
+        addressed: `Calmness.addressed`.
+        ear: of their voice.
+        deaf: there has been no sound at all.
+        attention: smoothed; None before any.
+        looked: 1, 0, or NaN for unknown.
         unseen: frames since their face; None before the first.
-        tells: somebody has told their attention.
+        tells: there has been an attention.
     """
 
     addressed: Addressed = "sense"
@@ -356,7 +363,10 @@ class Sensed:
 
 
 def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemory]:
-    """Pure. Several streams of one speaker may share it if their `addressed` is the same."""
+    """Take a frame; return its evidence and the memory after it.
+
+    Pure. Several streams of one speaker may share it if their `addressed` is the same.
+    """
     deaf = memory.deaf and not len(speaker.audio)
     ear = memory.ear if deaf else voice_activity.step(energy_db(speaker.audio), memory.ear)
     signs, face = read_signs(speaker.face, memory.face)
@@ -370,11 +380,12 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
 
 
 def sounds(own_voice: Floats | None) -> bool:
+    """Return whether the robot's own voice sounds."""
     return own_voice is not None and energy_db(own_voice) > OWN_VOICE_DB
 
 
 def looks_at_head(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMemory]:
-    """1, 0 or NaN, and what is remembered of it."""
+    """Return 1, 0 or NaN (unknown), and the memory after it."""
     if memory.addressed != "sense":
         return float(memory.addressed == "assume"), memory
     if speaker.face is None and speaker.attention is None:

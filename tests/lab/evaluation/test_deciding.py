@@ -105,7 +105,7 @@ def test_what_is_decided_is_what_deciding_every_frame_decides(speaker):
     _, heard = sensed(speaker[:6000])
     memory, every = when.start(7).decided, []
     for index, row in enumerate(heard):
-        decision, memory = when.decide(Sensed(index, row), memory)
+        ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decision.events
     assert decisions(when, heard, [7]) == [tuple(every)]
     assert {"nod", "blink", "gaze_shift"} <= {event.kind for event in every}
@@ -117,7 +117,7 @@ def test_the_same_at_other_rates(speaker, asked):
     _, heard = sensed(speaker[:4000], asked)
     memory, every = when.start(3, asked).decided, []
     for index, row in enumerate(heard):
-        decision, memory = when.decide(Sensed(index, row), memory)
+        ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decision.events
     assert decisions(when, heard, [3], asked) == [tuple(every)]
 
