@@ -298,11 +298,7 @@ LIMITS: Final[Mapping[str, Limits]] = {
         phase_s={"starting": START_LIMIT_S, "loading": START_LIMIT_S},
         restarts=5,
     ),
-    "source": Limits(
-        silent_s={"starting": START_LIMIT_S, "running": 3.0},
-        pause_s=0.5,
-        longest_pause_s=8.0,
-    ),
+    "source": Limits(silent_s={"starting": START_LIMIT_S, "running": 3.0}, pause_s=0.5, longest_pause_s=8.0),
     "page": Limits(hung_s=2.5, restarts=0, step_s=0.2),
 }
 
@@ -369,7 +365,7 @@ class Supervised:
             if failure is not None:
                 self.fail(failure)
             else:
-                self._report_hang()
+                self._report_hang(self._silent_s > limits.hung_s)
                 if self.phase == "running" and alive and self.phase_s > limits.steady_s:
                     self._failed, self._pause_s = False, limits.pause_s
         if self.phase == "backing off" and self._time_s >= self._restart_at_s:
@@ -392,16 +388,14 @@ class Supervised:
         self._pause_s = min(2 * self._pause_s, self._limits.longest_pause_s)
         self.phase, self._failed = "backing off", True
 
-    def _report_hang(self) -> None:
-        if (self._silent_s > self._limits.hung_s) == self.hung:
-            return
-        self.hung = not self.hung
-        self.hangs += self.hung
-        if self.hung:
+    def _report_hang(self, hung: bool) -> None:
+        if hung and not self.hung:
+            self.hangs += 1
             text = "%s (%s): no sign of life for %.1f s; the run continues"
             log.warning(text, self._name, self.phase, self._silent_s)
-        else:
+        elif self.hung and not hung:
             log.info("%s: answers again", self._name)
+        self.hung = hung
 
     def _restart(self) -> None:
         self.restarts += 1
@@ -434,10 +428,7 @@ class ParentPipe:
         raise SystemExit(0)
 
     def forward(self, take: Callable[[Any], object], end: Callable[[], object] = lambda: os._exit(0)) -> None:
-        """Pass all further messages to `take`, in a thread, and call `end` at the end of the pipe.
-
-        Without `end`, the process ends then, whatever it computes.
-        """
+        """Pass all further messages to `take`, in a thread; then call `end`, which ends this process at once."""
 
         def read() -> None:
             for message in _messages(self.incoming):
@@ -456,9 +447,6 @@ def give_way(nice: int) -> None:
     """Let processes of higher priority go first; `nice`: by how much, 0 to 19, where the system has that."""
     if hasattr(os, "nice"):
         os.nice(nice)
-
-
-# --- Pools and cores --------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -497,23 +485,16 @@ def realtime_priority(wanted: bool = True) -> Iterator[str]:
     usual_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
-        with _fifo() as outcome:
-            yield outcome
-    finally:
-        sys.setswitchinterval(usual_s)
-
-
-@contextmanager
-def _fifo() -> Iterator[str]:
-    try:
         before = (os.sched_getscheduler(0) | os.SCHED_RESET_ON_FORK, os.sched_getparam(0))
         # A process that is started meanwhile, such as a listener that died, must not compete with the loop.
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
+        outcome = "fifo"
     except (AttributeError, OSError) as error:
-        yield f"refused: {error}"
-        return
+        outcome = f"refused: {error}"
     try:
-        yield "fifo"
+        yield outcome
     finally:
-        os.sched_setscheduler(0, *before)
+        if outcome == "fifo":
+            os.sched_setscheduler(0, *before)
+        sys.setswitchinterval(usual_s)
