@@ -2,7 +2,6 @@
 
 import logging
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from sfms_robot.processes import (
     ONE_THREAD,
     Child,
     Ended,
-    Limits,
     ParentPipe,
     PipeWriter,
     Supervised,
@@ -345,10 +343,6 @@ def test_a_page_is_not_started_again_and_a_break_of_the_run_itself_is_no_silence
     assert [each.getMessage() for each in caplog.records] == ["test: its process died; the run continues without it"]
 
 
-def test_a_limit_that_is_not_set_never_ends_anything():
-    assert Watched(Limits()).until(lambda child: child.hung or child.restarts, limit_s=1e4, step_s=10.0) is None
-
-
 # --- pools and priority -----------------------------------------------------------------------------------------------
 
 
@@ -369,11 +363,6 @@ def test_every_pool_and_every_pickling_child_of_the_package_is_made_in_one_place
     making = ("ProcessPoolExecutor(", "multiprocessing.Pool", "get_context(", "start_new_session=")
     users = [file.name for file in package.rglob("*.py") if any(word in file.read_text("utf-8") for word in making)]
     assert [*dict.fromkeys(users)] == ["processes.py"]
-
-
-def test_errors_survive_the_way_to_the_parent():
-    error = sfms_robot.RobotError("one line")
-    assert str(pickle.loads(pickle.dumps(error))) == "one line"
 
 
 def test_priority_is_granted_or_says_why_not():

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import itertools
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -27,7 +26,6 @@ from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, ModelError, PacketError, PortError, RobotError, optional
 from sfms_robot.listeners.capacity import Capacity
-from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.remote import ROOT, down_key, join_key
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
 from sfms_robot.listeners.stream_server import DEADLINE_S, Figures, report
@@ -228,33 +226,6 @@ def _client(message: bytes) -> str | None:
     return words.client if isinstance(words, Join) else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServeOptions:
-    """The flags of `sfms-robot serve`.
-
-    Attributes:
-        listener: shipped name or folder.
-        name: by which robots request it, zenoh/NAME; None: the listener's.
-        zenoh: zenoh's configuration; None: loopback.
-        metrics: TCP port of /metrics; None: none.
-        hop: None for the one that a robot would choose by what a plan takes here.
-        processes: number of processes; None: one for each core.
-        all_heads: admit all, whatever they cost.
-        engine: what computes the listener's networks.
-        insecure: allow endpoints beyond loopback without TLS.
-    """
-
-    listener: str = "sfms-small"
-    name: str | None = None
-    zenoh: Path | None = None
-    metrics: str | None = None
-    hop: int | None = None
-    processes: int | None = None
-    all_heads: bool = False
-    engine: EngineName = "auto"
-    insecure: bool = False
-
-
 class ZenohService:
     """A `WorkerPool` on zenoh's keys. Serves from construction, which blocks for some seconds, until `close`.
 
@@ -298,33 +269,43 @@ class ZenohService:
         )
 
 
-def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], None]) -> dict[str, Any]:
+def serve(
+    served: Served,
+    over: threading.Event,
+    say: Callable[[str], None],
+    *,
+    router: Path | None = None,
+    insecure: bool = False,
+    metrics: str | None = None,
+    processes: int | None = None,
+) -> dict[str, Any]:
     """Serve until `over` is set, and return the figures. Blocks until then.
+
+    Args:
+        served: the listener, and how.
+        over: ends the service.
+        say: prints a line for people.
+        router: zenoh's configuration; None: loopback.
+        insecure: allow endpoints beyond loopback without TLS.
+        metrics: [HOST:]PORT of /metrics; None: none.
+        processes: number of processes; None: one for each core.
 
     Raises ConfigError, MissingExtra, ModelError, PortError.
     """
     from sfms_robot.runtime.service_notify import ServiceManager
 
     check_zenoh()
-    name = check_name(options.name or Path(options.listener).name, "listener")
-    config = session_config("serve", Router(options.zenoh, options.insecure))
+    name = check_name(served.name, "listener")
+    config = session_config("serve", Router(router, insecure))
     service_manager = ServiceManager()
     with ExitStack() as stack:
-        metrics = None if options.metrics is None else stack.enter_context(closing(metrics_server(options.metrics)))
-        served = Served(
-            listener=options.listener,
-            name=name,
-            server=os.uname().nodename,
-            engine=options.engine,
-            hop=options.hop,
-            all_heads=options.all_heads,
-        )
-        service = ZenohService(served, config, options.processes)
+        figures = None if metrics is None else stack.enter_context(closing(metrics_server(metrics)))
+        service = ZenohService(served, config, processes)
         stack.callback(service.close)
         pool = service.pool
-        if metrics is not None:
-            metrics.begin(pool.statistics)
-            say(f"metrics: {metrics.url}")
+        if figures is not None:
+            figures.begin(pool.statistics)
+            say(f"metrics: {figures.url}")
         say(
             f"{name}: a plan every {pool.hop} frames, up to {pool.most} heads in {DEADLINE_S * 1e3:.0f} ms here, "
             f"by {len(pool.capacities)} processes"
